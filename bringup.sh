@@ -216,9 +216,9 @@ died() { # NAME STATUS
   exit 1
 }
 
-# Waits until NAME has ended, and returns its status. Any other end is a failure, except that of a
-# recording.
-wait_for() { # NAME
+# wait_for NAME: waits until the process of this name has ended, and returns its status. If another
+# one ends first, bring-up has failed, unless that is a recording that was played to its end.
+wait_for() {
   local pid name status
   wait -n -p pid "${!name_of[@]}"
   status=$?

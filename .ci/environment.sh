@@ -70,8 +70,8 @@ find_ros() {
 
 # --- .venv ---------------------------------------------------------------------------------------
 
-# Written when an installation is complete. The first line says what .venv was made for, the others
-# are the requirements that were installed.
+# Written when an installation is complete. The first line names the ROS and the repository that
+# .venv was made for; the other lines list the installed requirements.
 installed=$venv/.installed
 
 venv_is_complete() {

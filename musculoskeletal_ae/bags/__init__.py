@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of rosbag2: written, read, checked and played without ROS."""
+"""Writes, reads, checks and plays bags of rosbag2. None of it needs ROS."""

@@ -31,7 +31,7 @@ SMOOTHING = 0.15  # [s] standard deviation: a hand is slower, noise of the estim
 SPACING = 0.1  # [s] between points
 LEAD_TIME = 3.0  # [s] to reach the first posture
 SHORTEST_MOTION = 0.5  # [s]
-LONGEST_GAP = 1.0  # [s] between two messages, over which the motion is unknown
+LONGEST_GAP = 1.0  # [s] between two messages; over a longer gap, the motion is unknown
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:

@@ -135,7 +135,11 @@ class Activities:
 
 
 class Suspicion:
-    """Which muscle the estimator suspects: the one that is isolated for the present anomaly."""
+    """Finds out which muscle the estimator suspects of the present anomaly.
+
+    The estimator reports an anomaly and isolates the suspect in two messages, which may come in
+    either order.
+    """
 
     def __init__(self) -> None:
         self._isolated: tuple[int, float] | None = None  # the last muscle, and when [s]
@@ -315,7 +319,6 @@ class Controller:
             nearest = self.planner.takes_nearest
             goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
-        last = self.target_state
         self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
         if not (self.supervisor.is_running and by_follower(self.settings) and self._is_ready):
             self._hold()  # it is gone to as soon as the arm may move
@@ -323,7 +326,7 @@ class Controller:
         try:
             self._approach(self.settings.target_duration or self.settings.first_duration)
         except MessageError:
-            self.target_state = last
+            self.target_state = state
             raise
         except Exception as error:  # noqa: BLE001 (as in `_desired`)
             self._note_fault(error)
@@ -527,8 +530,8 @@ class Controller:
             return None
         # A paused arm whose data is back waits for a moment: neither hold nor release goes on.
         waits = not self.supervisor.is_latched and not present
-        stale = {condition.cause for condition in present}
-        is_fresh = StopCause.STALE_MUSCLE_STATES not in stale
+        causes = {condition.cause for condition in present}
+        is_fresh = StopCause.STALE_MUSCLE_STATES not in causes
         may_wind = self.supervisor.may_wind_suspect
         return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, may_wind)
 

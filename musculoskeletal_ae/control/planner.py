@@ -115,7 +115,7 @@ class Planner:
             nearest: Whether the nearest posture that can be held will do.
 
         Raises:
-            MessageError: If θ cannot be held and the nearest one will not do.
+            MessageError: If the arm cannot be held at θ and `nearest` is false.
         """
         robot = self._robot
         if robot.used.all():

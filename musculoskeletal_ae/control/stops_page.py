@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page `doc/stops.md`, made from the declarations of modes and stop causes.
+"""Generates the page `doc/stops.md` from the modes (`supervisor`) and the causes (`stops`).
 
 python -m musculoskeletal_ae.control.stops_page > doc/stops.md
 """

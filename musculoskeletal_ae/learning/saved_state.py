@@ -144,7 +144,7 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     """Return the saved network, if there is one.
 
     Raises:
-        StateError: If it does not fit the robot.
+        StateError: If the saved network lacks muscles of the robot, or is no valid checkpoint.
     """
     if added := [name for name in robot.muscles if name not in state.muscles]:
         raise StateError(f'of the robot without {", ".join(added)}; only its samples are used')

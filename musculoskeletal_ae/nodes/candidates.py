@@ -44,7 +44,7 @@ class Candidates:
         self.queue = node.checkpoint_queue(CANDIDATES, self._validate)
 
     def follow(self) -> None:
-        """Follow the topic, and the parameter `checkpoint`, beginning with its present value."""
+        """Take candidates from the topic, and from the file of `checkpoint`, now and later."""
         node = self._node
         node.needed.append(CANDIDATES)
         node.follow_parameter('checkpoint', self._use_file, node.load_checkpoint)

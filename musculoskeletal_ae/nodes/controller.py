@@ -119,7 +119,7 @@ class Controller(Shell):
             raise MusculoskeletalError(f'{told}; or let it follow muscle_tension_command, too')
         return value
 
-    def _use_offsets(self, *_: object) -> None:
+    def _use_offsets(self) -> None:
         self.core.use_body(self.core.stream.body.with_offsets(self.zeros))
 
     def _isolate(self, muscles: tuple[int, ...]) -> None:

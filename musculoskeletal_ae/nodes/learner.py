@@ -68,7 +68,7 @@ class Learner(Shell):
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.listen(Imu, 'imu', self._take_imu, SENSOR)
-        self.follow_zeros(lambda *_: self._use_offsets())
+        self.follow_zeros(self._use_offsets)
         self.follow_muscle_messages(self._take_muscle_states)
         self.follow_anomaly(core.anomaly)
         self.has_heard_isolated = False

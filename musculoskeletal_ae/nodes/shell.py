@@ -51,7 +51,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import (
     read_array,
-    read_muscle_states,
     read_names,
     read_posture,
 )
@@ -349,26 +348,6 @@ class Shell(Node):
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
-    def follow_muscle_states(
-        self,
-        follow: Callable[[Array], object],
-        warn: Callable[[str], object] | None = None,
-        unknown: float = 0.0,
-    ) -> None:
-        """Give `follow` what comes on muscle_states: l [m], T [N], temperature [°C], (3, M).
-
-        The length offsets are subtracted from l. What is not finite of isolated muscles is
-        `unknown`, a temperature NaN. For `warn` see `follow_muscle_messages`.
-        """
-
-        def read(message: Float64MultiArray) -> None:
-            muscle_count = self.robot.muscle_count
-            states = read_muscle_states(message, muscle_count, self.left_out, unknown)
-            states[0] -= self.zeros.offset
-            follow(states)
-
-        self.follow_muscle_messages(read, warn)
-
     def follow_muscle_messages(
         self,
         follow: Callable[[Float64MultiArray], object],
@@ -410,26 +389,26 @@ class Shell(Node):
         senders = (f'{count} nodes {node}' if count > 1 else node for node, count in names.items())
         return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
 
-    def follow_zeros(self, changed: Callable[[bool, Array], object]) -> None:
-        """Take the estimator's zeros; tell whether they are known now, and how much less l is.
+    def follow_zeros(self, changed: Callable[[], object]) -> None:
+        """Keep the estimator's length offsets in `zeros`, and call `changed` when they are others.
 
-        Known ones that are not those known before come from an estimator that starts anew and
-        has not heard of them: nothing is known then, until it finds them.
+        Known offsets that differ from the known ones before come from an estimator that was
+        started again and has not heard of those. They count as unknown until it has found them.
         """
         heard = LengthOffsets.unknown(self.robot.muscle_count)
 
         def take(rows: Array) -> None:
             nonlocal heard
             if np.abs(rows[0]).max() > MOST_ZERO or rows[1].min() < 0.0:
-                told = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
-                raise MessageError('impossible zeros', told)
+                detail = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
+                raise MessageError('impossible zeros', detail)
             zeros, before, heard = LengthOffsets(*rows), heard, LengthOffsets(*rows)
             if before.known and zeros.known:
                 if (zeros.offset == before.offset).all():
                     return
                 zeros = replace(LengthOffsets.unknown(len(zeros.offset)), offset=zeros.offset)
-            less, self.zeros = zeros.offset - self.zeros.offset, zeros
-            changed(zeros.known, less)
+            self.zeros = zeros
+            changed()
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 

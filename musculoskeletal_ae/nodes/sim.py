@@ -44,7 +44,7 @@ class Sim(Arm):
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
         if not self.as_robot:  # which is the modules themselves
-            self.follow_zeros(lambda *_: None)  # `zeros` are those of the commands
+            self.follow_zeros(lambda: None)  # `_command` reads `zeros`
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()

@@ -314,7 +314,7 @@ def _read_end_effectors(
     order: list[str],
     fail: Fail,
 ) -> tuple[str, ...]:
-    """Return the links that the file names or, if it names none, the last link of the chain."""
+    """Return the end effectors that muscles.yaml names; by default the last link of the chain."""
     links = _joints_above(model, {*content.joints})
     moved = _joints_above(model, {*content.joints, *couplings})
     places = {f'$.end_effectors[{i}]': n for i, n in enumerate(content.end_effectors or ())}

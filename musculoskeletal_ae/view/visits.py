@@ -89,5 +89,5 @@ def checked_visits(host: str) -> Iterator[None]:
     finally:
         server.serve = serve  # type: ignore[misc]
     if not served:
-        told = 'this version of viser serves its page in a way that cannot be checked'
-        raise MusculoskeletalError(f'{told}; install the one of .ci/requirements-view.txt')
+        problem = 'this version of viser serves its page in a way that cannot be checked'
+        raise MusculoskeletalError(f'{problem}; install the one of .ci/requirements-view.txt')

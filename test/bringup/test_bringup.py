@@ -282,19 +282,19 @@ def driver(namespace):
 def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
     options = ['--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own']
     run = bringup(environment, *options)
-    told = read_until(run, 'waiting for /own/muscle_states')
-    assert 'starting' not in told
+    transcript = read_until(run, 'waiting for /own/muscle_states')
+    assert 'starting' not in transcript
     graph = Graph('/own')
     graph.processes += [run, driver('own')]
     try:
-        told += read_until(run, 'starting controller')
+        transcript += read_until(run, 'starting controller')
         explore_fast(graph, 'controller')
         learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         graph.wait(lambda: len(learned) > 2, 'two updates of the network', 8 * DEADLINE)
     finally:
         status, output = run.end(signal.SIGINT)
         graph.close()
-    assert 'the driver keeps its contract' in told + output
+    assert 'the driver keeps its contract' in transcript + output
     assert status == 130 and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
     assert kept.is_dir()  # for the next time

@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from processes import is_running
 
 from musculoskeletal_ae.learning import trainer as trainers
 from musculoskeletal_ae.learning.trainer import Trainer, TrainerProcess
@@ -35,14 +36,6 @@ def answer(process):
             return update
         time.sleep(0.02)
     return None
-
-
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 def test_the_training_process_learns_the_same_network_as_training_in_this_process(
@@ -85,7 +78,7 @@ def test_a_training_process_that_hangs_is_replaced_and_its_job_repeated(
         process.submit(job(stage.store(300), steps=1))
         assert answer(process) is None
     assert 'did not answer in time' in process.trouble
-    assert not alive(first)
+    assert not is_running(first)
     assert answer(process).mae.training.count('300 samples')
     assert process.trouble == ''
     assert process.pid != first

@@ -21,12 +21,12 @@ def said(
 
 
 def test_before_the_first_sample_it_says_why_the_error_may_rise():
-    told = Situation('/left')
-    assert told.hint() == ''  # nobody learns
-    told.diagnosed(said('/left/learner', samples='0'))
-    assert 'error may rise' in told.hint()
-    told.diagnosed(said('/left/learner', samples='3', checkpoints='2'))
-    assert told.hint() == '' and (told.samples, told.checkpoints) == ('3', '2')
+    situation = Situation('/left')
+    assert situation.hint() == ''  # nobody learns
+    situation.diagnosed(said('/left/learner', samples='0'))
+    assert 'error may rise' in situation.hint()
+    situation.diagnosed(said('/left/learner', samples='3', checkpoints='2'))
+    assert situation.hint() == '' and (situation.samples, situation.checkpoints) == ('3', '2')
 
 
 def test_what_is_not_known_is_said_to_be_waited_for():
@@ -65,53 +65,53 @@ REPAIR = '(to go on: repair the muscle; call estimator/reset)'
 
 
 def test_a_stop_of_this_arm_alone_is_shown_with_its_remedy():
-    told = Situation('/left')
-    told.diagnosed(said('/right/controller', mode='stopped', stop='another arm'))
-    assert told.trouble() == ''
-    told.diagnosed(said('/left/controller', mode='holding'))
-    assert told.trouble() == ''
-    told.diagnosed(stopped(StopCause.OPERATOR))
-    assert told.trouble() == f'STOPPED: controller/stop was called {RESET}'
-    told.diagnosed(said('/left/controller', mode='paused', stop_cause='stale_estimate'))
-    assert told.trouble() == ''  # it goes on by itself
+    situation = Situation('/left')
+    situation.diagnosed(said('/right/controller', mode='stopped', stop='another arm'))
+    assert situation.trouble() == ''
+    situation.diagnosed(said('/left/controller', mode='holding'))
+    assert situation.trouble() == ''
+    situation.diagnosed(stopped(StopCause.OPERATOR))
+    assert situation.trouble() == f'STOPPED: controller/stop was called {RESET}'
+    situation.diagnosed(said('/left/controller', mode='paused', stop_cause='stale_estimate'))
+    assert situation.trouble() == ''  # it goes on by itself
 
 
 @pytest.mark.parametrize('cause', StopCause)
 def test_every_stop_is_shown_with_the_remedy_of_its_cause(cause):
-    told = Situation('/left')
-    told.diagnosed(stopped(cause))
-    assert told.trouble() == f'STOPPED: {cause.text} (to go on: {cause.remedy})'
+    situation = Situation('/left')
+    situation.diagnosed(stopped(cause))
+    assert situation.trouble() == f'STOPPED: {cause.text} (to go on: {cause.remedy})'
 
 
 def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
-    told = Situation('/left')
-    told.diagnosed(said('/left/estimator', suspect_muscle='biceps', d='12.5', d_limit='9.0'))
-    assert (told.distance, told.limit) == (12.5, 9.0)
-    told.detected = True
-    assert told.trouble() == f'ANOMALY: biceps {REPAIR}'  # without a controller
-    told.diagnosed(said('/left/controller', mode='exploring'))
-    told.diagnosed(stopped(StopCause.ANOMALY))
-    assert told.trouble() == (
+    situation = Situation('/left')
+    situation.diagnosed(said('/left/estimator', suspect_muscle='biceps', d='12.5', d_limit='9.0'))
+    assert (situation.distance, situation.limit) == (12.5, 9.0)
+    situation.detected = True
+    assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # without a controller
+    situation.diagnosed(said('/left/controller', mode='exploring'))
+    situation.diagnosed(stopped(StopCause.ANOMALY))
+    assert situation.trouble() == (
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
         'call estimator/reset; call controller/reset; controller/explore explores again)'
     )
-    told.detected = False
-    told.diagnosed(said('/left/controller', mode='holding'))
-    assert told.trouble() == ''
+    situation.detected = False
+    situation.diagnosed(said('/left/controller', mode='holding'))
+    assert situation.trouble() == ''
 
 
 def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
-    told = Situation('/left')
-    told.diagnosed(said('/left/estimator', suspect_muscle='biceps'))
-    told.diagnosed(stopped(StopCause.ANOMALY, 'verifying'))
-    told.detected = True
-    assert told.trouble() == 'ANOMALY: biceps is being verified'
-    told.diagnosed(stopped(StopCause.OPERATOR, 'verifying'))
-    assert told.trouble() == (
+    situation = Situation('/left')
+    situation.diagnosed(said('/left/estimator', suspect_muscle='biceps'))
+    situation.diagnosed(stopped(StopCause.ANOMALY, 'verifying'))
+    situation.detected = True
+    assert situation.trouble() == 'ANOMALY: biceps is being verified'
+    situation.diagnosed(stopped(StopCause.OPERATOR, 'verifying'))
+    assert situation.trouble() == (
         f'ANOMALY: biceps is being verified, STOPPED: controller/stop was called {RESET}'
     )
-    told.diagnosed(stopped(StopCause.OPERATOR))
-    assert told.trouble() == (
+    situation.diagnosed(stopped(StopCause.OPERATOR))
+    assert situation.trouble() == (
         f'ANOMALY: biceps {REPAIR}, STOPPED: controller/stop was called {RESET}'
     )
 
@@ -142,16 +142,16 @@ def test_an_error_of_any_node_is_shown_until_it_is_over():
     assert alone.trouble() == ''
     alone.diagnosed(said('/learner', 'the disk is full', error))
     assert alone.trouble() == '/learner: the disk is full'
-    told = Situation('/left')
-    told.diagnosed(said('/right/learner', 'the disk is full', error))
-    told.diagnosed(said('/left/controller', 'a KeyError escaped', error, fault='a KeyError'))
-    assert told.trouble() == '/left/controller: a KeyError escaped'
-    told.diagnosed(stopped(StopCause.OPERATOR))
+    situation = Situation('/left')
+    situation.diagnosed(said('/right/learner', 'the disk is full', error))
+    situation.diagnosed(said('/left/controller', 'a KeyError escaped', error, fault='a KeyError'))
+    assert situation.trouble() == '/left/controller: a KeyError escaped'
+    situation.diagnosed(stopped(StopCause.OPERATOR))
     stop = f'STOPPED: controller/stop was called {RESET}'
-    assert told.trouble() == stop
-    told.diagnosed(said('/left/learner', 'the disk is full', error))
-    assert told.trouble() == f'{stop}, /left/learner: the disk is full'
-    told.diagnosed(said('/left/controller', 'holding', mode='holding'))
-    assert told.trouble() == '/left/learner: the disk is full'
-    told.diagnosed(said('/left/learner', 'learning'))
-    assert told.trouble() == ''
+    assert situation.trouble() == stop
+    situation.diagnosed(said('/left/learner', 'the disk is full', error))
+    assert situation.trouble() == f'{stop}, /left/learner: the disk is full'
+    situation.diagnosed(said('/left/controller', 'holding', mode='holding'))
+    assert situation.trouble() == '/left/learner: the disk is full'
+    situation.diagnosed(said('/left/learner', 'learning'))
+    assert situation.trouble() == ''

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph import DEADLINE, LOOK
+from processes import is_running
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
@@ -328,14 +329,6 @@ def learn(graph, arm, condition, what):
     graph.wait(step, what)
 
 
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
 def test_a_killed_learner_resumes_from_its_saved_state(graph, arm26, trained_file, state):
     process = start(graph, checkpoint=trained_file, state_directory=state)
     arm = Arm(graph, arm26)
@@ -347,7 +340,7 @@ def test_a_killed_learner_resumes_from_its_saved_state(graph, arm26, trained_fil
     start(graph, checkpoint='/no/such/file', state_directory=state)
     graph.wait(lambda: samples(graph) >= stored, 'the samples of before')
     graph.wait(lambda: versions(graph, arm26)[-1] >= version, 'the network of before')
-    graph.wait(lambda: not alive(worker), 'the end of the orphaned training process')
+    graph.wait(lambda: not is_running(worker), 'the end of the orphaned training process')
 
 
 def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, trained_file):
@@ -399,7 +392,7 @@ def test_ctrl_c_ends_the_learner_and_its_training_process_without_a_traceback(gr
     status, output = graph.ended(process, signal.SIGINT)
     assert status == 0
     assert 'Traceback' not in output
-    assert not alive(worker)
+    assert not is_running(worker)
 
 
 def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host, state, graph):

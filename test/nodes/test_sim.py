@@ -159,7 +159,7 @@ def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae,
         graph.wait(lambda reported=reported: reported in str(graph.report('sim').values), reported)
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
-    # There is one network for all nodes.
+    # The estimator decides which network all nodes use, once it has published one.
     done, reason = graph.set_parameter('sim', 'checkpoint', trained_file)
     assert not done
     assert 'of the estimator' in reason

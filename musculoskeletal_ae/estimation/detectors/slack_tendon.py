@@ -85,7 +85,8 @@ class SlackTendon(Detector):
     def _demand(self, observation: Observation) -> Array | None:
         """Return T that the muscles have to pull with [N], (M,), or None where it is unknown.
 
-        An arm whose estimate makes no sense is not commanded. Then its modules hold T_bias.
+        While the estimate is impossible, the controller sends no commands, and the modules hold
+        T_bias.
         """
         if observation.demand is not None:
             return observation.demand
