@@ -13,7 +13,7 @@ Usage: ./bringup.sh [options]
 
 Sets up what is missing, then runs the whole system on an emulated arm and prints one status line a
 second: estimation error, anomaly A, samples learned, number of checkpoints. Ctrl-C stops it all.
-doc/your_robot.md leads from a robot of your own to one that learns.
+doc/howto/your_robot.md leads from a robot of your own to one that learns.
 
   --robot NAME|DIR           a robot under config/, or a directory with robot.urdf and muscles.yaml
                              (default: musashi_left_arm)

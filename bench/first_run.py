@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From nothing to an arm that learns: every command of doc/your_robot.md, in a clean clone.
+"""From nothing to an arm that learns: every command of doc/howto/your_robot.md, in a clean clone.
 
 python -m bench first_run > doc/results/door/first_run.txt
 
@@ -19,7 +19,7 @@ from pathlib import Path
 from musculoskeletal_ae.options import Parser
 
 ROOT = Path(__file__).resolve().parents[1]
-GUIDE = 'doc/your_robot.md'
+GUIDE = 'doc/howto/your_robot.md'
 LEARNING, LOOKING = 90, 5  # [s] of bringup.sh with --explore, and without
 LEARNED = 0.05  # [rad] that the error is below at the end
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'TMPDIR')

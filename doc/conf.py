@@ -42,7 +42,7 @@ suppress_warnings = [
 def write_reference(_: Sphinx) -> None:
     """Write one page for each room of the package, those that nobody builds on excepted."""
     left_out = [str(PACKAGE / room) for room in ('nodes', 'tools', 'view', 'importing')]
-    out = str(FOLDER / 'reference')
+    out = str(FOLDER / 'modules')
     apidoc.main(['-f', '-q', '-T', '-M', '-d', '1', '-o', out, str(PACKAGE), *left_out])
 
 

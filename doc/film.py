@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records the moving picture of the README from the page, in a headless Chromium.
 
-python doc/film.py --checkpoint INITIAL.safetensors [--out doc/view.gif]
+python doc/film.py --checkpoint INITIAL.safetensors [--out doc/images/view.gif]
 
 An emulated arm explores, is learned meanwhile, and has a muscle cut at the end. Arm, learner,
 estimator and simulator are stepped here, frame by frame, so that a slow machine records the same;
@@ -43,7 +43,7 @@ def main() -> None:
     """Record."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--checkpoint', type=Path, required=True)
-    parser.add_argument('--out', type=Path, default=Path(__file__).with_name('view.gif'))
+    parser.add_argument('--out', type=Path, default=Path(__file__).parent / 'images' / 'view.gif')
     options = parser.parse_args()
     robot = Robot.load('musashi_left_arm')
     mae = checkpoint.load(options.checkpoint, robot)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes what is made from the code: `api.md`, and the picture of the elastic unit.
+"""Writes what is made from the code: `reference/api.md`, and the picture of the elastic unit.
 
 python doc/make.py
 """
@@ -127,5 +127,5 @@ def draw_elastic_unit(file: Path) -> None:
 
 
 if __name__ == '__main__':
-    (FOLDER / 'api.md').write_text(api(), encoding='utf-8')
-    draw_elastic_unit(FOLDER / 'elastic_unit.png')
+    (FOLDER / 'reference' / 'api.md').write_text(api(), encoding='utf-8')
+    draw_elastic_unit(FOLDER / 'images' / 'elastic_unit.png')

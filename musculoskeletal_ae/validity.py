@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a message must be to be used (doc/interface.md): one function for each kind, without ROS.
+"""Check messages as doc/reference/topics_and_services.md describes: one function for each kind.
 
 A function takes a message by its fields alone, a live one or one of a bag, and returns numbers.
 A message that breaks a rule raises a `MessageError` with a short reason; the caller counts it and

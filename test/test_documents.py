@@ -20,12 +20,14 @@ def test_the_page_of_public_classes_is_up_to_date():
 
     page = make.api()
     assert '`_' not in page  # what is private is nothing to build on
-    assert (ROOT / 'doc' / 'api.md').read_text('utf-8') == page, 'run: python doc/make.py'
+    assert (ROOT / 'doc' / 'reference' / 'api.md').read_text('utf-8') == page, (
+        'run: python doc/make.py'
+    )
 
 
 def test_the_page_of_stops_is_up_to_date():
-    remedy = 'run: python -m musculoskeletal_ae.control.stops_page > doc/stops.md'
-    assert (ROOT / 'doc' / 'stops.md').read_text('utf-8') == stops_page.page(), remedy
+    remedy = 'run: python -m musculoskeletal_ae.control.stops_page > doc/reference/stops.md'
+    assert (ROOT / 'doc' / 'reference' / 'stops.md').read_text('utf-8') == stops_page.page(), remedy
 
 
 def test_the_three_lines_of_python_of_the_readme_estimate_without_ros(trained_file, tmp_path):
@@ -55,7 +57,7 @@ print(*theta)
 
 
 def test_options_and_executables_that_the_guide_names_exist():
-    guide = (ROOT / 'doc' / 'your_robot.md').read_text('utf-8')
+    guide = (ROOT / 'doc' / 'howto' / 'your_robot.md').read_text('utf-8')
     bringup = (ROOT / 'bringup.sh').read_text('utf-8')
     for option in set(re.findall(r'bringup\.sh[^\n]*? (--[\w-]+)', guide)):
         assert f'{option} ' in bringup

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of the interface (doc/interface.md), and which of a bag's topics they are."""
+"""The topics of doc/reference/topics_and_services.md, and which topics of a bag they are."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from musculoskeletal_ae.files import read_table
 
 
 class Topic(NamedTuple):
-    """One row of the table in doc/interface.md."""
+    """One row of the table in doc/reference/topics_and_services.md."""
 
     type: str
     latched: bool = False  # the last message reaches late joiners

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generates the page `doc/stops.md` from the modes (`supervisor`) and the causes (`stops`).
+"""Generates `doc/reference/stops.md` from the modes (`supervisor`) and the causes (`stops`).
 
-python -m musculoskeletal_ae.control.stops_page > doc/stops.md
+python -m musculoskeletal_ae.control.stops_page > doc/reference/stops.md
 """
 
 from collections.abc import Iterable
@@ -12,11 +12,11 @@ INTRODUCTION = """\
 # Why the arm stops, and what lets it go on
 
 This page is generated from the code: `python -m musculoskeletal_ae.control.stops_page > \
-doc/stops.md`. While the arm is *running*, the mode that the controller reports is what the arm \
-does: {activities}. Otherwise the mode is one of {states}. A program compares these identifiers \
-and those of the causes: the latched topic `controller_mode` has the mode, or the mode and the \
-cause as `stopped:operator_stop`. The values `mode` and `stop cause` of the controller in \
-`/diagnostics` name the same.
+doc/reference/stops.md`. While the arm is *running*, the mode that the controller reports is \
+what the arm does: {activities}. Otherwise the mode is one of {states}. A program compares these \
+identifiers and those of the causes: the latched topic `controller_mode` has the mode, or the \
+mode and the cause as `stopped:operator_stop`. The values `mode` and `stop cause` of the \
+controller in `/diagnostics` name the same.
 
 ## Modes
 

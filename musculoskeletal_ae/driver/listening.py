@@ -2,7 +2,7 @@
 """What the messages of a driver say about it while nothing is commanded.
 
 By what values are possible at all and, where θ is known, by l beside the geometric model's
-(doc/design.md, The driver's contract).
+(doc/explanation/method.md, The driver's contract).
 """
 
 import math

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `experiment` does, and leaves in its folder: result.json, plots, report, results table.
 
-python -m musculoskeletal_ae.experiments.results doc/experiments.md
+python -m musculoskeletal_ae.experiments.results doc/results.md
 
 writes the table of a page anew from the result.json files in doc/results; `experiment … --readme
-doc/experiments.md` first puts what it measured there.
+doc/results.md` first puts what it measured there.
 """
 
 import base64
@@ -251,7 +251,7 @@ def individuals(seeds: Sequence[int]) -> str:
 def readme_table(results: Results) -> str:
     """Return what stands between the markers of a page."""
     if not results:
-        return '\n\nNothing measured yet: `experiment all --readme doc/experiments.md`.\n\n'
+        return '\n\nNothing measured yet: `experiment all --readme doc/results.md`.\n\n'
     about = next(iter(results.values()))['about']
     text = (
         f'\n\n{about["robot"]}, emulated {individuals(about["seeds"])}, '

@@ -156,8 +156,8 @@ def _parse(arguments: list[str]) -> Namespace:
     parser = Parser(
         'check_driver',
         'Listens to the driver of a real arm and says of each muscle whether it keeps the contract '
-        'of doc/your_robot.md: what was seen, and what to change. Move the arm gently by hand '
-        'meanwhile, if you can. Exit status 0: it does, 1: it does not.',
+        'of doc/howto/your_robot.md: what was seen, and what to change. Move the arm gently by '
+        'hand meanwhile, if you can. Exit status 0: it does, 1: it does not.',
         ROS_HELP,
     )
     parser.add_robot()

@@ -97,7 +97,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'faults': Parameter(
             ('',),
             'what is wrong, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
-            '([""] mends; doc/interface.md lists the kinds)',
+            '([""] mends; doc/reference/topics_and_services.md lists the kinds)',
             settable=True,
         ),
         'joint_sensors': Parameter(True, 'publish joint_states'),

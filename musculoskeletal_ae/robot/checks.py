@@ -9,9 +9,9 @@ tension; and the moment arms
 
 the joint torque that one newton of tension makes: r > 0 turns the joint in its positive direction.
 So that all joints have one unit, one that slides is taken as if a pinion of radius RACK turned it:
-where a wire lies along it, r is RACK. What a sound arm is, doc/design.md says ("An arm must be
-holdable"). Beside it, not judged: the one-sided stiffness, in which muscles at the bias tension
-count as slack.
+where a wire lies along it, r is RACK. doc/explanation/method.md ("An arm must be holdable")
+defines a sound arm. Beside it, not judged: the one-sided stiffness, in which muscles at the bias
+tension count as slack.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The format of muscles.yaml (doc/interface.md describes it for users).
+"""The format of muscles.yaml (doc/reference/topics_and_services.md describes it for users).
 
 What depends on robot.urdf, or on values of all muscles, `description` checks afterwards.
 """

@@ -17,7 +17,7 @@ from musculoskeletal_ae.bags.topics import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-# doc/interface.md, Bags.
+# doc/reference/topics_and_services.md, Bags.
 DEFAULT = {
     'joint_states',
     'muscle_states',
@@ -52,7 +52,9 @@ def ours(*names):
 
 
 def test_the_topics_are_those_of_the_interface():
-    text = (Path(__file__).parents[2] / 'doc' / 'interface.md').read_text('utf-8')
+    text = (Path(__file__).parents[2] / 'doc' / 'reference' / 'topics_and_services.md').read_text(
+        'utf-8'
+    )
     table = text.partition('| topic | type |')[2].partition('\n\n')[0]
     told = {
         name for row in table.splitlines()[2:] for name in re.findall('`(.*?)`', row.split('|')[1])

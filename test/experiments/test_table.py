@@ -27,9 +27,9 @@ def rows(key):
 
 
 def test_the_page_says_what_the_committed_results_say():
-    text = (REPOSITORY / 'doc' / 'experiments.md').read_text(encoding='utf-8')
+    text = (REPOSITORY / 'doc' / 'results.md').read_text(encoding='utf-8')
     between = text.split(BEGIN)[1].split(END)[0]
-    remedy = 'run: python -m musculoskeletal_ae.experiments.results doc/experiments.md'
+    remedy = 'run: python -m musculoskeletal_ae.experiments.results doc/results.md'
     assert between == readme_table(read(REPOSITORY / KEPT)), remedy
 
 
