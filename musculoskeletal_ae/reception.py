@@ -20,6 +20,8 @@ class Reception:
         self._warn = warn
         self.last_rejected = ''  # what was wrong with the last one of them
         self.rejected: Counter[str] = Counter()  # messages, by topic and reason
+        #: parts of messages that were not used though the rest was, by topic and what it was
+        self.ignored: Counter[str] = Counter()
         self._received: Counter[str] = Counter()
         self.numbers: Counter[str] = Counter()  # of the newest message, by topic; 0: not known
         #: how often a message was numbered lower than the one before, by topic: once where a
@@ -79,6 +81,12 @@ class Reception:
         if first:
             self._warn(f'rejected {self.last_rejected}')
         return first
+
+    def ignore(self, source: str, part: str) -> None:
+        """Count a part of a message that is not used, such as one joint's position."""
+        self.ignored[f'{source}: {part}'] += 1
+        if self.ignored[f'{source}: {part}'] == 1:
+            self._warn(f'ignored {source}: {part}')
 
     def reject_error(self, source: str, error: Exception) -> bool:
         """Count what a callback let out; say whether it is the first of its kind."""

@@ -6,6 +6,7 @@ A message that breaks a rule raises a `MessageError` with a short reason; the ca
 goes on.
 """
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -88,8 +89,9 @@ def _values(message: Any, rows: int, columns: int) -> Array:
 def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
     """Return θ [rad] (D,) of a measured JointState; joints are matched by name, others ignored.
 
-    All listed joints must be there; with `some` one is enough, and the others are NaN. Velocities
-    and efforts do not count: drivers say NaN where they measure none.
+    All listed joints must be there; with `some` one is enough, and the others are NaN, as are those
+    whose position is not finite (`joints_not_finite` names them). Velocities and efforts do not
+    count: drivers say NaN where they measure none.
     """
     names = _joint_names(message)
     index = {name: i for i, name in enumerate(names)}
@@ -103,9 +105,24 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
         raise MessageError('missing joint', missing)
     position = [message.position[index[name]] if name in index else np.nan for name in joints]
     theta = np.array(position, dtype=float)
-    if np.count_nonzero(np.isfinite(theta)) < len(known):
-        raise MessageError('not finite', 'a position')
+    finite = np.isfinite(theta)
+    if np.count_nonzero(finite) < (1 if some else len(known)):
+        raise MessageError('not finite', _positions_of(joints_not_finite(message, joints)))
+    theta[~finite] = np.nan
     return theta
+
+
+def joints_not_finite(message: Any, joints: Sequence[str]) -> list[str]:
+    """Return which of the listed joints a JointState gives a position that is not finite."""
+    return [
+        name
+        for name, position in zip(message.name, message.position)
+        if name in joints and not math.isfinite(position)
+    ]
+
+
+def _positions_of(names: Sequence[str]) -> str:
+    return f'position of {", ".join(names)}'
 
 
 def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -123,9 +140,12 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
     efforts = np.array(message.effort if len(message.effort) else [0.0] * len(names), dtype=float)
     if len(too_large := efforts[np.abs(efforts) > MOST_EFFORT]):
         raise MessageError('oversized', f'effort {too_large[0]:g}, at most {MOST_EFFORT:g}')
-    for values in (message.position, efforts, message.velocity):
-        if not np.isfinite(np.asarray(values, dtype=float)).all():
-            raise MessageError('not finite', 'a position, effort or velocity')
+    for what, values in (
+        ('position', message.position), ('effort', efforts), ('velocity', message.velocity)
+    ):  # fmt: skip
+        wrong = [name for name, value in zip(names, values) if not math.isfinite(value)]
+        if wrong:
+            raise MessageError('not finite', f'{what} of {", ".join(wrong)}')
     return dict(zip(names, zip(message.position, efforts.tolist())))
 
 
@@ -218,9 +238,12 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
     time = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     if not (np.diff(time, prepend=-1e-9) > 0.0).all() or time[0] < 0.0:
         raise MessageError('times do not increase', str(time[:20].tolist()))
-    parts = [part for part in (position, velocity, acceleration) if part is not None]
-    if not all(np.isfinite(part).all() for part in parts):
-        raise MessageError('not finite', 'a position, velocity or acceleration')
+    for what, part in (
+        ('position', position), ('velocity', velocity), ('acceleration', acceleration)
+    ):  # fmt: skip
+        if part is not None and not np.isfinite(part).all():
+            point, joint = np.argwhere(~np.isfinite(part))[0]
+            raise MessageError('not finite', f'{what} of {names[joint]} at point {point + 1}')
     if velocity is not None and np.abs(velocity[-1]).max() > LAST_VELOCITY:
         raise MessageError('moves at its end', f'last velocities {velocity[-1].tolist()}')
     places = np.array([list(joints).index(name) for name in names])

@@ -15,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.validity import (
+    joints_not_finite,
     read_array,
     read_imu,
     read_muscle_states,
@@ -114,6 +115,31 @@ def test_a_measurement_of_some_joints_leaves_the_others_open():
         read_posture(JointState(name=['x'], position=[1.0]), JOINTS, some=True)
 
 
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_a_sensor_without_a_number_costs_its_joint_only_and_is_named(value):
+    message = JointState(name=['x', 'b', 'a'], position=[value, 2.0, value])
+    np.testing.assert_array_equal(read_posture(message, JOINTS, some=True), [np.nan, 2.0])
+    assert joints_not_finite(message, JOINTS) == ['a']
+    message = JointState(name=['b', 'a'], position=[value, value])
+    with pytest.raises(MessageError, match='not finite: position of b, a'):
+        read_posture(message, JOINTS, some=True)
+
+
+@pytest.mark.parametrize('field', ['position', 'velocity', 'effort'])
+def test_a_target_without_a_number_is_refused_and_names_the_joint(field):
+    values = {'position': [0.1, 0.2], field: [0.1, math.nan]}
+    with pytest.raises(MessageError, match=f'{field} of b'):
+        read_target(JointState(name=['a', 'b'], **values), JOINTS)
+
+
+@pytest.mark.parametrize('field', ['positions', 'velocities', 'accelerations'])
+def test_a_trajectory_without_a_number_is_refused_and_names_joint_and_point(field):
+    rows = {'velocities': [(0.0, 0.0)] * 2, 'accelerations': [(0.0, 0.0)] * 2}
+    rows[field] = [(0.0, 0.0), (math.nan, 0.0)]
+    with pytest.raises(MessageError, match='of b at point 2'):
+        read_trajectory(trajectory(**rows), JOINTS)
+
+
 @pytest.mark.parametrize(
     ('message', 'reason'),
     [
@@ -123,6 +149,7 @@ def test_a_measurement_of_some_joints_leaves_the_others_open():
         (JointState(name=['a', 'b'], position=[1.0]), 'wrong length'),
         (JointState(name=['a', 'b'], position=[1.0, 2.0], effort=[1.0]), 'wrong length'),
         (JointState(name=['a', 'b'], position=[1.0, math.inf]), 'not finite'),
+        (JointState(name=['a', 'b'], velocity=[1.0, 1.0]), 'wrong length'),
         (JointState(name=['x'] * 20_000, position=[0.0] * 20_000), 'oversized'),
         (JointState(name=['a', 'b'], position=[0.0] * 2, velocity=[0.0] * 20_000), 'oversized'),
     ],

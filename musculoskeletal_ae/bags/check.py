@@ -2,7 +2,6 @@
 """What is in a recording, and whether it is whole and fits a robot: `replay --check`."""
 
 from array import array
-from collections import Counter
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -59,7 +58,7 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
     if robot:
         check.faults += results[robot][0]
     if fits:
-        check.lines += [f'rejected {n}: {why}' for why, n in results[fits[0]][1].items()]
+        check.lines += results[fits[0]][1]
     if fits or not robot:
         check.lines.append(f'fits: {", ".join(fits) or "none of the shipped robots (see --robot)"}')
     return check
@@ -119,20 +118,22 @@ def _contents(bag: Bag) -> list[str]:
     return [*lines, '']
 
 
-def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], Counter[str]]:
-    """Return why a bag does not fit a robot, and the messages that were rejected, by reason."""
+def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], list[str]]:
+    """Return why a bag does not fit a robot, and a line for each reason to leave messages out."""
     try:
         robot = Robot.load(name)
         streams = read_streams(bag, robot, namespace)
     except BagError as error:
-        return [f'does not fit {name}: {error}'], Counter()
+        return [f'does not fit {name}: {error}'], []
     except MusculoskeletalError as error:
-        return [str(error)], Counter()
+        return [str(error)], []
+    left_out = [f'rejected {n}: {why}' for why, n in streams.rejected.items()]
+    left_out += [f'used in part {n}: {why}' for why, n in streams.ignored.items()]
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'nothing says whether it fits {name}: no joint_states or muscle_states is in it'
-        return [problem], streams.rejected
+        return [problem], left_out
     misplaced = [
         f'the order of muscles is not that of {name}: {muscle} behaves like {like}'
         for muscle, like in misplaced_muscles(streams.pairs(), robot)
     ]
-    return misplaced, streams.rejected
+    return misplaced, left_out

@@ -21,7 +21,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
-from musculoskeletal_ae.validity import read_array, read_names, read_posture
+from musculoskeletal_ae.validity import (
+    joints_not_finite,
+    read_array,
+    read_names,
+    read_posture,
+)
 
 
 class Series(NamedTuple):
@@ -50,6 +55,7 @@ class Streams(NamedTuple):
     tension_commands: Series  # T_target [N], (N, M)
     isolated: Series  # 1 of isolated muscles, else 0, (N, M)
     rejected: Counter[str]  # messages left out, by topic and reason
+    ignored: Counter[str]  # parts of messages left out, by topic and what it was
 
     def pairs(self) -> Pairs:
         """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.signals.pairing`)."""
@@ -117,12 +123,18 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         has_offsets.append(muscle_stream.body.offsets.known)
         return np.array([sample.length, sample.motor_tension, sample.temperature])
 
+    def posture(message: Any, _: float) -> Array:
+        theta = read_posture(message, joints, some=True)
+        for name in joints_not_finite(message, joints):
+            reception.ignore(recorded['joint_states'], f'position of {name} is not finite')
+        return theta
+
     def rows(count: int) -> Callable[[Any, float], Array]:
         return lambda message, _: read_array(message, count, muscles)
 
     isolated, offsets = _Stream((muscles,), isolated_mask), _Stream((2, muscles), rows(2))
     streams = {
-        'joint_states': _Stream((len(joints),), lambda m, _: read_posture(m, joints, some=True)),
+        'joint_states': _Stream((len(joints),), posture),
         'muscle_states': _Stream((3, muscles), muscle_states),
         'muscle_length_command': _Stream((muscles,), rows(1)),
         'muscle_tension_command': _Stream((muscles,), rows(1)),
@@ -158,7 +170,8 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     if not use.all():
         reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += int((~use).sum())
         states = Series(states.time[use], states.values[use])
-    return Streams(joint_states, states, lengths, tensions, isolated_series, reception.rejected)
+    series = joint_states, states, lengths, tensions, isolated_series
+    return Streams(*series, reception.rejected, reception.ignored)
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:

@@ -9,6 +9,7 @@ Values of isolated muscles become 0 before anything else is done with them. A sa
 version of the body state and the isolated muscles under which it was taken.
 """
 
+import math
 from collections import Counter
 from dataclasses import replace
 
@@ -29,6 +30,8 @@ from musculoskeletal_ae.signals.pairing import Paired, Pairing
 
 #: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
+NO_MESSAGES = 'no muscle_states come'
+NO_JOINTS = 'no usable joint angle comes with muscle_states'
 SPREAD = 0.02  # standard deviation of θ by a camera [rad]; of a prismatic joint times RACK [m]
 
 
@@ -39,6 +42,8 @@ class SampleCollector:
         samples: The samples so far.
         healthy: Messages of the healthy arm, moving or resting.
         rejected: How many messages and rests were not used, by reason.
+        used_at: When the last message came that could be learned from [s]; −∞ before the first.
+        obstacle: Why the messages since then could not be learned from.
     """
 
     def __init__(
@@ -63,6 +68,8 @@ class SampleCollector:
         radian = robot.kinematics.radian
         self.samples, self.healthy = samples, healthy
         self.rejected: Counter[str] = Counter()
+        self.used_at, self.obstacle = -math.inf, NO_MESSAGES
+        self._needs_joints = joint_source == SENSOR
         self._robot = robot
         self._stream = MuscleStream(robot)
         self._pairing = Pairing[MuscleSample](period)
@@ -115,6 +122,7 @@ class SampleCollector:
             sample = self._stream.take_states(states, time)
         except RejectionError as error:
             self.rejected[error.reason] += 1
+            self.obstacle = f'muscle_states are rejected: {error}'
             return None
         if self.body.isolated:
             used = sample.usable
@@ -135,9 +143,14 @@ class SampleCollector:
             check_posture(self._robot, theta, LIMITS.joint_outside)
         except MessageError as error:
             self.rejected[error.reason] += 1
+            self.obstacle = str(error)
             self._skipped = dt
             return []
         self._skipped = 0.0
+        if self._needs_joints and np.isnan(theta).all():
+            self.obstacle = NO_JOINTS
+        else:
+            self.used_at, self.obstacle = paired.time, NO_MESSAGES
         message = paired.message
         reading = Sample(
             theta,

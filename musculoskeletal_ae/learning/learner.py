@@ -14,6 +14,7 @@ Time is the caller's: the ROS clock, recorded or simulated time. All rules about
 Therefore a recording is learned exactly as on a robot, except that training takes no time.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -81,6 +82,8 @@ class Learner:
         """
         self.robot = robot
         self.enabled = True
+        self._waiting_since = math.inf  # time of the first poll, or after a jump of the clock [s]
+        self._polled_at = math.inf
         self.trainer = trainer(robot, preset, seed)
         way = self.trainer.preset
         radian = robot.kinematics.radian
@@ -227,6 +230,8 @@ class Learner:
 
     def poll(self, now: float) -> bytes | None:
         """Begin and end updates at `now` [s]; return a checkpoint if one is to be published."""
+        self._waiting_since = min(self._waiting_since, now)
+        self._polled_at = now
         is_learning = self.enabled and not self.collector.is_anomaly
         if is_learning and self.trainer.ready and self.scheduler.is_due(now, len(self.samples)):
             healthy = self.collector.healthy
@@ -338,6 +343,15 @@ class Learner:
     def trouble(self) -> str:
         """Why nothing is learned, or what is learned is not on disk; or ''."""
         return '; '.join(filter(None, (self.trainer.trouble, self.keeper.trouble)))
+
+    @property
+    def idle_time(self) -> float:
+        """For how long [s] nothing has come that could be learned from; 0 before the first poll."""
+        used_at = self.collector.used_at
+        if used_at > self._polled_at:  # by a clock that has been set back
+            used_at = -math.inf
+        since = max(used_at, self._waiting_since)
+        return max(0.0, self._polled_at - since) if math.isfinite(since) else 0.0
 
     def report(self) -> Report:
         """Return how it is, for /diagnostics."""

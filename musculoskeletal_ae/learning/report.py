@@ -13,6 +13,8 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.learner import Learner
 
+LONGEST_IDLE = 5.0  # [s] without a message to learn from, before that is a warning
+
 
 def learner_report(learner: Learner) -> Report:
     """Return how a learner is."""
@@ -27,6 +29,8 @@ def learner_report(learner: Learner) -> Report:
         message = 'waiting until the estimator has found the length zeros'
     elif learner.collector.is_anomaly:
         message = 'stopped by an anomaly until estimator/reset'
+    elif (idle_time := learner.idle_time) > LONGEST_IDLE:
+        message = f'nothing to learn from for {idle_time:.0f} s: {learner.collector.obstacle}'
     else:
         level, message = 'ok', 'learning'
     return Report(level, message, {**_values(learner), 'state': message})

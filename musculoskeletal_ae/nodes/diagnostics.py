@@ -2,6 +2,7 @@
 """What a node says of itself on /diagnostics: how it is, what came, and what was rejected."""
 
 import time
+from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -21,6 +22,7 @@ class Diagnostics:
         self._node, self._reception, self._hardware = node, reception, hardware
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._told_at = time.monotonic()
+        self._ignored_before = Counter[str]()
 
     def tell(self, report: Report) -> dict[str, int]:
         """Publish a report; return how many messages were used since the last, by topic."""
@@ -33,6 +35,12 @@ class Diagnostics:
         values |= {f'rejected {reason}': str(n) for reason, n in rejected.items()}
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
+        values |= {f'ignored {part}': str(n) for part, n in self._reception.ignored.items()}
+        if newly_ignored := self._reception.ignored - self._ignored_before:
+            self._ignored_before = self._reception.ignored.copy()
+            if report.level == 'ok':
+                message = f'{report.message}; ignored {", ".join(newly_ignored)}'
+                report = Report('warn', message, report.values)
         status = DiagnosticStatus(
             level=getattr(DiagnosticStatus, report.level.upper()),
             name=f'{self._node.get_fully_qualified_name()}: state',

@@ -6,13 +6,16 @@ import sys
 import time
 from argparse import ArgumentTypeError, Namespace
 from contextlib import suppress
+from copy import copy
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos
 
 from musculoskeletal_ae.bags.metadata import offered_qos
@@ -29,6 +32,8 @@ LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # After Ctrl-C: what has arrived and waits to be taken still belongs to the recording.
 DRAIN_TIME = 0.5  # [s]
+# Before it says that it records: to find the publishers that are there, and to be connected.
+DISCOVERY_TIME, CONNECTION_TIME = 0.5, 2.0  # [s]
 
 
 class Record(Node):
@@ -42,14 +47,60 @@ class Record(Node):
         self._early: dict[str, tuple[Topic, bytes, dict[str, int]]] = {}
         self.timeless = 0
         self._sim_time = self.get_parameter('use_sim_time').value
+        self._subscriptions_of: dict[str, Subscription] = {}  # by the name in the interface
+        self._incompatible: dict[str, QoSPolicyKind] = {}  # what a publisher does not offer
         for name in topics:
-            topic = TOPICS[name]
-            resolved = self.resolve_topic_name(name)
-            qos = LATCHED if topic.latched else LIVE
-            receive = partial(self._receive, resolved, topic)
-            self.create_subscription(message_class(topic.type), name, receive, qos, raw=True)
+            self._subscribe(name, LATCHED if TOPICS[name].latched else LIVE)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(FLUSH_PERIOD, writer.flush, clock=steady)
+        self.create_timer(FLUSH_PERIOD, self._look_after, clock=steady)
+
+    def _subscribe(self, name: str, qos: QoSProfile) -> None:
+        receive = partial(self._receive, self.resolve_topic_name(name), TOPICS[name])
+        self._subscriptions_of[name] = self.create_subscription(
+            message_class(TOPICS[name].type), name, receive, qos, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=lambda event: self._on_incompatible(name, event)
+            ),
+        )  # fmt: skip
+
+    def _on_incompatible(self, name: str, event: QoSRequestedIncompatibleQoSInfo) -> None:
+        self._incompatible[name] = event.last_policy_kind
+
+    def _look_after(self) -> None:
+        """Write to disk, and subscribe anew where a publisher offers less than was requested."""
+        self.writer.flush()
+        incompatible, self._incompatible = self._incompatible, {}
+        for name, policy in incompatible.items():
+            before = self._subscriptions_of[name]
+            qos = copy(before.qos_profile)
+            if policy == QoSPolicyKind.RELIABILITY:
+                qos.reliability = ReliabilityPolicy.BEST_EFFORT
+            elif policy == QoSPolicyKind.DURABILITY:
+                qos.durability = DurabilityPolicy.VOLATILE
+            else:  # nothing else is requested
+                continue
+            self.destroy_subscription(before)
+            self._subscribe(name, qos)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the publishers that are known by now are connected."""
+        return all(
+            each.get_publisher_count() >= self.count_publishers(each.topic_name)
+            for each in self._subscriptions_of.values()
+        )
+
+    def missing(self) -> list[str]:
+        """Say of each topic on which nothing came, and whether somebody publishes it."""
+        silent = [
+            each.topic_name
+            for each in self._subscriptions_of.values()
+            if each.topic_name not in self.writer.topics
+        ]
+        return [
+            f'{name}, which {"sent nothing" if self.count_publishers(name) else "nobody publishes"}'
+            for name in silent
+        ]
 
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
@@ -81,24 +132,35 @@ class Record(Node):
         return offered or [offered_qos(topic.latched)]
 
 
-def _record(options: Namespace, arguments: list[str]) -> None:
+def _record(options: Namespace, arguments: list[str]) -> int:
     start_ros(arguments)
     out = options.out or Path(f'{datetime.now():%Y_%m_%d-%H_%M_%S}_bag')  # noqa: DTZ005 - local
     with BagWriter(out, options.compression) as writer:
         node = Record(writer, options.topics)
         with Spinner(node) as spinner:
-            print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
             with suppress(KeyboardInterrupt):
+                # Who starts this and publishes then may rely on being heard.
+                spinner.spin_until(lambda: False, DISCOVERY_TIME)
+                spinner.spin_until(lambda: node.is_connected, CONNECTION_TIME)
+                print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
                 spinner.spin_until(lambda: False, options.duration or math.inf)
             drained, before = time.monotonic() + DRAIN_TIME, -1
             while time.monotonic() < drained and node.received != before:
                 before = node.received
                 spinner.spin_once(0.05)
+        missing = node.missing()
         node.destroy_node()
     if node.timeless:
         problem = 'messages came before the first /clock, and are left out'
         print(f'warning: {node.timeless} {problem}', file=sys.stderr)
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
+    if options.are_chosen and missing:
+        print(f'warning: nothing was recorded of {"; ".join(missing)}', file=sys.stderr)
+        return 1
+    if not writer.message_count:
+        print('warning: nothing was recorded: no topic brought a message', file=sys.stderr)
+        return 1
+    return 0
 
 
 def parse(arguments: list[str]) -> Namespace:
@@ -122,6 +184,7 @@ def parse(arguments: list[str]) -> Namespace:
     if options.recover and (options.topics or options.duration):
         parser.error('--recover copies the whole recording: without --topics and --duration')
     options.out = options.out or options.directory
+    options.are_chosen = bool(options.topics)
     options.topics = options.topics or list(TOPICS)
     return options
 
@@ -144,7 +207,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
             print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
         with STOP.reacting(Reaction.REMEMBER):  # what waits in the queues is still written
-            _record(options, arguments)
+            return _record(options, arguments)
     return 0
 
 

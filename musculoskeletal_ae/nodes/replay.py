@@ -49,7 +49,13 @@ SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
 SETTLE_TIME = 0.3  # [s]
 LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
 TRAJECTORY = 'joint_trajectory'
-ANSWER_TIME, NO_RATE = 2.5 * PERIOD, '0.0 Hz'  # [s] for two reports; how those say that none came
+# How a report on /diagnostics says that no message was used since the one before.
+NO_RATE = '0.0 Hz'
+# [s] for a first report of those that listen, and for two reports after a message was sent.
+FIRST_REPORT_TIME, REPORT_TIME = 2.0 * PERIOD, 5.0 * PERIOD
+SENDINGS = 3  # of a trajectory that does not arrive
+# [s] for subscribers: a recording may begin without them, one message is worth a longer wait.
+WAIT, SEND_WAIT = 2.0, 10.0
 ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
 # Recorded time between two messages on /clock, but not more often than nodes can bear.
 CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
@@ -199,6 +205,92 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
     time.sleep(SETTLE_TIME if longest else 0.0)
 
 
+class _Answers:
+    """What the nodes that listen to a topic say of it on /diagnostics."""
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node, self._topic = node, topic
+        self._refused_before = 0
+        self.reports: list[dict[str, str]] = []
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE)
+
+    @property
+    def listeners(self) -> set[str]:
+        """The names under which the nodes that listen report."""
+        infos = self._node.get_subscriptions_info_by_topic(self._topic)
+        return {f'{info.node_namespace.rstrip("/")}/{info.node_name}: state' for info in infos}
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name in self.listeners:
+                self.reports.append({value.key: value.value for value in status.values})
+
+    def begin(self) -> None:
+        """Forget the reports so far; what they count as refused is an earlier message."""
+        self._refused_before = self._refused
+        self.reports.clear()
+
+    @property
+    def _refused(self) -> int:
+        counted = f'rejected {TRAJECTORY}: '
+        last = self.reports[-1] if self.reports else {}
+        return sum(int(n) for key, n in last.items() if key.startswith(counted) and n.isdecimal())
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether a node reports that it has used a message since."""
+        key = f'{TRAJECTORY} rate'
+        return any(values.get(key, NO_RATE) != NO_RATE for values in self.reports)
+
+    @property
+    def refusal(self) -> str:
+        """Why a node has refused a message since; '' if none reports that."""
+        if not self.reports or self._refused <= self._refused_before:
+            return ''
+        last = self.reports[-1].get('last rejected', '')
+        return last if last.startswith(TRAJECTORY) else 'see its /diagnostics for the reason'
+
+
+def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wait: float) -> None:
+    """Publish a trajectory to nodes that have been matched, and wait until it has been used.
+
+    Raises:
+        MusculoskeletalError: If nobody listens, or the trajectory did not arrive or was refused.
+    """
+    publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
+    answers = _Answers(node, publisher.topic_name)
+    # The list of subscribers may come before the connection to them, or after it.
+    spinner.spin_until(lambda: publisher.get_subscription_count() and answers.listeners, wait)
+    if not publisher.get_subscription_count():
+        found = ', '.join(sorted(answers.listeners))
+        raise MusculoskeletalError(
+            f'no connection to {found} within {wait:g} s: try again, or with a longer --wait'
+            if found
+            else f'nobody listens to {topic}: start the controller first'
+        )
+    spinner.spin_until(lambda: answers.reports, FIRST_REPORT_TIME)
+    has_reported = bool(answers.reports)
+    for _ in range(SENDINGS):
+        answers.begin()
+        publisher.publish(message)
+        is_acknowledged = publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
+        # The first report may have been on its way when the trajectory arrived.
+        spinner.spin_until(
+            lambda: answers.is_taken or answers.refusal or len(answers.reports) > 1,
+            REPORT_TIME if has_reported else 0.0,
+        )
+        if answers.refusal:
+            raise MusculoskeletalError(f'the controller did not take it: {answers.refusal}')
+        if answers.is_taken:
+            return
+        if is_acknowledged and not answers.reports:
+            print(f'{topic}: received; whether it was taken has not been reported', file=sys.stderr)
+            return
+    raise MusculoskeletalError(
+        f'{topic} was sent {SENDINGS} times and did not arrive; is this machine overloaded?'
+    )
+
+
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     """Publish what a hand taught as one trajectory, and say whether the controller took it."""
     names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
@@ -215,32 +307,7 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     start_ros(arguments)
     node = Node('replay')
     topic, spinner = name.removesuffix(TAUGHT_TOPIC) + TRAJECTORY, Spinner(node)
-    publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
-    listeners, reports = set[str](), list[dict[str, str]]()
-
-    def on_diagnostics(message: DiagnosticArray) -> None:
-        statuses = (status for status in message.status if status.name in listeners)
-        reports.extend({value.key: value.value for value in status.values} for status in statuses)
-
-    node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, RELIABLE)
-    _await_subscribers(spinner, [publisher], options.wait)
-    for each in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic)):
-        listeners.add(f'{each.node_namespace.rstrip("/")}/{each.node_name}: state')
-    if not listeners:
-        raise MusculoskeletalError(f'nobody listens to {topic}: start the controller first')
-    publisher.publish(message)
-    publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
-
-    def is_taken() -> bool:
-        return any(values.get(f'{TRAJECTORY} rate', NO_RATE) != NO_RATE for values in reports)
-
-    spinner.spin_until(is_taken, ANSWER_TIME)
-    # The first report may have been on its way; others than our controller may say nothing.
-    if len(reports) > 1 and not is_taken():
-        last, counted = reports[-1].get('last rejected', ''), f'rejected {TRAJECTORY}: '
-        reasons = [key.removeprefix(counted) for key in reports[-1] if key.startswith(counted)]
-        why = last if last.startswith(TRAJECTORY) else ', '.join(reasons) or 'it does not say why'
-        raise MusculoskeletalError(f'the controller did not take it: {why}')
+    _send(node, spinner, message, topic, options.wait)
     length = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
     print(f'{topic}: {length}, the first {LEAD_TIME:g} s of it to where it begins')
     return 0
@@ -297,8 +364,8 @@ def parse(arguments: list[str]) -> Namespace:
     teach = f'send the motion of {TAUGHT_TOPIC} as one smooth joint_trajectory, and end'
     add('--as-trajectory', action='store_true', help=teach)
     add('--paused', action='store_true', help='wait for replay/resume or replay/step')
-    wait = 'longest wait for subscribers [s]'
-    add('--wait', type=not_negative, default=2.0, metavar='S', help=wait)
+    wait = f'longest wait for subscribers [s] (default: {WAIT:g}, --as-trajectory: {SEND_WAIT:g})'
+    add('--wait', type=not_negative, metavar='S', help=wait)
     options = parser.parse_args(arguments)
     if options.rate != 1 and not options.clock:
         parser.error(
@@ -313,6 +380,8 @@ def parse(arguments: list[str]) -> Namespace:
         }
         if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
             parser.error(f'--check plays nothing: without --{ignored[0].replace("_", "-")}')
+    if options.wait is None:
+        options.wait = SEND_WAIT if options.as_trajectory else WAIT
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
     if options.as_trajectory and options.topics != [DEFAULT]:

@@ -50,6 +50,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.validity import (
+    joints_not_finite,
     read_array,
     read_names,
     read_posture,
@@ -430,10 +431,17 @@ class Shell(Node):
     ) -> None:
         """Give `follow` the θ [rad] (D,) that comes on a topic of joint states.
 
-        If `some` joints are enough, the others are NaN.
+        If `some` joints are enough, the others are NaN. A position that is not finite then costs
+        that joint only, and is counted.
         """
         joints = self.robot.joints
-        self.listen(JointState, topic, lambda m: follow(read_posture(m, joints, some)), SENSOR)
+
+        def take(message: JointState) -> None:
+            follow(read_posture(message, joints, some))
+            for name in joints_not_finite(message, joints):
+                self._reception.ignore(topic, f'position of {name} is not finite')
+
+        self.listen(JointState, topic, take, SENSOR)
 
     # -- diagnostics ----------------------------------------------------------------------------
 

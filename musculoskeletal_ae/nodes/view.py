@@ -106,8 +106,9 @@ class View(Node):
             return read_muscle_states(message, robot.muscle_count, self._isolated(), math.nan)
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
-            (arm, JointState, topic, NEWEST, lambda m: read_posture(m, joints))
+            (arm, JointState, topic, NEWEST, partial(read_posture, joints=joints, some=is_measured))
             for arm, topic in ARM_TOPICS.items()
+            for is_measured in [arm == 'measured']
         ]
         table += [
             ('muscles', Float64MultiArray, 'muscle_states', NEWEST, muscles),
@@ -181,6 +182,12 @@ class View(Node):
         self._take()
         self.situation.detected = bool(self._newest('detected', math.inf))
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
+        if (measured := posture.get('measured')) is not None and np.isnan(measured).any():
+            # Joints without a sensor, or whose sensor fails, are drawn where they are estimated.
+            filled = np.where(np.isnan(measured), posture.get('estimated', measured), measured)
+            posture['measured'] = filled
+            if np.isnan(filled).any():
+                del posture['measured']
         states = self._newest('muscles')
         self.page.draw(posture, None if states is None else states[1], self._kinds())
         if now >= self.told + TELL_PERIOD:

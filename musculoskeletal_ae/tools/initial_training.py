@@ -130,6 +130,8 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
     streams = read_streams(bag, robot, namespace)
     for reason, count in streams.rejected.items():
         print(f'warning: {path}: {count} messages rejected, {reason}', file=sys.stderr)
+    for part, count in streams.ignored.items():
+        print(f'warning: {path}: {count} messages used in part, {part}', file=sys.stderr)
     pairs = streams.pairs()
     if not len(pairs.time):
         problem = 'holds no joint_states and muscle_states that belong together'

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -110,11 +110,53 @@ def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
     assert 2 <= bag.message_count <= 31 - int(told[1]), output
 
 
-def test_the_end_is_recorded_too_and_duration_ends_it(tool, graph, tmp_path):
-    recorder = record(tool, graph, tmp_path / 'bag', '--duration', '2', '--topics', 'anomaly')
-    assert '0 messages recorded' in recorder.output()
-    assert recorder.process.returncode == 0
+def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp_path):
+    graph.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
+    wanted = 'anomaly,muscle_states'
+    recorder = record(tool, graph, tmp_path / 'bag', '--duration', '1', '--topics', wanted)
+    output, ns = recorder.output(), graph.namespace
+    assert '0 messages recorded' in output
+    silent = f'{ns}/anomaly, which nobody publishes; {ns}/muscle_states, which sent nothing'
+    assert f'nothing was recorded of {silent}' in output
+    assert recorder.process.returncode == 1
     assert Bag.open(tmp_path / 'bag').message_count == 0
+
+
+@pytest.mark.parametrize('is_late', [False, True])
+def test_a_publisher_that_offers_less_than_usual_is_recorded(tool, graph, tmp_path, is_late):
+    topics = {'muscle_states': Float64MultiArray, 'isolated_muscles': String}
+    qos = {  # unreliable, and not latched
+        'muscle_states': QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT),
+        'isolated_muscles': QoSProfile(depth=5),
+    }
+
+    def advertise():
+        return {
+            name: graph.node.create_publisher(kind, name, qos[name])
+            for name, kind in topics.items()
+        }
+
+    publishers = {} if is_late else advertise()
+    recorder = record(tool, graph, tmp_path / 'bag', '--topics', ','.join(topics))
+    publishers = publishers or advertise()
+    content = {
+        'muscle_states': Float64MultiArray(data=array('d', [1.0] * 18)),
+        'isolated_muscles': String(data='biceps_long'),
+    }
+    for name, publisher in publishers.items():
+        graph.wait(publisher.get_subscription_count, f'a subscriber of {name}')
+
+    def is_recorded():
+        for name, publisher in publishers.items():
+            publisher.publish(content[name])
+        graph.spin(0.1)
+        return (tmp_path / 'bag').exists() and Bag.open(tmp_path / 'bag').topics.keys() >= {
+            f'{graph.namespace}/{name}' for name in topics
+        }
+
+    graph.wait(is_recorded, 'messages of both in the bag')
+    recorder.end(signal.SIGINT)
+    assert recorder.process.returncode == 0
 
 
 def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path):

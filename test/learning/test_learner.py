@@ -397,3 +397,39 @@ def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stag
     jobs = len(learner.trainer.jobs)
     learner.poll(6.0)
     assert len(learner.trainer.jobs) == jobs + 1  # it is learned then
+
+
+NAN = np.nan
+
+
+@pytest.mark.parametrize(
+    ('angles', 'shift', 'obstacle'),
+    [
+        ([NAN, NAN], 0.0, 'no usable joint angle'),
+        ([9.0, 0.0], 0.0, 'joint limits'),
+        ([0.1, 0.2], 5.0, 'muscle_states are rejected'),
+        (None, 0.0, 'no usable joint angle'),
+        ([0.1, NAN], 0.0, ''),  # the other joint is learned from
+    ],
+)
+def test_a_learner_that_gets_nothing_to_learn_from_warns_and_names_why(
+    learner, stage, angles, shift, obstacle
+):
+    sample = stage.sample()
+    learner.poll(0.0)
+    for time in np.arange(0.0, 8.0, DT):
+        theta = None if angles is None else np.array(angles)
+        learner.step(time, theta, sample.tension, sample.length + shift)
+    report = learner.report()
+    assert report.level == ('warn' if obstacle else 'ok')
+    assert obstacle in report.message
+    assert ('nothing to learn from for' in report.message) == bool(obstacle)
+
+
+def test_silence_is_reported_as_nothing_to_learn_from(learner):
+    learner.poll(100.0)
+    assert learner.report().level == 'ok'
+    learner.poll(120.0)
+    assert learner.report().message == 'nothing to learn from for 20 s: no muscle_states come'
+    learner.poll(3.0)  # the clock was set back
+    assert learner.report().level == 'ok'

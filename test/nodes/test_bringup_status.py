@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.nodes import bringup_status
@@ -155,3 +156,20 @@ def test_an_error_of_any_node_is_shown_until_it_is_over():
     assert situation.trouble() == '/left/learner: the disk is full'
     situation.diagnosed(said('/left/learner', 'learning'))
     assert situation.trouble() == ''
+
+
+def test_a_joint_sensor_without_a_number_is_named_and_the_others_are_used(graph):
+    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    graph.listen(DiagnosticArray, '/diagnostics')
+    publisher = graph.publisher(JointState, 'joint_states')
+    first, second = node.robot.joints
+
+    def is_named():
+        publisher.publish(JointState(name=[first, second], position=[0.5, math.nan]))
+        report = graph.report('bringup_status')
+        return f'joint_states: position of {second} is not finite' in report.message and report
+
+    report = graph.wait(is_named, 'the warning')
+    assert report.level == 'warn'
+    assert int(report.values[f'ignored joint_states: position of {second} is not finite']) > 0
+    np.testing.assert_array_equal(node.theta, [0.5, math.nan])
