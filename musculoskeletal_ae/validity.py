@@ -17,6 +17,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.report import distinct
 
 MOST_ENTRIES = 10_000  # far more than any arm has; a longer message is refused unread
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)  # [N], [N·m] at the end effector
@@ -139,7 +140,8 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
         raise MessageError('duplicate joint', repr(name))
     efforts = np.array(message.effort if len(message.effort) else [0.0] * len(names), dtype=float)
     if len(too_large := efforts[np.abs(efforts) > MOST_EFFORT]):
-        raise MessageError('oversized', f'effort {too_large[0]:g}, at most {MOST_EFFORT:g}')
+        effort, most = distinct(too_large[0], np.copysign(MOST_EFFORT, too_large[0]))
+        raise MessageError('oversized', f'effort {effort} N·m, at most ±{most.lstrip("-")}')
     for what, values in (
         ('position', message.position), ('effort', efforts), ('velocity', message.velocity)
     ):  # fmt: skip

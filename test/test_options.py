@@ -2,6 +2,7 @@
 """What every command line has in common."""
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -99,3 +100,18 @@ def test_ctrl_c_ends_without_a_traceback(capsys):
 def test_an_unexpected_exception_is_not_hidden():
     with pytest.raises(ZeroDivisionError):
         exit_status(lambda: 1 // 0)
+
+
+TOOLS = [
+    'nodes.check_driver', 'nodes.record', 'nodes.render', 'nodes.replay', 'nodes.view',
+    'tools.check_robot', 'tools.experiment', 'tools.fit_series_elastic', 'tools.import_robot',
+    'tools.train',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('tool', TOOLS)
+def test_help_states_no_default_twice(tool, capsys):
+    with pytest.raises(SystemExit):
+        import_module(f'musculoskeletal_ae.{tool}').main(['--help'])
+    options = ' '.join(capsys.readouterr().out.split()).split(' --')
+    assert [option for option in options if option.count('(default:') > 1] == []

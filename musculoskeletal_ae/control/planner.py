@@ -21,6 +21,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
 ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
@@ -137,10 +138,10 @@ class Planner:
             return
         k, j = np.argwhere(beyond)[0]
         unit = robot.units[points.joints[j]].theta
+        value, least, most = distinct(points.position[k, j], low[j], high[j], digits=4)
         raise MessageError(
             'beyond the joint limits',
-            f'{robot.joints[points.joints[j]]} {points.position[k, j]:.3f}, '
-            f'legal: {low[j]:.3f} to {high[j]:.3f} {unit}',
+            f'{robot.joints[points.joints[j]]} {value}, legal: {least} to {most} {unit}',
         )
 
     def _slowed(self, mae: Mae, planned: Trajectory) -> Trajectory:

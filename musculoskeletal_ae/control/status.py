@@ -15,6 +15,7 @@ from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import shown
 
+LEAST_SHARE = 10.0  # [%] of its speed, from which on a trajectory's duration says more
 DOING = {
     Activity.IDLE: 'no target',
     Activity.HOLDING: 'holding',
@@ -143,7 +144,11 @@ def slowed(follower: Follower) -> str:
     last = follower.latest
     if last is None or last.slowed == 1.0:
         return ''
-    return f'slowed to {100.0 / last.slowed:.0f} % of its speed for the winches'
+    share = 100.0 / last.slowed
+    if share < LEAST_SHARE:
+        short, long = last.duration / last.slowed, last.duration
+        return f'of {short:.3g} s takes {long:.3g} s: the winches are not faster'
+    return f'slowed to {share:.0f} % of its speed for the winches'
 
 
 def _fallen(core: Controller) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import Condition, StopCause
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.limits import LIMITS
@@ -174,7 +175,8 @@ class HeatLimit:
         self._is_overheated = is_hot or bool(robot.used.any() and not can_pull.any())
         if not self._is_overheated:
             return []
-        detail = f'{robot.muscles[m]} {winding[m]:.0f} °C, limit {highest:g} °C'
+        warm, most = distinct(winding[m], highest)
+        detail = f'{robot.muscles[m]} {warm} °C, limit {most} °C'
         return [Condition(StopCause.OVERHEATED, detail)]
 
 

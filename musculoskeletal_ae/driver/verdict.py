@@ -25,7 +25,7 @@ class FaultTexts(Strict, frozen=True, array_like=True):
     change: str
 
 
-#: by what is wrong
+#: by what is wrong; those of a message that is rejected begin with its topic
 FAULTS = read_table(__file__, 'faults.yaml', dict[str, FaultTexts])
 
 
@@ -63,6 +63,14 @@ class Verdict:
         self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
         change = texts.change.format(**seen)
         self.faults.append(Fault(texts.check, muscles, texts.seen.format(**seen), change))
+
+    def add(self, other: 'Verdict') -> None:
+        """Add what another verdict on the same driver found."""
+        wrong = other._state == WRONG
+        self._state[wrong] = WRONG
+        self._state[(self._state == OPEN) & (other._state == OK)] = OK
+        self.faults += other.faults
+        self.notes += other.notes
 
     @property
     def wrong(self) -> set[str]:

@@ -21,6 +21,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.report import distinct
 
 ABOVE_BIAS = 40.0  # [N] that the highest tension lies above T_bias, unless said otherwise
 LEAST_ABOVE_BIAS = 20.0  # [N]; an answer to less is not told from noise
@@ -37,6 +38,7 @@ LENGTH_ERROR = 2.0e-4  # [m] noise and resolution of l, two standard deviations
 SLOPES = 0.7, 1.4  # of what the law asks for
 RESPONSE = 4.0, 0.0006  # [N], [m] above noise
 CLIP = 20.0, 0.05  # asked for beyond tension.max [N], tolerated beyond it (share)
+MIRROR_TOLERANCE = 0.008  # [m] from −l to where a muscle pulls whose l has the wrong sign
 MOST_BEYOND = 0.3  # share of tension.max that is asked for beyond it
 
 Wait = Generator[None, None, None]  # each step takes one message
@@ -84,12 +86,15 @@ class Winding:
         for m in self._muscles:
             least = self._bias[m] + (LEAST_ABOVE_BIAS * self._scale)[m]
             most = robot.tension.max[m]
-            told = f'muscle {robot.muscles[m]!r} is asked for {least:g} N at least to be judged'
+            asked = 'is asked for {} N at least to be judged'
             if most < least:
-                told = f'{told}, its tension.max is {most:g} N'
-                raise MusculoskeletalError(f'{told}: it is not wound')
+                need, has = distinct(least, most)
+                told = f'{asked.format(need)}, its tension.max is {has} N: it is not wound'
+                raise MusculoskeletalError(f'muscle {robot.muscles[m]!r} {told}')
             if self._highest[m] < least:
-                raise MusculoskeletalError(f'{told}, not {self._highest[m]:g} N')
+                need, given = distinct(least, self._highest[m])
+                told = f'{asked.format(need)}, not {given} N'
+                raise MusculoskeletalError(f'muscle {robot.muscles[m]!r} {told}')
         self.trying = ''  # what is going on, for people
         self.done = False
         self._now = 0.0
@@ -126,7 +131,9 @@ class Winding:
                 self.trying = self._robot.muscles[m]
                 yield from self._try(m)
         except RunAwayError as error:
-            self.verdict.failed('ran away', error.args[0], told=error.args[1])
+            muscle, told, rose = error.args
+            what = 'rising' if rose > RESPONSE[1] else 'ran away'
+            self.verdict.failed(what, muscle, told=told, rose=1e3 * rose)
             # Out, and then silence, in which modules go safe by themselves.
             self._target += 2.0 * RUN_AWAY
             end = self._now + RELEASE
@@ -146,9 +153,11 @@ class Winding:
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())
                 told = f'T rose to {tension[m]:.0f} N, {asked[m]:.0f} N were asked for'
-                raise RunAwayError(m, told)
+                rose = 0.0 if start is None else float(length[m] - start[0][m])
+                raise RunAwayError(m, told, rose)
             if start is not None and (fell := start[0] - length).max() > RUN_AWAY:
-                raise RunAwayError(int(fell.argmax()), f'l fell by {1e3 * fell.max():.0f} mm')
+                told = f'l fell by {1e3 * fell.max():.0f} mm'
+                raise RunAwayError(int(fell.argmax()), told, 0.0)
 
     def _mean(self) -> _Reading:
         readings = np.array([states for _, states in self._recent])
@@ -228,6 +237,8 @@ class Winding:
         if wound[m] < -RESPONSE[1]:
             verdict.failed('sign', m, told=f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in')
         verdict.passed('sign', m)
+        if (other := self._whose_tension(m, home, last)) != m:
+            verdict.failed('tension place', m, other=robot.muscles[other])
         clip = robot.tension.max[m]
         if clip <= self._highest[m]:
             beyond = max((CLIP[0] * self._scale)[m], 2.0 * CLIP[1] * clip)
@@ -262,6 +273,39 @@ class Winding:
         else:
             self.verdict.passed('law', m)
 
+    def _whose_tension(self, m: int, home: _Reading, last: _Reading) -> int:
+        """Return the muscle whose T does what the law asks of m, which was wound in."""
+        asked, got = last.demand - home.demand, last.tension - home.tension
+        if asked[m] < 0.25 * (self._highest - self._bias)[m] or abs(got[m]) > 0.3 * asked[m]:
+            return m
+        other = int((got - asked).argmax())
+        return other if SLOPES[0] < (got - asked)[other] / asked[m] < SLOPES[1] else m
+
+    def _find_onset(self, m: int, home: _Reading) -> Generator[None, None, float | None]:
+        """Go slowly in, and to where l would be if a sign were wrong; return where m pulls [m].
+
+        None if it pulls nowhere on the way. It ends with the first newton that tells, and at once
+        where l and T seem not to be read.
+        """
+        home_length, far = (
+            home.length[m],
+            2.0 * self._response[m] / self._robot.stiffness[m] + SLACK,
+        )
+        answer = self._response[m] + 3.0 * self._swing[m]
+        inwards = min(home_length - FURTHEST, -home_length) - far
+        for goal in (inwards, max(home_length, -home_length) + far):
+            start, direction = self._now, np.sign(goal - home_length)
+            while (gone := SPEED * (self._now - start)) < abs(goal - home_length):
+                yield
+                readings = np.array([states[:2, m] for _, states in self._recent])
+                if (np.ptp(readings, axis=0) == 0.0).any():
+                    return None
+                self._target[m] = home_length + direction * gone
+                if abs(readings[-1, 1] - home.tension[m]) > answer:
+                    return float(self._target[m])
+            yield from self._go(m, home_length)
+        return None
+
     def _ask_outwards(self, m: int, home: _Reading, pulled: Array, wound: Array) -> Wait:
         """Find out why a muscle did not respond, where all pulled [N] and wound in [m] (M,)."""
         other = int(np.where(wound > RESPONSE[1], pulled, -np.inf).argmax())
@@ -273,4 +317,16 @@ class Winding:
         yield from self._wait(HOLD)
         answered = self._mean().tension[m] - home.tension[m] > self._response[m]
         yield from self._go(m, home.length[m])
-        self.verdict.failed('outwards' if answered else 'no answer', m)
+        if answered:
+            self.verdict.failed('outwards', m)
+            return
+        onset = yield from self._find_onset(m, home)
+        self._target[m] = home.length[m]  # at once
+        yield from self._wait(RELEASE)
+        if onset is None:
+            self.verdict.failed('no answer', m)
+        elif abs(onset + home.length[m]) < MIRROR_TOLERANCE:
+            what = 'mirrored' if onset < home.length[m] else 'mirrored command'
+            self.verdict.failed(what, m, at=1e3 * onset, l=1e3 * home.length[m])
+        else:
+            self.verdict.failed('other zero', m, at=1e3 * onset, l=1e3 * home.length[m])

@@ -24,6 +24,7 @@ from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS
 from musculoskeletal_ae.presets import PRESETS, Activation
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
@@ -229,10 +230,12 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
             raise CheckpointError(f'tensor {name} holds a value beyond ±{LARGEST:g}, or not finite')
     for name in ('std', 'touch.spread'):
         if name in tensors and (least := tensors[name].min()) < SMALLEST_STD:
-            problem = f'tensor {name} holds {least:g}; at least {SMALLEST_STD:g} is legal'
+            found, legal = distinct(least, SMALLEST_STD)
+            problem = f'tensor {name} holds {found}; at least {legal} is legal'
             raise CheckpointError(problem)
     if (most := np.abs(tensors.get('touch.friction', np.zeros(1))).max()) > LARGEST_FRICTION:
-        problem = f'tensor touch.friction holds ±{most:g}; at most {LARGEST_FRICTION:g} is legal'
+        found, legal = distinct(most, LARGEST_FRICTION)
+        problem = f'tensor touch.friction holds ±{found}; at most {legal} is legal'
         raise CheckpointError(problem)
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:

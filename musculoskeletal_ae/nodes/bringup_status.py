@@ -62,8 +62,9 @@ class BringupStatus(Shell):
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
             return
         self.started = self.started or now
-        means = (sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies))
-        told, known = self.situation, figures(self.theta is not None, *means)
+        means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
+        unit = self.robot.kinematics.distance_unit
+        told, known = self.situation, figures(self.theta is not None, means[0], means[1], unit)
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  {known}'
         line += f'  samples {told.samples or 0}  checkpoints {told.checkpoints or 0}'

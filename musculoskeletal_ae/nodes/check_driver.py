@@ -13,6 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -31,6 +32,7 @@ STATES, JOINTS, COMMAND = 'muscle_states', 'joint_states', 'muscle_length_comman
 TYPE = 'std_msgs/msg/Float64MultiArray'
 DISCOVERY = 1.0  # [s] in which the others on the graph are found
 SILENCE = 1.0  # [s] without messages that end the winding
+TICK = 0.02  # [s]; a tick that comes late says that this process did not run
 
 
 def _say(text: object) -> None:
@@ -44,13 +46,21 @@ class CheckDriver:
         self.node = Node('check_driver')
         self.robot, self.options = robot, options
         self.topic, self.command = map(self.node.resolve_topic_name, (STATES, COMMAND))
-        self.muscles: Callable[[Float64MultiArray], object] = lambda _: None
+        self.muscles: Callable[[Float64MultiArray, dict[str, int]], object] = lambda *_: None
         self.joints: Callable[[JointState], object] = lambda _: None
         subscribe: Any = self.node.create_subscription
-        subscribe(Float64MultiArray, STATES, lambda message: self.muscles(message), SENSOR)
+        subscribe(Float64MultiArray, STATES, lambda m, info: self.muscles(m, info), SENSOR)
         subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
+        self.on_pause: Callable[[float, float], object] = lambda *_: None
+        self._ticked_at = time.monotonic()
+        self.node.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.spin_until = Spinner(self.node).spin_until
         self.spin_until(lambda: False, DISCOVERY)
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self.on_pause(self._ticked_at + TICK, now)
+        self._ticked_at = now
 
     def _mistyped(self) -> str:
         kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(STATES)}
@@ -61,8 +71,13 @@ class CheckDriver:
         chosen, node = self.options, self.node
         kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
         listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed)
-        self.muscles = lambda message: listening.muscles(message, time.monotonic())
-        self.joints = listening.joints
+
+        def take(message: Float64MultiArray, info: dict[str, int]) -> None:
+            sent = 1e-9 * info['source_timestamp'] or math.nan
+            number = info['publication_sequence_number']
+            listening.muscles(message, time.monotonic(), sent, number)
+
+        self.muscles, self.joints, self.on_pause = take, listening.joints, listening.pause
         self.spin_until(lambda: listening.count, 2.0)
         if not listening.count:
             _say(f'waiting for {self.topic} (ROS_DOMAIN_ID {node.context.get_domain_id()})')
@@ -90,9 +105,7 @@ class CheckDriver:
 
     def wind(self, verdict: Verdict) -> None:
         """Wind each muscle in a little."""
-        muscles = self.robot.muscle_indices(self.options.muscles or [])
-        kind = import_heavy('musculoskeletal_ae.driver.winding').Winding
-        winding = kind(verdict, muscles, self.options.tension)
+        winding = _winding(self.robot, verdict, self.options)
         read = import_heavy('musculoskeletal_ae.validity').read_muscle_states
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
@@ -101,7 +114,7 @@ class CheckDriver:
             return
         last, trying = time.monotonic(), ''
 
-        def follow(message: Float64MultiArray) -> None:
+        def follow(message: Float64MultiArray, _: dict[str, int]) -> None:
             nonlocal last, trying
             now = time.monotonic()
             try:
@@ -126,10 +139,24 @@ class CheckDriver:
             verdict.failed('silence', gap=SILENCE)
 
 
+def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
+    """Return what winds muscles in.
+
+    Raises:
+        MusculoskeletalError: If the options name an unknown muscle, or too small a tension.
+    """
+    muscles = robot.muscle_indices(options.muscles or [])
+    kind = import_heavy('musculoskeletal_ae.driver.winding').Winding
+    return kind(verdict, muscles, options.tension)
+
+
 def _check(options: Namespace, arguments: list[str]) -> int:
     robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(options.robot)
     if options.posture and len(options.posture) != robot.joint_count:
         raise MusculoskeletalError(f'--posture: {robot.joint_count} values are wanted, one a joint')
+    if options.move:  # what cannot be moved is refused before anything is waited for
+        kind = import_heavy('musculoskeletal_ae.driver.verdict').Verdict
+        _winding(robot, kind(robot), options)
     start_ros(arguments)
     driver, told = CheckDriver(robot, options), None
     while True:

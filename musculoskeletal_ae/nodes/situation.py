@@ -26,10 +26,10 @@ ACTIVITIES = {activity.value for activity in Activity}
 EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value
 
 
-def figures(measured: bool, error: float, anomaly: float) -> str:
-    """Return error [rad] and A, or what those that are NaN wait for; `measured`: θ is."""
+def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
+    """Return error and A, or what those that are NaN wait for; `measured`: θ is."""
     joints = 'estimated_joint_states' if measured else 'joint_states'
-    told = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} rad'
+    told = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} {unit}'
     return f'error {told}  A {"waits for anomaly" if math.isnan(anomaly) else f"{anomaly:.3f}"}'
 
 

@@ -218,7 +218,8 @@ class View(Node):
         anomaly = math.nan if anomaly is None else anomaly
         distance = '' if math.isnan(told.distance) else f'  d {told.distance:.0f}'
         lines = [
-            figures('measured' in posture, error, anomaly) + distance,
+            figures('measured' in posture, error, anomaly, self.robot.kinematics.distance_unit)
+            + distance,
             f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
             'waiting for muscle_states' if states is None else told.hint(),
         ]

@@ -19,6 +19,7 @@ from msgspec import UNSET, to_builtins
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text, read_yaml
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot import kinematics, series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.kinematics import Coupling, body_frames, resolved
@@ -206,7 +207,8 @@ def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None
         index = model.joints[model.getJointId(name)].idx_q
         lower, upper = (limit[index] for limit in limits)
         if not -math.inf < lower < upper < math.inf:
-            found = f'joint {name!r} has limits [{lower:g}, {upper:g}] in robot.urdf'
+            least, most = distinct(lower, upper)
+            found = f'joint {name!r} has limits [{least}, {most}] in robot.urdf'
             raise fail(f'$.joints[{i}]: {found}; expected finite lower < upper')
 
 
@@ -265,7 +267,8 @@ def _read_tension(
     tension = default | _entries(entry)
     bias, limit, most = (tension[key] for key in ('bias', 'limit', 'max'))
     if not bias < limit <= most:
-        raise fail(f'{place}: expected bias < limit <= max, got {bias:g}, {limit:g}, {most:g}')
+        told = ', '.join(f'{value:.17g}' for value in (bias, limit, most))
+        raise fail(f'{place}: expected bias < limit <= max, got {told}')
     return tension
 
 

@@ -152,6 +152,8 @@ class Kinematics:
         self.slides = self.prismatic[ids]
         self.radian: Array = np.where(self.slides, RACK, 1.0)
         self.units = tuple(SLIDES if slides else TURNS for slides in self.slides)
+        #: what a distance between postures is measured in, for people
+        self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
         self.local_axis = np.zeros((count, 3))
         # Pose in the parent = placement + a(θ) · first + b(θ) · second.
         self.placements = np.stack([m.homogeneous for m in self.model.jointPlacements])

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot import checks
 from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
 from musculoskeletal_ae.robot.description import shown
@@ -70,6 +71,11 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
     return [*told, 'other routes may help: see --suggest']
 
 
+def rounded(values: Array) -> Array:
+    """Return values with two significant digits."""
+    return np.array([float(f'{value:.2g}') for value in values])
+
+
 def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:
     """Multiply something about an arm, or about one of its joints; say what it then is."""
     robot = copy(setting.robot)
@@ -84,14 +90,19 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
     if what == 'limits':  # and the postures with them
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
-        theta[:, joint] += (1.0 - factor) * (middle - theta[:, joint])
-        low, high = (middle + factor * (end[joint] - middle) for end in (robot.lower, robot.upper))
-        text = f'[{low:.4f}, {high:.4f}] m'
-        text = text if robot.kinematics.slides[joint] else f'[{low:.2f}, {high:.2f}]'
+        slides = robot.kinematics.slides[joint]
+        low, high = (
+            round(float(middle + factor * (end[joint] - middle)), 4 if slides else 2)
+            for end in (robot.lower, robot.upper)
+        )
+        share = (theta[:, joint] - robot.lower[joint]) / (robot.upper - robot.lower)[joint]
+        theta[:, joint] = low + share * (high - low)
+        text = f'[{low:.4f}, {high:.4f}] m' if slides else f'[{low:.2f}, {high:.2f}]'
         return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'
     owner, _, part = what.rpartition('.')
     of: Any = getattr(robot, owner) if owner else robot
-    values = factor * getattr(of, part)
+    # What is measured is the number that a person would write into the file.
+    values = rounded(factor * getattr(of, part))
     vars(robot).update({owner: replace(of, **{part: values})} if owner else {part: values})
     more = ' (and max)' if part == 'limit' and (values > robot.tension.max).any() else ''
     return setting._replace(robot=robot), f'{what} {shown(values)}{more}'

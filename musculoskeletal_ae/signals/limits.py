@@ -13,6 +13,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -97,9 +98,10 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
     j = int(np.nanargmax(np.append(beyond, -np.inf)))
     if j < len(theta) and beyond[j] > outside:
         low, high, unit = robot.lower[j], robot.upper[j], robot.units[j].theta
+        value, least, most = distinct(theta[j], low, high)
         raise MessageError(
             'θ far outside the joint limits',
-            f'{robot.joints[j]} {theta[j]:.3g} {unit}, limits {low:.2f} to {high:.2f}',
+            f'{robot.joints[j]} {value} {unit}, limits {least} to {most}',
         )
 
 

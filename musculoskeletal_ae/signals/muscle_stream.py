@@ -20,6 +20,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
@@ -117,9 +118,10 @@ class LevelCheck:
             return None
         quantity, muscle = np.argwhere(beyond)[0]
         reason, unit = ((LENGTH, 'm'), (TENSION, 'N'), (TEMPERATURE, '°C'))[quantity]
-        value = states[quantity, muscle]
-        legal = f'{low[quantity, muscle]:.3g} to {self._high[quantity, muscle]:.3g} {unit}'
-        return reason, f'{self._robot.muscles[muscle]} {value:.3g} {unit}, possible {legal}'
+        place = quantity, muscle
+        value, least, most = distinct(states[place], low[place], self._high[place])
+        legal = f'{least} to {most} {unit}'
+        return reason, f'{self._robot.muscles[muscle]} {value} {unit}, possible {legal}'
 
 
 class StepCheck:

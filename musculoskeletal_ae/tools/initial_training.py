@@ -115,7 +115,8 @@ def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
     for path, pairs in recordings.items():
         kind = 'held out' if path in args.hold_out else 'learned from'
         after = error(learner.mae, pairs)
-        print(f'{path} ({kind}): {before[path]:.4f} → {after:.4f} rad against its joint sensors')
+        change = f'{before[path]:.4f} → {after:.4f} {robot.kinematics.distance_unit}'
+        print(f'{path} ({kind}): {change} against its joint sensors')
     return learner
 
 

@@ -4,6 +4,8 @@
 Where the arm matters it is an emulated one.
 """
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,6 +13,7 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
 
+from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import DEMANDED, Controller
 from musculoskeletal_ae.control.follower import SHARE, slowness
@@ -454,3 +457,19 @@ def test_a_twist_moves_the_hand_until_it_times_out(bench):
         - begun
     )
     assert gone @ twist[:3] / 0.1 > 0.08
+
+
+@pytest.mark.parametrize('apart', [1e-9, 1e-6])
+def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apart):
+    goals = np.stack([np.array(REST), np.array(OTHER)])
+    bench.core.trajectory(Points(np.arange(2), np.array([1.0, 1.0 + apart]), goals, None, None))
+    follower = bench.core.activities.follower
+    said = status.slowed(follower)
+    assert f'takes {follower.latest.duration:.3g} s' in said, said
+
+
+def test_a_target_just_beyond_a_limit_is_refused_in_numbers_that_differ(bench):
+    beyond = np.array([0.0, ROBOT.upper[1] + 2e-6])
+    with pytest.raises(MessageError) as error:
+        bench.core.trajectory(points(beyond))
+    assert len(set(re.findall(r'-?\d+\.\d+', str(error.value)))) == 3

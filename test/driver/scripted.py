@@ -26,6 +26,7 @@ class Driver:
         self.publish: Callable = lambda rows: rows
         self.take: Callable = lambda target: target
         self.names = robot.joints
+        self.angles: Callable = lambda theta: theta  # (D,) as published
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
         self._commands: deque = deque()
@@ -66,7 +67,8 @@ class Driver:
                 self.arm.set_wrench(30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0])))
             for theta, rows in self.step():
                 if joints:
-                    listening.joints(joint_state(dict(zip(self.names, theta))))
+                    angles = self.angles(theta)
+                    listening.joints(joint_state(dict(zip(self.names, angles))))
                 listening.muscles(array(rows), self.now)
         self.arm.set_wrench(np.zeros(6))
         return listening.verdict(self.now)

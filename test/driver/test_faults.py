@@ -3,15 +3,18 @@
 
 import copy
 import math
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from driver.scripted import Driver, array, joint_state
+from musculoskeletal_ae import validity
 from musculoskeletal_ae.driver.listening import Listening
-from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange
@@ -59,6 +62,24 @@ def with_nan(rows):
     return rows
 
 
+def minus_tension(rows):
+    rows = rows.copy()
+    rows[1, BICEPS] *= -1.0
+    return rows
+
+
+def less_tension(rows):
+    rows = rows.copy()
+    rows[1, BICEPS] -= 35.0
+    return rows
+
+
+def with_tensions(rows):
+    rows = rows.copy()
+    rows[1] = exchanged(rows[1])
+    return rows
+
+
 def shifted(rows):
     rows = rows.copy()
     rows[0, BICEPS] += 0.08
@@ -91,8 +112,13 @@ HEARD = {
     ),
     'l in mm': (scaled(1000, 1, 1), 'at rest', 'unit', 'lengths look like mm'),
     'l in mm, moved': (scaled(1000, 1, 1), 'moved', 'unit', 'lengths look like mm'),
-    'T in mN': (scaled(1, 1000, 1), 'at rest', 'unit', 'does pull count as +'),
-    'sign of every T': (scaled(1, -1, 1), 'at rest', 'unit', 'does pull count as +'),
+    'T in mN': (scaled(1, 1000, 1), 'at rest', 'unit', 'tensions look like mN'),
+    'T in kgf': (scaled(1, 1 / 9.81, 1), 'at rest', 'unit', 'tensions look like kgf'),
+    'T in kN, moved': (scaled(1, 1e-3, 1), 'moved', 'unit', 'tensions look like kN'),
+    'sign of every T': (scaled(1, -1, 1), 'at rest', 'sign', 'has the wrong sign'),
+    'sign of one T': (minus_tension, 'at rest', 'unit', 'does pull count as +'),
+    'zero of one T off by -35 N': (less_tension, 'at rest', 'law', 'with the wire off'),
+    'tenths of °C': (scaled(1, 1, 10), 'at rest', 'unit', 'temperatures look like tenths'),
     'temperatures in K': (lambda rows: rows + [[0], [0], [273.15]], 'at rest', 'unit', 'like K'),
     'sign of every l': (flipped, 'moved', 'sign', 'must fall when the motor winds in'),
     'sign of one l': (lambda rows: flipped(rows, [BICEPS]), 'moved', 'sign', 'biceps_long'),
@@ -102,6 +128,57 @@ HEARD = {
     'NaN tension': (with_nan, 'at rest', 'rate', 'not finite'),
     'two rows': (lambda rows: rows[:2], 'at rest', 'order', '3×M values'),
 }
+
+
+ANGLES = {
+    'degrees': (np.degrees, 'unit', 'look like degrees'),
+    'sign of one': (lambda theta: theta * [1.0, -1.0], 'sign', 'the angle of elbow is turned'),
+    'sign of all': (lambda theta: -theta, 'sign', 'shoulder, elbow'),
+    'exchanged': (lambda theta: theta[::-1], 'order', 'shoulder, elbow are exchanged'),
+}
+
+
+@pytest.mark.parametrize('name', ANGLES)
+def test_a_fault_of_the_joint_sensors_is_not_blamed_on_the_lengths(name):
+    driver = Driver(ROBOT)
+    driver.angles, check, reported = ANGLES[name]
+    verdict = driver.listen(8.0, moved=True)
+    assert verdict.wrong == {check}, str(verdict)
+    assert reported in str(verdict)
+
+
+def test_advice_on_a_rejected_message_is_that_of_its_topic():
+    listening = Listening(ROBOT, 100.0)
+    velocities = joint_state({})
+    velocities.name, velocities.velocity = list(ROBOT.joints), [0.0, 0.0]
+    listening.joints(velocities)
+    listening.joints(joint_state(dict.fromkeys(ROBOT.joints, math.nan)))
+    listening.joints(joint_state({}))
+    listening.muscles(array(np.zeros((2, M))), 0.0)
+    advice = [fault.change for fault in listening.verdict(0.1).faults]
+    assert sum('fill `position`, one value for each name' in change for change in advice) == 1
+    assert sum('3×M' in change for change in advice) == 1  # of muscle_states alone
+
+
+def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
+    source = Path(validity.__file__).read_text('utf-8')
+    readers = {
+        'muscle_states': ('read_muscle_states', '_values'),
+        'joint_states': ('read_posture', '_joint_names'),
+    }
+    for topic, functions in readers.items():
+        for name in functions:
+            text = source.partition(f'def {name}(')[2].partition('\ndef ')[0]
+            reasons = re.findall(r"MessageError\(\s*'([^']+)'", text)
+            assert reasons
+            assert {f'{topic}: {reason}' for reason in reasons} <= FAULTS.keys()
+
+
+def test_one_joint_sensor_without_a_number_is_named():
+    driver = settled()
+    driver.angles = lambda theta: np.array([theta[0], math.nan])
+    verdict = driver.listen(1.0)
+    assert 'the position of elbow was not finite in 100 messages' in str(verdict)
 
 
 @pytest.mark.parametrize('name', HEARD)
@@ -144,6 +221,51 @@ def test_slow_repeated_and_frozen_messages_are_found():
     frozen.publish = freeze
     verdict = frozen.listen()
     assert [fault.muscles for fault in verdict.faults] == [(3,)], str(verdict)
+
+
+class Messages:
+    """Brings messages of a driver at rest to `Listening`, at times of the test's choice."""
+
+    def __init__(self):
+        self.listening, self.driver = Listening(ROBOT, 100.0), settled()
+        self.number = 0
+
+    def bring(self, count, sent, came, lost=()):
+        """Bring messages; `sent` and `came` [s] are functions of their number."""
+        for n in range(count):
+            self.number += 1
+            if n not in lost:
+                (_, rows), *_ = self.driver.step()
+                self.listening.muscles(array(rows), came(n), sent(n), self.number)
+
+
+def test_messages_that_wait_in_a_busy_computer_are_no_fault_of_the_driver():
+    messages = Messages()
+    sent = lambda n: 1000.0 + 0.01 * n  # noqa: E731
+    messages.bring(300, sent, lambda n: 0.01 * n + (0.5 if 100 <= n < 150 else 0.0))
+    verdict = messages.listening.verdict(3.0)
+    assert not verdict.faults, str(verdict)
+
+
+def test_messages_that_are_lost_on_the_way_are_no_fault_of_the_driver():
+    messages = Messages()
+    lost = {*range(100, 140), *range(200, 240)}
+    messages.bring(300, lambda n: 1000.0 + 0.01 * n, lambda n: 0.01 * n, lost)
+    verdict = messages.listening.verdict(3.0)
+    assert not verdict.faults, str(verdict)
+    assert '80 of 300 messages were lost on the way' in str(verdict)
+
+
+@pytest.mark.parametrize('is_busy', [True, False])
+def test_a_gap_in_which_this_computer_did_not_run_is_told_apart(is_busy):
+    messages = Messages()
+    late = lambda n: 0.01 * n + (0.6 if n >= 100 else 0.0)  # noqa: E731
+    messages.bring(300, lambda n: 1000.0 + late(n), late)
+    if is_busy:
+        messages.listening.pause(1.05, 1.55)
+    verdict = messages.listening.verdict(3.6)
+    assert verdict.wrong == (set() if is_busy else {'rate'}), str(verdict)
+    assert ('this computer is busy' if is_busy else 'nothing came for 0.61 s') in str(verdict)
 
 
 def test_a_driver_that_falls_silent_is_found():
@@ -229,6 +351,14 @@ WOUND = {
         'sign',
         'a longer l_target winds it in',
     ),
+    'sign of l': ({'publish': flipped}, 'sign', 'turn the sign of l round'),
+    'sign of the command': ({'take': lambda t: -t}, 'sign', 'turn the sign of the command'),
+    'T of two muscles exchanged': (
+        {'publish': with_tensions},
+        'order',
+        'T of deltoid_posterior rises',
+    ),
+    'commands counted from another zero': ({'take': lambda t: t + 0.03}, 'zero', 'same zero'),
     'half the stiffness': ({'in_tension': law(stiffness=K / 2)}, 'law', f'K {K:g} N/m'),
     'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law asks for'),
     'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),

@@ -7,6 +7,7 @@ import pytest
 from graph import PATIENCE, Process, executable
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
+from musculoskeletal_ae.nodes import check_driver
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 
 
@@ -79,6 +80,19 @@ def test_a_topic_of_the_wrong_type_is_reported(graph):
     status, output = check(graph, '--seconds', '1').ended()
     assert status == 1
     assert 'is a std_msgs/msg/Float32MultiArray' in output
+
+
+@pytest.mark.parametrize(
+    ('options', 'problem'),
+    [
+        (['--muscles', 'bicep_long'], "unknown muscle 'bicep_long'"),
+        (['--tension', '35'], 'at least to be judged'),
+    ],
+)
+def test_what_cannot_be_moved_is_refused_at_once(options, problem, capsys):
+    arguments = ['--robot', 'arm26', '--seconds', '1000', '--move', *options]
+    assert check_driver.main(arguments) == 1
+    assert problem in capsys.readouterr().err
 
 
 def test_check_driver_does_not_move_an_arm_under_control(graph):

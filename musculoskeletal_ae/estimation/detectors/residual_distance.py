@@ -34,6 +34,7 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Obser
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
@@ -184,7 +185,8 @@ class ResidualDistance(Detector):
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''
-        return f'{name} = {value:.3g} above {limit:.3g}{where} in {IN_A_ROW} consecutive messages'
+        reached, most = distinct(value, limit)
+        return f'{name} = {reached} above {most}{where} in {IN_A_ROW} consecutive messages'
 
     def _least_likely(self, bone_tension: Array, length: Array, candidates: Bools) -> int:
         """Return the muscle without which the remaining residual is most likely."""
