@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What becomes of a message, live or of a bag: used, or rejected and counted by reason."""
 
+import math
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -8,6 +10,7 @@ from typing import Any
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
+SHOWN = 10.0  # [s] for which the last refusal is shown
 # A source time that lies further back than this is another publisher's clock, not a reordering.
 REORDERING = 1_000_000_000  # [ns]
 
@@ -22,6 +25,9 @@ class Reception:
         self.rejected: Counter[str] = Counter()  # messages, by topic and reason
         #: parts of messages that were not used though the rest was, by topic and what it was
         self.ignored: Counter[str] = Counter()
+        #: topics by which somebody asks for something: who asks is to see that it was refused
+        self.commands: set[str] = set()
+        self._refusal = '', -math.inf  # the last one of a command, and when it was refused [s]
         self._received: Counter[str] = Counter()
         self.numbers: Counter[str] = Counter()  # of the newest message, by topic; 0: not known
         #: how often a message was numbered lower than the one before, by topic: once where a
@@ -77,10 +83,22 @@ class Reception:
         """Count a message or request; say whether it is the first for this reason."""
         self.last_rejected = f'{source}: {detail}'[:LONGEST_TEXT]
         self.rejected[f'{source}: {reason}'] += 1
+        if source in self.commands:
+            self.refuse(self.last_rejected)
         first = self.rejected[f'{source}: {reason}'] == 1
         if first:
             self._warn(f'rejected {self.last_rejected}')
         return first
+
+    def refuse(self, text: str) -> None:
+        """Note that something which somebody asked for is not done, and why."""
+        self._refusal = text[:LONGEST_TEXT], time.monotonic()
+
+    @property
+    def refusal(self) -> str:
+        """What was refused in the last seconds, with the reason; ''."""
+        text, refused_at = self._refusal
+        return text if time.monotonic() - refused_at < SHOWN else ''
 
     def ignore(self, source: str, part: str) -> None:
         """Count a part of a message that is not used, such as one joint's position."""

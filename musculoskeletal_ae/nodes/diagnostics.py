@@ -36,11 +36,12 @@ class Diagnostics:
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
         values |= {f'ignored {part}': str(n) for part, n in self._reception.ignored.items()}
+        if refusal := self._reception.refusal:
+            values['refused'] = refusal
+            report = _with_warning(report, f'refused {refusal}')
         if newly_ignored := self._reception.ignored - self._ignored_before:
             self._ignored_before = self._reception.ignored.copy()
-            if report.level == 'ok':
-                message = f'{report.message}; ignored {", ".join(newly_ignored)}'
-                report = Report('warn', message, report.values)
+            report = _with_warning(report, f'ignored {", ".join(newly_ignored)}')
         status = DiagnosticStatus(
             level=getattr(DiagnosticStatus, report.level.upper()),
             name=f'{self._node.get_fully_qualified_name()}: state',
@@ -52,3 +53,10 @@ class Diagnostics:
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
         return received
+
+
+def _with_warning(report: Report, warning: str) -> Report:
+    """Return a report with one more warning; an error stays the error that it is."""
+    if report.level == 'error':
+        return report
+    return Report('warn', f'{report.message}; {warning}', report.values)

@@ -22,10 +22,11 @@ from rcl_interfaces.msg import (
 )
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
@@ -63,6 +64,13 @@ if TYPE_CHECKING:  # it needs what writes bags
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
 MOST_ZERO = 10.0  # [m] of a length sensor
+#: what to do about a quality of service that does not fit, by who states it
+QOS_REMEDIES = {
+    ('publisher offers', QoSPolicyKind.RELIABILITY): 'publish it reliable',
+    ('publisher offers', QoSPolicyKind.DURABILITY): 'publish it transient local (latched)',
+    ('subscriber asks', QoSPolicyKind.RELIABILITY): 'subscribe best-effort',
+    ('subscriber asks', QoSPolicyKind.DURABILITY): 'subscribe volatile',
+}
 LOOK_AROUND = 0.1  # [s] between looks at who publishes
 LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
 
@@ -140,7 +148,30 @@ class Shell(Node):
         rclpy subscribes to /clock by this method as well.
         """
         guarded = self._guarded(self.resolve_topic_name(topic), callback)
+        if qos_profile is RELIABLE:
+            self._reception.commands.add(topic)
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda event: self._on_incompatible(topic, 'publisher offers', event)
+        )
+        options.setdefault('event_callbacks', events)
         return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
+
+    def create_publisher(  # type: ignore[override]
+        self, msg_type: Any, topic: str, qos_profile: Any, **options: Any
+    ) -> Any:
+        """Advertise; a subscriber that cannot be served is reported."""
+        events = PublisherEventCallbacks(
+            incompatible_qos=lambda event: self._on_incompatible(topic, 'subscriber asks', event)
+        )
+        options.setdefault('event_callbacks', events)
+        return super().create_publisher(msg_type, topic, qos_profile, **options)
+
+    def _on_incompatible(self, topic: str, who: str, event: Any) -> None:
+        policy = QoSPolicyKind(event.last_policy_kind)
+        remedy = QOS_REMEDIES.get((who, policy), 'see "Quality of service" in the interface')
+        problem = f'a {who} another {policy.name.lower()} than this node: {remedy}'
+        self._reception.reject(topic, 'incompatible QoS', f'incompatible QoS: {problem}')
+        self._reception.refuse(f'{topic}: incompatible QoS: {problem}')
 
     def create_timer(  # type: ignore[override]
         self, timer_period_sec: float, callback: Any, **options: Any
