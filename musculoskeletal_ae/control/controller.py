@@ -232,8 +232,11 @@ class Controller:
         self.sample = sample
         self.watchdog.take_sample(sample, now)
 
-    def estimated(self, theta: Array, now: float) -> None:
-        """Take estimated θ [rad] (D,); a MessageError says that no joints can be there."""
+    def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
+        """Take estimated θ [rad] (D,); a MessageError says that no joints can be there.
+
+        An estimate that is not `is_new`, such as one that is repeated, keeps its age.
+        """
         known = self.stream.body.offsets.known
         if not known:  # a guess of the offsets may make any posture
             theta = np.clip(theta, self.robot.lower, self.robot.upper)
@@ -243,7 +246,8 @@ class Controller:
             self._estimate_problem.note(str(error), now)
             raise
         self._estimate_problem.note('', now)
-        self.watchdog.take_estimate(now)
+        if is_new:
+            self.watchdog.take_estimate(now)
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:

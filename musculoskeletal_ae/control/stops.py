@@ -43,6 +43,7 @@ class Declaration(NamedTuple):
 
 RESET = 'call controller/reset'
 REPAIR = 'repair the muscle; call estimator/reset'
+ZERO = 'call estimator/zero'
 EXPLORE = 'controller/explore explores again'
 
 
@@ -116,11 +117,12 @@ class StopCause(Enum):
     SECOND_PUBLISHER = (
         'second_publisher',
         Declaration(
-            'more than one node publishes muscle_states',
+            'another node publishes a topic of the driver, the estimator, the learner or the '
+            'controller',
             Action.RELEASE,
             Clears.RESET,
             'several publishers',
-            f'end all publishers but the driver; {RESET}',
+            f'end the node that does not belong to this arm; {RESET}',
         ),
     )
     IMPLAUSIBLE_MUSCLE_STATES = (

@@ -186,7 +186,7 @@ class Watchdog:
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.age, self.overload, self.heat = DataAge(), Overload(robot), HeatLimit(robot)
         self.has_checkpoint = self.has_anomaly = False
-        self.second_publisher = ''  # which nodes publish muscle_states, if it is more than one
+        self.second_publisher = ''  # who publishes beside the rightful publishers
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:

@@ -129,9 +129,9 @@ class Estimator:
     def use(self, mae: Mae) -> None:
         """Use this network and its healthy statistics, without the isolated muscles.
 
-        Until this estimator has isolated or found anything, those are the muscles that were
-        isolated when the network was learned. A length calibration begins again: its guess depends
-        on the network.
+        Until this estimator has isolated or found anything, or `keep_isolated` was called, those
+        are the muscles that were isolated when the network was learned. A length calibration
+        begins again: its guess depends on the network.
 
         Raises:
             numpy.linalg.LinAlgError: If its statistics are singular; the network before stays.
@@ -145,6 +145,10 @@ class Estimator:
         self._use_body(self.body.with_isolated(isolated))
         if self.calibration is not None:
             self.calibration = LengthCalibration(self.robot, reduced, self.calibration.posture)
+
+    def keep_isolated(self) -> None:
+        """Follow no network any more in which muscles are isolated: from now on we know."""
+        self._follows_network = False
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Isolate these muscles (positions in T and l), and restore all others.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.signals.body_state import KNOWN
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
@@ -19,12 +20,12 @@ SILENCE = 1.0  # [s] without a message, beyond which there is nothing to estimat
 def report(core: Estimator, now: float) -> Report:
     """Return level, message and values of a core; `now` is on a steady clock [s].
 
-    The values `finding` and `verification` are identifiers for programs, and `last outcome` is one
-    of `verification.Outcome`.
+    The values `state`, `finding` and `verification` are identifiers for programs, and `last
+    outcome` is one of `verification.Outcome`.
     """
     mae = core.state.mae
     if mae is None:
-        return Report('warn', 'waiting for a checkpoint', {})
+        return Report('warn', 'waiting for a checkpoint', {'state': 'no_checkpoint'})
     values = {
         **_network(core, mae),
         **_suspects(core),
@@ -35,23 +36,27 @@ def report(core: Estimator, now: float) -> Report:
     }
     if core.suspects.finding is not None:
         verifying = '' if core.suspects.verification is None else '; verifying it'
-        return Report('error', f'anomaly detected: {core.suspects.cause}{verifying}', values)
+        text = f'anomaly detected: {core.suspects.cause}{verifying}'
+        return Report('error', text, {**values, 'state': 'anomaly'})
     if now - core.stepped_at > SILENCE:
-        return Report('warn', 'no muscle_states', values)
+        return Report('warn', 'no muscle_states', {**values, 'state': 'no_muscle_states'})
     if core.calibration is not None:
         progress = core.calibration.progress
-        return Report('warn', f'finding the length zeros: {progress}', values)
+        text = f'finding the length zeros: {progress}'
+        return Report('warn', text, {**values, 'state': 'calibrating'})
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:
         drifting = (
             f'{core.robot.muscles[muscle]}: its module {how}'
             for muscle, how in core.heat.changed.items()
         )
-        return Report('warn', f'anomaly of a cool muscle: {"; ".join(drifting)}', values)
+        text = f'anomaly of a cool muscle: {"; ".join(drifting)}'
+        return Report('warn', text, {**values, 'state': 'thermal_drift'})
     if core.body.isolated:
         without = core.robot.names(core.body.isolated)
-        return Report('warn', f'estimating{calibrated} without {without}', values)
-    return Report('ok', f'estimating{calibrated}', values)
+        text = f'estimating{calibrated} without {without}'
+        return Report('warn', text, {**values, 'state': 'isolated'})
+    return Report('ok', f'estimating{calibrated}', {**values, 'state': 'estimating'})
 
 
 def _network(core: Estimator, mae: Mae) -> dict[str, str]:
@@ -108,12 +113,15 @@ def _contact(core: Estimator) -> dict[str, str]:
 
 
 def _offsets(core: Estimator) -> dict[str, str]:
-    offsets = core.body.offsets
+    offsets, values = core.body.offsets, dict[str, str]()
+    if not offsets.known:
+        unknown = np.flatnonzero(~(offsets.deviation < KNOWN))
+        values['unknown length zeros'] = core.robot.names(unknown)
     if not offsets.offset.any():
-        return {}
+        return values
     rows = zip(core.robot.muscles, 1e3 * offsets.offset, 1e3 * offsets.deviation)
     each = (f'{name} {offset:.1f} ± {deviation:.1f} mm' for name, offset, deviation in rows)
-    return {'length zeros': ', '.join(each)}
+    return {**values, 'length zeros': ', '.join(each)}
 
 
 def _familiarity(core: Estimator) -> dict[str, str]:

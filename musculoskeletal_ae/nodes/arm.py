@@ -24,6 +24,7 @@ from musculoskeletal_ae.nodes.messages import (
     joint_message,
 )
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.nodes.sources import COMMANDS
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_wrench
@@ -102,7 +103,9 @@ class Frames:
 
 
 class Arm(Shell):
-    """A node that stands for an arm."""
+    """A node that stands for an arm. Like real muscle modules it obeys whoever commands it."""
+
+    accepted_from_all = COMMANDS
 
     @property
     def longest_step(self) -> float:
@@ -117,6 +120,7 @@ class Arm(Shell):
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
         """Advertise the states below a prefix; the description is the robot's own to publish."""
         self._joints = None
+        self.sources.watch(f'{prefix}joint_states', f'{prefix}muscle_states')
         if joint_sensors:
             self._joints = self.create_publisher(JointState, f'{prefix}joint_states', RELIABLE)
         self._muscles = self.create_publisher(Float64MultiArray, f'{prefix}muscle_states', RELIABLE)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `bringup_status`: one line a second about a running arm, for `bringup.sh`.
 
-joint_states, estimated_joint_states, anomaly, anomaly_detected, /diagnostics → stdout.
+joint_states, estimated_joint_states, anomaly, /diagnostics → stdout. Its own report on /diagnostics
+is the situation of the whole arm: as bad as the worst of all nodes.
 """
 
 import math
 import sys
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
+from musculoskeletal_ae.report import Report
 
 
 class BringupStatus(Shell):
@@ -38,7 +39,6 @@ class BringupStatus(Shell):
         self.follow_posture('joint_states', self._measured, some=True)
         self.follow_posture('estimated_joint_states', self._estimated)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
-        self.follow_anomaly(partial(setattr, self.situation, 'detected'))
         self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
         self.create_timer(1.0, self._print, clock=STEADY)
 
@@ -55,8 +55,14 @@ class BringupStatus(Shell):
         if (measured := self.theta) is not None:
             self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - measured))))
 
+    def report(self) -> Report:
+        """Return the situation of the whole arm."""
+        self.situation.tick()
+        return Report(self.situation.level(), self.situation.trouble() or 'all nodes are well', {})
+
     def _print(self) -> None:
         now = time.monotonic()
+        self.situation.tick()
         if self.started is None and not self.anomalies:
             if 0.0 < self.patience < now - self.begun:
                 sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')

@@ -31,14 +31,17 @@ class Candidates:
         queue: Candidates from the topic, which are validated in small steps.
     """
 
-    def __init__(self, node: Shell, use: Callable[[Mae], None]) -> None:
+    def __init__(
+        self, node: Shell, use: Callable[[Mae], None], on_candidate: Callable[[], None]
+    ) -> None:
         """Begin without a network.
 
         Args:
             node: The estimator.
             use: Puts an accepted network to use.
+            on_candidate: Is called when a candidate from the topic was accepted.
         """
-        self._node, self._use = node, use
+        self._node, self._use, self._on_candidate = node, use, on_candidate
         self.validator = CheckpointValidator(node.robot)
         self._publisher = node.create_publisher(UInt8MultiArray, ACCEPTED, LATCHED)
         self.queue = node.checkpoint_queue(CANDIDATES, self._validate)
@@ -65,6 +68,7 @@ class Candidates:
         yield
         yield from self.validator.trial(mae)
         self._accept(mae, message)
+        self._on_candidate()
 
     def _use_file(self, mae: Mae) -> None:
         self.validator.check(mae)

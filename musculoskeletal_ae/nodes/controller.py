@@ -22,21 +22,22 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
+from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.sources import AUTHORS, Stamps
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
     read_pose,
+    read_posture,
     read_target,
     read_trajectory,
     read_twist,
@@ -47,6 +48,9 @@ from musculoskeletal_ae.validity import (
 class Controller(Shell):
     """Node shell of control."""
 
+    # Several publishers stop the arm. What pays it out then has to go by the readings that come.
+    accepted_from_all = frozenset({'muscle_states'})
+
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
@@ -55,6 +59,7 @@ class Controller(Shell):
         self.logged: list[str] = []
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
         self.published_mode = ''
+        self.estimate_stamps = Stamps()
         self.publishers_of = {
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
@@ -67,9 +72,9 @@ class Controller(Shell):
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
         self.follow_zeros(self._use_offsets)
-        watchdog = self.core.watchdog
-        self.follow_muscle_messages(self._muscles, partial(setattr, watchdog, 'second_publisher'))
-        self.follow_posture('estimated_joint_states', self._estimated)
+        self.sources.watch(*AUTHORS)
+        self.follow_muscle_messages(self._muscles)
+        self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(JointTrajectory, 'joint_trajectory', self._trajectory, RELIABLE)
         self.listen(PoseStamped, 'target_pose', self._pose, RELIABLE)
@@ -131,8 +136,14 @@ class Controller(Shell):
     def _anomaly(self, detected: bool) -> None:
         self.core.anomaly(detected)
 
-    def _estimated(self, theta: Array) -> None:
-        self.core.estimated(theta, time.monotonic())
+    def on_intruders(self, intruders: str) -> None:
+        """Stop while anybody else publishes what one of the arm's nodes should."""
+        self.core.watchdog.second_publisher = intruders
+
+    def _estimated(self, message: JointState) -> None:
+        theta = read_posture(message, self.robot.joints)
+        is_new = self.estimate_stamps.is_new(message.header.stamp)
+        self.core.estimated(theta, time.monotonic(), is_new)
         # The estimate is made from the newest muscle states: now everything is fresh.
         self._step()
 

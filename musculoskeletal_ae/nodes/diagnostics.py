@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a node says of itself on /diagnostics: how it is, what came, and what was rejected."""
 
+import secrets
 import time
 from collections import Counter
 
@@ -23,13 +24,16 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._told_at = time.monotonic()
         self._ignored_before = Counter[str]()
+        self.status_name = f'{node.get_fully_qualified_name()}: state'
+        #: tells this node from another one of the same name
+        self.identity = secrets.token_hex(8)
 
     def tell(self, report: Report) -> dict[str, int]:
         """Publish a report; return how many messages were used since the last, by topic."""
         now = time.monotonic()
         elapsed, self._told_at = now - self._told_at, now
         received, rejected = self._reception.take_received(), self._reception.rejected
-        values = dict(report.values)
+        values = {**report.values, 'identity': self.identity}
         values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
         values['rejected'] = str(sum(rejected.values()))
         values |= {f'rejected {reason}': str(n) for reason, n in rejected.items()}
@@ -44,7 +48,7 @@ class Diagnostics:
             report = _with_warning(report, f'ignored {", ".join(newly_ignored)}')
         status = DiagnosticStatus(
             level=getattr(DiagnosticStatus, report.level.upper()),
-            name=f'{self._node.get_fully_qualified_name()}: state',
+            name=self.status_name,
             message=printable(report.message),
             hardware_id=self._hardware,
             values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()],

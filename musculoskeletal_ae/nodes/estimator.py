@@ -37,11 +37,14 @@ from musculoskeletal_ae.nodes.messages import (
     serve,
 )
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.validity import read_pose
+
+OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estimator']
 
 
 class Estimator(Shell):
@@ -50,8 +53,10 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
-        self.candidates = Candidates(self, self._use)
+        # After a restart, the learner's first network brings back which muscles were isolated.
+        self.candidates = Candidates(self, self._use, self.core.keep_isolated)
         self._advertise()
+        self.sources.watch(*OWN_TOPICS)
         # What was published last on the latched topics; None: nothing yet.
         self.published_anomaly = False
         self.published_isolated: tuple[int, ...] | None = None
@@ -77,6 +82,7 @@ class Estimator(Shell):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._on_command, kind))
         self.listen(PoseStamped, 'marker_pose', self._on_marker, SENSOR)
         Markers(self, 'estimated', self._lines)
+        serve(self, Trigger, 'estimator/check_health', self._check_health)
         serve(self, Trigger, 'estimator/reset', self._reset)
         serve(self, Trigger, 'estimator/zero', self._calibrate)
         serve(self, Trigger, 'estimator/isolate', self._isolate_more)
@@ -154,7 +160,14 @@ class Estimator(Shell):
         self.candidates.on_anomaly(False)
         self.detected.publish(Bool(data=False))
         self._publish_isolated()
+        self._report()
         return f'cleared: {cause}' if cause else 'nothing was detected'
+
+    def _check_health(self, _: Trigger.Request) -> str:
+        """Confirm that nothing is detected: a latched anomaly opens only by that."""
+        if cause := self.core.cause:
+            raise MusculoskeletalError(f'anomaly detected: {cause}')
+        return 'no anomaly is detected'
 
     # -- messages -------------------------------------------------------------------------------
 

@@ -53,6 +53,7 @@ class Learner(Shell):
             directory=self._directory(value('state_directory')),
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        self.sources.watch('mae_checkpoint')
         self.running = self.troubled = False
         core = self.core
         if value('fresh'):

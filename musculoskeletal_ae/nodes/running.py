@@ -3,7 +3,7 @@
 
 SIGINT and SIGTERM are remembered while nodes are constructed and while they run (`stop_signals`). A
 timer looks at that ten times a second, and lets the executor return. Nodes are then destroyed, and
-after them the ROS context.
+after them the ROS context. Without progress for 10 s the process ends by itself (`progress`).
 """
 
 import gc
@@ -22,6 +22,7 @@ from rclpy.utilities import remove_ros_args
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.executor import make_executor
 from musculoskeletal_ae.nodes.parameters import COMBINED, check_names
+from musculoskeletal_ae.nodes.progress import ProgressWatch
 from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 from musculoskeletal_ae.nodes.shell import STEADY
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -69,6 +70,7 @@ def _run(kinds: list[Any]) -> None:
     """Construct nodes, spin them until a stop, and destroy them."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Any] = []
+    watch = ProgressWatch()
     try:
         with make_executor() as executor:
             with STOP.reacting(Reaction.EXIT_SOON):
@@ -82,14 +84,22 @@ def _run(kinds: list[Any]) -> None:
                 # would delay a command by 40 ms.
                 gc.collect()
                 gc.freeze()
-            nodes[0].create_timer(STOP_LOOK_PERIOD, stop_if_asked, clock=STEADY)
+
+            def look() -> None:
+                watch.note()
+                stop_if_asked()
+
+            nodes[0].create_timer(STOP_LOOK_PERIOD, look, clock=STEADY)
+            watch.start()
             spin(executor, nodes[0])
     except ExternalShutdownException:
         pass
     finally:
         for node in nodes:
+            watch.note()
             node.destroy_node()
         rclpy.try_shutdown()
+        watch.stop()
 
 
 def spin(executor: Executor, node: Any) -> None:

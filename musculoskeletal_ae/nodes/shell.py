@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +13,7 @@ from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -41,10 +41,12 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, check_names
+from musculoskeletal_ae.nodes.sources import AUTHORS, LOOK_PERIOD, SEVERAL, Sources, Twins
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -71,8 +73,7 @@ QOS_REMEDIES = {
     ('subscriber asks', QoSPolicyKind.RELIABILITY): 'subscribe best-effort',
     ('subscriber asks', QoSPolicyKind.DURABILITY): 'subscribe volatile',
 }
-LOOK_AROUND = 0.1  # [s] between looks at who publishes
-LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
+MANY_REPORTS = QoSProfile(depth=50)  # of all nodes of the graph
 
 
 class Shell(Node):
@@ -81,6 +82,8 @@ class Shell(Node):
     core: Any = None  # what computes
     is_time_critical = True  # whether commands wait for it
     recording: StopRecording | None = None  # told of every message that is new, before it is used
+    #: topics that have one rightful publisher, but on which this node takes what anybody sends
+    accepted_from_all: frozenset[str] = frozenset()
 
     def __init__(self, name: str, **options: Any) -> None:
         """Start the node, declare its parameters and load its robot; options are those of Node."""
@@ -101,7 +104,8 @@ class Shell(Node):
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
         self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
-        self._turns: deque[int] = deque([0], maxlen=LOOKS)
+        self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}  # how to subscribe anew
+        self.sources = Sources(self, self._reception.turns, self._subscribe_anew)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         #: by which readings of l are too long
         self.zeros = LengthOffsets.none(self.robot.muscle_count)
@@ -109,6 +113,15 @@ class Shell(Node):
         self.add_on_set_parameters_callback(self._set_parameters)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
+        self.twins = Twins(self._diagnostics.status_name, self._diagnostics.identity)
+        self.create_subscription(
+            DiagnosticArray,
+            '/diagnostics',
+            lambda report: self.twins.take(report, time.monotonic()),
+            MANY_REPORTS,
+            raw=True,
+        )
+        self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
         self.checkpoint_version: int | None = None  # of the network in use
@@ -294,7 +307,7 @@ class Shell(Node):
         """Use the network that the estimator has accepted, or until there is one that of a file.
 
         `unfit` is called with the reason if a network cannot be computed with; the one in use
-        stays. While several nodes publish accepted networks, none of theirs is used.
+        stays.
         """
         has_accepted = False
 
@@ -309,8 +322,6 @@ class Shell(Node):
         def handle(message: UInt8MultiArray) -> Iterator[None]:
             mae = checkpoint.from_bytes(bytes(message.data), self.robot)
             yield
-            while self.count_publishers(topic) > 1:
-                yield
             put_to_use(mae)
             nonlocal has_accepted
             has_accepted = True
@@ -323,7 +334,6 @@ class Shell(Node):
             CheckpointValidator(self.robot).check(mae)
             put_to_use(mae)
 
-        topic = self.resolve_topic_name(ACCEPTED)
         self.accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
         self.needed.append(ACCEPTED)
         self.follow_parameter('checkpoint', use_file, self.load_checkpoint)
@@ -355,19 +365,64 @@ class Shell(Node):
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
-        """Subscribe; what comes twice or late, or the callback refuses by raising, is counted."""
+        """Subscribe; what comes twice or late, or the callback refuses by raising, is counted.
+
+        Topics that have one rightful publisher are watched (`sources`). What comes while there are
+        several is rejected, unless the topic is one of `accepted_from_all`.
+        """
         full, recording = self.resolve_topic_name(topic), self.recording
+        if topic in AUTHORS and topic not in self.accepted_from_all:
+            self.sources.watch(topic)
+            callback = self._from_author(topic, callback, qos is LATCHED)
         if recording is not None:
             callback = _recorded(recording, topic, kind, callback)
-        receive = self._reception.of(
-            topic,
-            callback,
-            lambda: self.count_publishers(full),
-            is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
-        )
-        # rclpy accepts (message, info) callbacks; its annotations do not know them.
-        raw = recording is not None
-        self.create_subscription(kind, topic, receive, qos, raw=raw)  # type: ignore[arg-type]
+
+        def subscribe() -> Any:
+            receive = self._reception.of(
+                topic,
+                callback,
+                lambda: self.count_publishers(full),
+                is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
+            )
+            # rclpy accepts (message, info) callbacks; its annotations do not know them.
+            raw = recording is not None
+            return self.create_subscription(kind, topic, receive, qos, raw=raw)
+
+        subscription = subscribe()
+        if qos is LATCHED:
+            self._latched[topic] = subscription, subscribe
+
+    def _from_author(
+        self, topic: str, callback: Callable[[Any], object], is_latched: bool
+    ) -> Callable[[Any], None]:
+        """Return a callback that rejects what comes while several nodes publish the topic."""
+
+        def take(message: Any) -> None:
+            self.sources.check(topic, is_latched)
+            callback(message)
+
+        return take
+
+    def _subscribe_anew(self, topic: str) -> None:
+        """Let a latched topic bring its value again."""
+        subscription, subscribe = self._latched[topic]
+        self.destroy_subscription(subscription)
+        self._latched[topic] = subscribe(), subscribe
+
+    def _look_around(self) -> None:
+        self.sources.look()
+        self.on_intruders(self.intruders)
+
+    @property
+    def intruders(self) -> str:
+        """Which other nodes publish what this arm's nodes alone should, or ''."""
+        found = [self.sources.intruders]
+        if not self.twins.is_alone(time.monotonic()):
+            found.append(f'two nodes are named {self.get_fully_qualified_name()}')
+        return '; '.join(filter(None, found))
+
+    def on_intruders(self, intruders: str) -> None:
+        """Take who publishes beside the rightful publishers; '' if nobody does."""
 
     def follow_muscles(
         self,
@@ -380,46 +435,9 @@ class Shell(Node):
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
-    def follow_muscle_messages(
-        self,
-        follow: Callable[[Float64MultiArray], object],
-        warn: Callable[[str], object] | None = None,
-    ) -> None:
-        """Give `follow` the messages of muscle_states as they are.
-
-        If several nodes publish them, `warn` is called with their names, and with '' once it is
-        one. Without `warn` their messages are rejected.
-        """
-        intruders = ''
-
-        def look_around() -> None:
-            nonlocal intruders
-            intruders = self._several_publishers('muscle_states')
-            if warn:
-                warn(intruders)
-
-        def from_one(message: Float64MultiArray) -> None:
-            if intruders and not warn:
-                raise MessageError('several publishers', intruders)
-            follow(message)
-
-        self.create_timer(LOOK_AROUND, look_around, clock=STEADY)
-        self.listen(Float64MultiArray, 'muscle_states', from_one, SENSOR)
-
-    def _several_publishers(self, name: str) -> str:
-        """Return which nodes publish a topic, '' if it is one."""
-        topic, names = self.resolve_topic_name(name), Counter[str]()
-        if self.count_publishers(topic) > 1:
-            for publisher in self.get_publishers_info_by_topic(topic):
-                names[f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'] += 1
-        # One name twice: a node that was killed stays known for a while beside its successor,
-        # but no longer sends.
-        turns = self._reception.turns[name]
-        self._turns.append(turns)
-        if len(names) == 1 and turns - self._turns[0] < TURNS:
-            return ''
-        senders = (f'{count} nodes {node}' if count > 1 else node for node, count in names.items())
-        return f'{name} come from {" and ".join(sorted(senders))}' if names else ''
+    def follow_muscle_messages(self, follow: Callable[[Float64MultiArray], object]) -> None:
+        """Give `follow` the messages of muscle_states as they are."""
+        self.listen(Float64MultiArray, 'muscle_states', follow, SENSOR)
 
     def follow_zeros(self, changed: Callable[[], object]) -> None:
         """Keep the estimator's length offsets in `zeros`, and call `changed` when they are others.
@@ -454,8 +472,12 @@ class Shell(Node):
         self.listen(String, 'isolated_muscles', take, LATCHED)
 
     def follow_anomaly(self, follow: Callable[[bool], object]) -> None:
-        """Tell whether the estimator has detected an anomaly, whenever it says so."""
-        self.listen(Bool, 'anomaly_detected', lambda m: follow(m.data), LATCHED)
+        """Tell whether the estimator has detected an anomaly, when that changes.
+
+        The end of an anomaly counts once the estimator has confirmed it, asked by a service.
+        """
+        latch = AnomalyLatch(self, follow)
+        self.listen(Bool, 'anomaly_detected', lambda message: latch.take(message.data), LATCHED)
 
     def follow_posture(
         self, topic: str, follow: Callable[[Array], object], some: bool = False
@@ -499,6 +521,9 @@ class Shell(Node):
         if self._fault:
             values = {**report.values, 'fault': self._fault}
             report, self._fault = Report('error', self._fault, values), ''
+        if (intruders := self.intruders) and report.level != 'error':
+            text = f'{SEVERAL}: {intruders}; {self.sources.remedy()}'
+            report = Report('error', text, {**report.values, SEVERAL: intruders})
         received = self._diagnostics.tell(report)
         self._tell_waiting([topic for topic in self.needed if topic not in received])
 

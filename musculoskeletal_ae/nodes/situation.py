@@ -1,20 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a running arm is, from what all nodes report on /diagnostics.
 
+The situation is as bad as the worst of all nodes, and a node that no longer reports is an error.
 Only identifiers are compared, such as the controller's values `mode` and `stop cause`. Sentences
 are shown as they are.
 """
 
 import contextlib
 import math
+import time
 from collections import deque
+from collections.abc import Callable
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from musculoskeletal_ae.control.stops import EXPLORE, REPAIR, StopCause
+from musculoskeletal_ae.control.stops import EXPLORE, REPAIR, ZERO, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
+from musculoskeletal_ae.nodes.sources import SEVERAL
+from musculoskeletal_ae.report import Level
 
 OLD = 1.0  # [s] after which something that moves is no longer shown
+#: [s] without a report after which a node counts as silent; nodes report once a second
+SILENT = 2.0
+#: [s] between two ticks, and the most that counts as such: our own pause makes no node silent
+TICK, LONGEST_TICK = 1.0, 1.5
+#: nodes whose end is nobody's concern
+OBSERVERS = 'bringup_status', 'view', 'replay', 'record'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'
 #: reports, one a second, in which the estimator's earlier networks are no mismatch, and after which
@@ -33,11 +44,28 @@ def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> 
     return f'error {told}  A {"waits for anomaly" if math.isnan(anomaly) else f"{anomaly:.3f}"}'
 
 
+class Node:
+    """What one node has reported last.
+
+    Attributes:
+        level: Of the report.
+        message: For people.
+        values: By name.
+        heard_at: When, not counting our own pauses [s].
+    """
+
+    def __init__(self, status: DiagnosticStatus, heard_at: float) -> None:
+        self.level: bytes = status.level
+        self.message: str = status.message
+        self.values = {value.key: value.value for value in status.values}
+        self.heard_at = heard_at
+
+
 class Situation:
     """What the newest diagnostics of one namespace reported, and what to do about it.
 
     Attributes:
-        detected: Whether an anomaly is detected; the topic anomaly_detected says so.
+        detected: Whether the estimator has detected an anomaly.
         suspect: Name of the muscle that the estimator suspects most, or ''.
         distance: d of the anomaly detector; NaN where it is unknown.
         limit: The d above which a message is an anomaly; NaN where it is unknown.
@@ -46,43 +74,50 @@ class Situation:
         doing: What the controller does, for people.
     """
 
-    def __init__(self, namespace: str) -> None:
+    def __init__(self, namespace: str, clock: Callable[[], float] = time.monotonic) -> None:
+        """Nothing has been reported yet; `clock` is a steady one [s]."""
+        self._clock = clock
         self._here = namespace.rstrip('/')
         self.detected = False
         self.samples = self.checkpoints = self.suspect = self.doing = ''
         self.distance = self.limit = math.nan
-        self._control: dict[str, str] = {}  # the values that the controller reports
+        self._nodes: dict[str, Node] = {}  # by full name
         self._has_explored = False  # before it stopped
-        self._errors: dict[str, str] = {}  # all other errors, by node
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # the estimator's last versions
         self._other_networks: dict[str, tuple[str, int]] = {}  # version and for how many reports
+        self._ticked_at, self._slept = math.nan, 0.0  # [s]
+
+    def tick(self) -> None:
+        """Let time pass: call it about once a second, before `trouble` and `level`."""
+        now = self._clock()
+        elapsed = now - self._ticked_at
+        if elapsed > LONGEST_TICK:  # what was sent meanwhile is still to be read
+            self._slept += elapsed - TICK
+        self._ticked_at = now
 
     def diagnosed(self, message: DiagnosticArray) -> None:
         """Take a message of /diagnostics."""
         for status in message.status:
-            node, _, _ = status.name.partition(':')
-            namespace, _, name = node.rpartition('/')
+            full_name, _, _ = status.name.partition(':')
+            namespace, _, name = full_name.rpartition('/')
             if namespace != self._here:
                 continue
-            values = {value.key: value.value for value in status.values}
+            node = self._nodes[full_name] = Node(status, self._clock() - self._slept)
             if name == 'learner':
-                self.samples = values.get('samples', '')
-                self.checkpoints = values.get('checkpoints', '')
+                self.samples = node.values.get('samples', '')
+                self.checkpoints = node.values.get('checkpoints', '')
             elif name == 'estimator':
-                self._take_estimator(values)
-                self._accepted.append(values.get(VERSION, ''))
+                self._take_estimator(node.values)
+                self._accepted.append(node.values.get(VERSION, ''))
             elif name == 'controller':
-                self.doing = status.message
-                self._take_controller(values)
+                self.doing = node.message
+                if node.values.get('mode') in ACTIVITIES:
+                    self._has_explored = node.values['mode'] in EXPLORING
             if name in FOLLOWERS:
-                self._compare_network(name, values.get(VERSION, ''))
-            # An anomaly and a stop are shown with what to do about them.
-            is_shown = name in ('estimator', 'controller') and 'fault' not in values
-            self._errors.pop(node, None)
-            if status.level == DiagnosticStatus.ERROR and not is_shown:
-                self._errors[node] = status.message
+                self._compare_network(name, node.values.get(VERSION, ''))
 
     def _take_estimator(self, values: dict[str, str]) -> None:
+        self.detected = values.get('finding', 'none') != 'none'
         self.suspect = values.get('suspect muscle', '')
         self.distance = self.limit = math.nan
         with contextlib.suppress(ValueError):
@@ -97,14 +132,47 @@ class Situation:
         _, reports = self._other_networks.get(node, ('', 0))
         self._other_networks[node] = version, reports + 1
 
-    def _take_controller(self, values: dict[str, str]) -> None:
-        self._control = values
-        if values.get('mode') in ACTIVITIES:
-            self._has_explored = values['mode'] in EXPLORING
+    def level(self) -> Level:
+        """Return how bad it is: as bad as the worst of all nodes."""
+        if self.detected or self._silent() or self._mismatches():
+            return 'error'
+        levels = [node.level for name, node in self._nodes.items() if not _is_own(name)]
+        if any(level not in (DiagnosticStatus.OK, DiagnosticStatus.WARN) for level in levels):
+            return 'error'
+        return 'warn' if DiagnosticStatus.WARN in levels else 'ok'
 
     def trouble(self) -> str:
-        """Return what keeps the arm from going on, and every step that is to be taken."""
-        mode, cause = self._control.get('mode'), self._control.get('stop cause')
+        """Return what keeps the arm from going on, every step that is to be taken, and warnings."""
+        parts = [*self._stops(), *self._mismatches(), *self._silent()]
+        errors, warnings = [], []
+        for name, node in self._nodes.items():
+            if _is_own(name) or self._is_shown(name, node) or node.level == DiagnosticStatus.OK:
+                continue
+            if node.level == DiagnosticStatus.WARN:
+                warnings.append(f'warning: {name}: {node.message}')
+            else:
+                errors.append(f'{name}: {node.message}')
+        return ', '.join([*parts, *errors, *self._body(), *warnings])
+
+    def _values(self, name: str) -> dict[str, str]:
+        node = self._nodes.get(f'{self._here}/{name}')
+        return {} if node is None else node.values
+
+    def _is_shown(self, name: str, node: Node) -> bool:
+        """Whether a report is shown otherwise: an anomaly, a stop, or isolated muscles."""
+        if node.level == DiagnosticStatus.OK or {'fault', SEVERAL} & node.values.keys():
+            return False
+        if name == f'{self._here}/controller':
+            return node.values.get('mode') in (STOPPED, VERIFYING)
+        if name == f'{self._here}/estimator':
+            is_isolating = node.values.get('state') == 'isolated'
+            return is_isolating if node.level == DiagnosticStatus.WARN else self.detected
+        return False
+
+    def _stops(self) -> list[str]:
+        """Return the anomaly and the stop, each with what to do about it."""
+        control = self._values('controller')
+        mode, cause = control.get('mode'), control.get('stop cause')
         is_verifying = mode == VERIFYING
         is_stopped_by_anomaly = (
             mode in (STOPPED, VERIFYING) and cause == StopCause.ANOMALY.identifier
@@ -117,23 +185,46 @@ class Situation:
         elif self.detected:
             parts.append(_with_remedy(f'ANOMALY: {self.suspect}', REPAIR))
         if mode == STOPPED or (is_verifying and not is_stopped_by_anomaly):
-            remedy = self._control.get('remedy', '')
+            remedy = control.get('remedy', '')
             if self._has_explored:
                 remedy = f'{remedy}; {EXPLORE}'
-            parts.append(_with_remedy(f'STOPPED: {self._control.get("stop", cause)}', remedy))
-        for node, (version, reports) in self._other_networks.items():
-            if reports >= REPORTS:
-                parts.append(
-                    f'{node} uses network {version}, the estimator {self._accepted[-1]}: '
-                    f'restart {node}'
-                )
-        parts += [f'{node}: {message}' for node, message in self._errors.items()]
-        return ', '.join(parts)
+            parts.append(_with_remedy(f'STOPPED: {control.get("stop", cause)}', remedy))
+        return parts
+
+    def _mismatches(self) -> list[str]:
+        return [
+            f'{node} uses network {version}, the estimator {self._accepted[-1]}: restart {node}'
+            for node, (version, reports) in self._other_networks.items()
+            if reports >= REPORTS
+        ]
+
+    def _silent(self) -> list[str]:
+        """Return which nodes have stopped reporting, and for how long."""
+        now = self._ticked_at - self._slept
+        return [
+            f'{name}: no report for {now - node.heard_at:.0f} s: see its log; start it again'
+            for name, node in self._nodes.items()
+            if now - node.heard_at > SILENT and name.rpartition('/')[2] not in OBSERVERS
+        ]
+
+    def _body(self) -> list[str]:
+        """Return what the estimator does not know of the body, or leaves out."""
+        values, parts = self._values('estimator'), []
+        if isolated := values.get('isolated muscles'):
+            parts.append(f'isolated: {isolated}')
+        if unknown := values.get('unknown length zeros'):
+            parts.append(_with_remedy(f'length zeros unknown: {unknown}', ZERO))
+        return parts
 
     def hint(self) -> str:
         """Return why the error may rise before anything is learned, '' once something is."""
         why = 'nothing learned yet: the error may rise while the arm leaves its first posture'
         return why if self.samples == '0' else ''  # '' without a learner
+
+
+def _is_own(name: str) -> bool:
+    """Whether a node only repeats what others report."""
+    return name.rpartition('/')[2] == 'bringup_status'
 
 
 def _with_remedy(trouble: str, remedy: str) -> str:

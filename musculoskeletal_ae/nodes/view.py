@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64, Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.arrays import Array, Ints
@@ -115,7 +115,6 @@ class View(Node):
             ('played', Float64MultiArray, 'replay/position', NEWEST,
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
-            ('detected', Bool, 'anomaly_detected', LATCHED, lambda m: m.data),
             ('isolated', String, 'isolated_muscles', LATCHED, read_names),
             ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
         ]  # fmt: skip
@@ -180,7 +179,7 @@ class View(Node):
     def _show(self, now: float) -> None:
         """Take what came, and show it; [s] of the monotonic clock."""
         self._take()
-        self.situation.detected = bool(self._newest('detected', math.inf))
+        self.situation.tick()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
         if (measured := posture.get('measured')) is not None and np.isnan(measured).any():
             # Joints without a sensor, or whose sensor fails, are drawn where they are estimated.

@@ -86,9 +86,9 @@ def test_every_stop_is_shown_with_the_remedy_of_its_cause(cause):
 
 def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     situation = Situation('/left')
-    situation.diagnosed(said('/left/estimator', suspect_muscle='biceps', d='12.5', d_limit='9.0'))
+    suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps'}
+    situation.diagnosed(said('/left/estimator', **suspect, d='12.5', d_limit='9.0'))
     assert (situation.distance, situation.limit) == (12.5, 9.0)
-    situation.detected = True
     assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # without a controller
     situation.diagnosed(said('/left/controller', mode='exploring'))
     situation.diagnosed(stopped(StopCause.ANOMALY))
@@ -96,16 +96,15 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
         'call estimator/reset; call controller/reset; controller/explore explores again)'
     )
-    situation.detected = False
+    situation.diagnosed(said('/left/estimator', finding='none'))
     situation.diagnosed(said('/left/controller', mode='holding'))
     assert situation.trouble() == ''
 
 
 def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
     situation = Situation('/left')
-    situation.diagnosed(said('/left/estimator', suspect_muscle='biceps'))
+    situation.diagnosed(said('/left/estimator', finding='slack_tendon', suspect_muscle='biceps'))
     situation.diagnosed(stopped(StopCause.ANOMALY, 'verifying'))
-    situation.detected = True
     assert situation.trouble() == 'ANOMALY: biceps is being verified'
     situation.diagnosed(stopped(StopCause.OPERATOR, 'verifying'))
     assert situation.trouble() == (
@@ -156,6 +155,48 @@ def test_an_error_of_any_node_is_shown_until_it_is_over():
     assert situation.trouble() == '/left/learner: the disk is full'
     situation.diagnosed(said('/left/learner', 'learning'))
     assert situation.trouble() == ''
+
+
+def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
+    now = 100.0
+    situation = Situation('/left', lambda: now)
+
+    def second(*nodes, lasting=1.0):
+        nonlocal now
+        for node in nodes:
+            situation.diagnosed(said(f'/left/{node}'))
+        now += lasting
+        situation.tick()
+        return situation.level(), situation.trouble()
+
+    for _ in range(3):
+        assert second('sim', 'learner', 'view') == ('ok', '')
+    assert second('sim', lasting=60.0)[0] == 'ok'  # the machine was suspended
+    assert second('sim')[0] == 'error'
+    level, trouble = second('sim')
+    assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s: ')
+    assert 'sim' not in trouble and 'view' not in trouble
+    assert second('sim', 'learner') == ('ok', '')
+
+
+def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_body():
+    situation = Situation('')
+    situation.diagnosed(said('/sim', 'slow', DiagnosticStatus.WARN))
+    assert (situation.level(), situation.trouble()) == ('warn', 'warning: /sim: slow')
+    body = {'state': 'isolated', 'isolated_muscles': 'biceps', 'unknown_length_zeros': 'triceps'}
+    situation.diagnosed(said('/estimator', 'estimating', DiagnosticStatus.WARN, **body))
+    assert situation.trouble() == (
+        'isolated: biceps, length zeros unknown: triceps (to go on: call estimator/zero), '
+        'warning: /sim: slow'
+    )
+    several = {'several_publishers': 'joint_states come from a and b', 'finding': 'none'}
+    situation.diagnosed(said('/estimator', 'two', DiagnosticStatus.ERROR, **several))
+    assert (situation.level(), situation.trouble()) == (
+        'error',
+        '/estimator: two, warning: /sim: slow',
+    )
+    situation.diagnosed(said('/bringup_status', 'the same again', DiagnosticStatus.ERROR))
+    assert 'the same again' not in situation.trouble()
 
 
 def test_a_joint_sensor_without_a_number_is_named_and_the_others_are_used(graph):

@@ -8,6 +8,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.nodes.stop_recording import FILE
 
@@ -139,17 +141,22 @@ def test_an_anomaly_stops_the_arm_until_estimator_and_controller_are_reset(movin
     arm.graph.wait(lambda: reset(arm).success, 'the reset')
 
 
-def test_an_unfit_checkpoint_file_is_refused_and_one_by_topic_stops_the_arm(moving):
+def test_an_unfit_checkpoint_file_is_refused_and_the_arm_goes_on(moving):
     arm = moving()
     done, reason = arm.graph.set_parameter('controller', 'checkpoint', '/nowhere.safetensors')
     assert not done
     assert 'nowhere' in reason
     arm.goes_to(HERE)
     assert 'stopped' not in arm.state().message
-    arm.graph.send_network(b'not a checkpoint', 'accepted_checkpoint')
-    arm.says('unfit checkpoint')
-    assert reset(arm).success
-    arm.says('holding')  # with the network in use
+
+
+def test_an_unfit_accepted_checkpoint_stops_the_controller(graph, trained_file):
+    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    before, supervisor = controller.core.mae, controller.core.supervisor
+    graph.send_network(b'not a checkpoint', 'accepted_checkpoint')
+    graph.wait(lambda: supervisor.is_latched, 'the stop')
+    assert supervisor.condition.cause is StopCause.UNFIT_CHECKPOINT
+    assert controller.core.mae is before
 
 
 def test_the_arm_moves_without_joint_sensors_and_learner(moving):

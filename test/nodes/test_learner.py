@@ -170,6 +170,11 @@ def test_the_learner_publishes_and_saves_checkpoints_and_replaces_a_dead_trainin
     assert learner.report().values['training process'] != first
 
 
+def confirm(_, response):
+    response.success = True
+    return response
+
+
 def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     learner = host()
     detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
@@ -181,6 +186,7 @@ def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     learner.run(2.0 * MARGIN + 2.0)
     assert (learner.samples, learner.updates) == (samples, updates)
     assert int(learner.report().values['not learned: anomaly']) >= 3
+    graph.node.create_service(Trigger, 'estimator/check_health', confirm)
     detected.publish(Bool(data=False))
     learner.learn(lambda: learner.updates > updates, 'learning again')
     assert not graph.call(Trigger, 'learner/save').success  # nothing is kept

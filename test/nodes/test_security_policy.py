@@ -43,6 +43,8 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     assert allowed - {'/clock', 'vision_joint_states'} <= used <= allowed
     used = names(node.get_service_names_and_types_by_node(*own))
     assert used == rights(name, 'services', 'reply')
+    used = names(node.get_client_names_and_types_by_node(*own))
+    assert used == rights(name, 'services', 'request')
 
 
 def test_commands_checkpoints_and_targets_have_one_source():

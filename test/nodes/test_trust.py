@@ -100,24 +100,14 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
     arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven one')
 
 
-def test_while_several_nodes_publish_accepted_networks_none_of_theirs_is_used(arm, trained):
-    controller, before = arm.controller, arm.controller.core.mae
-    stranger = replace(trained['paper'], version=77)
-    arm.graph.send_network(checkpoint.to_bytes(stranger), 'accepted_checkpoint')
-    arm.graph.wait(lambda: controller.accepted.is_busy, 'the network of the stranger')
-    arm.graph.spin(0.5)
-    assert controller.core.mae is before
-
-
-def test_impossible_length_offsets_are_refused_and_move_nothing(arm):
+def test_impossible_length_offsets_are_refused(graph, trained_file):
+    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
     zeros = np.zeros((2, 6))
     zeros[0] = 1e17
-    latched = arm.graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+    latched = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
     latched.publish(array_message(zeros, 'quantity', 'muscle'))
-    refused = 'muscle_length_zeros: impossible zeros'
-    arm.graph.wait(lambda: arm.controller.rejected[refused], 'the refusal')
-    arm.goes_to(HERE)
-    arm.never_jumped()
+    graph.wait(lambda: controller.rejected['muscle_length_zeros: impossible zeros'], 'the refusal')
+    assert not controller.zeros.offset.any()
 
 
 def test_a_second_publisher_of_muscle_states_stops_the_arm_until_it_is_gone(arm):

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An anomaly that was reported is over only when the estimator confirms that.
+
+The topic `anomaly_detected` latches an anomaly at once. That it is false there is a reason to ask:
+anybody could say so. The service `estimator/check_health` answers for the node that detected it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+SERVICE = 'estimator/check_health'
+ASK_PERIOD = 1.0  # [s] after which an estimator that has not answered is asked again
+
+
+class AnomalyLatch:
+    """Follows `anomaly_detected` for one node."""
+
+    def __init__(self, node: Node, follow: Callable[[bool], object]) -> None:
+        """Begin without an anomaly; `follow` is called with every confirmed change."""
+        self._node, self._follow = node, follow
+        self._is_latched = False
+        self._client: Any = node.create_client(Trigger, SERVICE)
+        self._future: Any = None  # the answer that is awaited
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer: Any = node.create_timer(ASK_PERIOD, self._ask, clock=steady)
+        self._timer.cancel()
+
+    def take(self, detected: bool) -> None:
+        """Take a message of anomaly_detected."""
+        if detected:
+            self._give_up()
+            if not self._is_latched:
+                self._is_latched = True
+                self._follow(True)
+        elif self._is_latched and self._future is None:
+            self._timer.reset()
+            self._ask()
+
+    def _ask(self) -> None:
+        """Ask the estimator; it may have been started anew since the last time."""
+        if self._future is not None:
+            self._client.remove_pending_request(self._future)
+        self._future = self._client.call_async(Trigger.Request())
+        self._future.add_done_callback(self._on_answer)
+
+    def _on_answer(self, future: Any) -> None:
+        if future is not self._future:
+            return
+        self._give_up()
+        answer = future.result()
+        if answer is not None and answer.success:
+            self._is_latched = False
+            self._follow(False)
+        else:
+            self._node.get_logger().warning(
+                f'anomaly_detected is false, but the estimator says: {answer and answer.message}'
+            )
+
+    def _give_up(self) -> None:
+        self._timer.cancel()
+        if self._future is not None and not self._future.done():
+            self._client.remove_pending_request(self._future)
+        self._future = None

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may publish what: judged from the graph, from reports and from stamps."""
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from controlled_arm import ControlledArm
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
+from std_srvs.srv import Trigger
+
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message, joint_message
+from musculoskeletal_ae.nodes.sources import (
+    LEASE,
+    NAMING,
+    TWIN_SILENCE,
+    UNNAMED,
+    Authorship,
+    Publisher,
+    Stamps,
+    Twins,
+)
+
+FIRST, SECOND = Publisher('/estimator', b'1'), Publisher('/estimator', b'2')
+
+
+def looked(publishers, turns=(0,), seconds=(0.0,)):
+    authorship = Authorship('topic')
+    for count, now in zip(turns, seconds, strict=True):
+        authorship.look(publishers, count, now)
+    return authorship
+
+
+def test_another_node_on_a_topic_is_an_intruder_at_once():
+    intruders = looked([FIRST, Publisher('/stranger', b'3')]).intruders
+    assert intruders == 'topic come from /estimator and /stranger'
+
+
+def test_a_killed_node_beside_its_successor_is_no_intruder():
+    seconds = np.arange(0.0, 20.0, 0.1)
+    assert looked([FIRST, SECOND], np.ones_like(seconds), seconds).intruders == ''
+
+
+def test_two_nodes_of_one_name_are_intruders_once_they_take_turns_or_outlast_the_lease():
+    taking_turns = looked([FIRST, SECOND], range(5), np.arange(5) * 0.1)
+    assert taking_turns.intruders == 'topic come from 2 nodes /estimator'
+    assert looked([FIRST, SECOND], (0, 0), (0.0, LEASE)).intruders
+
+
+def test_a_publisher_without_a_name_is_waited_for_and_then_an_intruder():
+    unnamed = [FIRST, Publisher(f'/{UNNAMED}', b'3')]
+    early = looked(unnamed)
+    assert (early.intruders, early.is_certain) == ('', False)
+    assert looked(unnamed, (0, 0), (0.0, NAMING)).intruders
+
+
+def report(node, identity):
+    values = [KeyValue(key='identity', value=identity)]
+    status = DiagnosticStatus(name=f'{node}: state', values=values)
+    return serialize_message(DiagnosticArray(status=[status]))
+
+
+def test_a_second_node_of_the_same_name_is_noticed_by_its_reports():
+    twins = Twins('/controller: state', 'ours')
+    twins.take(report('/controller', 'of one that was killed'), 0.0)
+    twins.take(report('/controller', 'ours'), 0.1)
+    twins.take(report('/left/controller', 'of another arm'), 0.2)
+    assert twins.is_alone(0.2)
+    twins.take(report('/controller', 'theirs'), 0.3)
+    assert not twins.is_alone(0.3)
+    assert twins.is_alone(0.4 + TWIN_SILENCE)
+
+
+def test_a_stamp_is_new_if_it_is_later_or_the_clock_was_set_back():
+    stamps = Stamps()
+    times = (5, 0), (5, 1), (5, 1), (5, 0), (2, 0), (2, 0), (2, 5)
+    new = [stamps.is_new(Time(sec=sec, nanosec=nanosec)) for sec, nanosec in times]
+    assert new == [True, True, False, False, True, False, True]
+
+
+def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
+    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    joints = graph.publisher(JointState, 'estimated_joint_states')
+    repeated = joint_message(arm26.joints, np.zeros(2), graph.node.get_clock().now().to_msg())
+
+    def is_stale():
+        joints.publish(repeated)
+        present = controller.core.watchdog.conditions(controller.core.watchdog.age.stepped_at)
+        return controller.core.estimate is not None and any(
+            condition.cause.identifier == 'stale_estimate' for condition in present
+        )
+
+    graph.wait(is_stale, 'the age')
+
+
+STRANGE = {
+    'isolated_muscles': (String, lambda robot: String(data=','.join(robot.muscles))),
+    'muscle_length_zeros': (
+        Float64MultiArray,
+        lambda robot: array_message(
+            np.array([np.full(robot.muscle_count, 0.08), np.full(robot.muscle_count, 1e-3)]),
+            'quantity',
+            'muscle',
+        ),
+    ),
+    'anomaly_detected': (Bool, lambda _: Bool(data=True)),
+    'accepted_checkpoint': (UInt8MultiArray, lambda _: UInt8MultiArray(data=b'not a network')),
+}
+
+
+def test_what_a_stranger_says_for_the_estimator_stops_the_arm_and_changes_nothing(
+    graph, arm26, trained_file
+):
+    arm = ControlledArm(graph, arm26, trained_file)
+    core = arm.controller.core
+    arm.target([-0.5, -1.2])
+    graph.wait(lambda: len(arm.sent()) > 30, 'commands')
+    before, network = core.stream.body, core.mae
+    for topic, (kind, message) in STRANGE.items():
+        stranger = graph.publisher(kind, topic, LATCHED)
+        stranger.publish(message(arm26))
+        graph.wait(lambda topic=topic: topic in core.watchdog.second_publisher, topic)
+        rejected = f'{topic}: several publishers'
+        graph.wait(lambda key=rejected: arm.controller.rejected[key], rejected)
+        arm.says('several publishers')
+        assert not graph.call(Trigger, 'controller/reset').success
+        arm.says('several publishers', 'estimator')
+        graph.node.destroy_publisher(stranger)
+        graph.wait(lambda: graph.call(Trigger, 'controller/reset').success, 'the reset')
+        # The estimator's own value has come again, and is as it was.
+        assert core.stream.body.isolated == before.isolated == ()
+        assert core.stream.body.offsets.known and not core.stream.body.offsets.offset.any()
+        assert core.mae is network or core.mae.version == network.version
+        assert not core.watchdog.has_anomaly
+    arm.goes_to([-0.5, -1.2])
+    arm.never_jumped()
+
+
+@pytest.mark.parametrize('confirmed', [False, True])
+def test_the_end_of_an_anomaly_counts_once_the_estimator_confirms_it(graph, confirmed):
+    controller = graph.host(Controller, robot='arm26')
+    asked = []
+
+    def answer(_, response):
+        asked.append(True)
+        response.success = confirmed
+        return response
+
+    graph.node.create_service(Trigger, 'estimator/check_health', answer)
+    detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
+    watchdog = controller.core.watchdog
+    detected.publish(Bool(data=True))
+    graph.wait(lambda: watchdog.has_anomaly, 'the anomaly')
+    detected.publish(Bool(data=False))
+    graph.wait(lambda: asked, 'the question')
+    graph.spin(0.2)
+    assert watchdog.has_anomaly is not confirmed
