@@ -216,6 +216,11 @@ class Situation:
             parts.append(_with_remedy(f'length zeros unknown: {unknown}', ZERO))
         return parts
 
+    @property
+    def is_stopped(self) -> bool:
+        """Whether the controller reports a stop that holds until it is reset."""
+        return self._control.get('mode') == STOPPED
+
     def hint(self) -> str:
         """Return why the error may rise before anything is learned, '' once something is."""
         why = 'nothing learned yet: the error may rise while the arm leaves its first posture'

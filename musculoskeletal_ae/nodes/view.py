@@ -47,13 +47,17 @@ MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD, TELL_PERIOD, LOOK_PERIOD = 1.0 / 30.0, 0.25, 1.0  # [s] of picture, texts, and the graph
 PATIENCE = 10.0  # [s] with a service
 STOP_LOOK_PERIOD = 0.1  # [s]
+SETTLED = 2.5  # [s] after a reset, in which a cause that is still present stops the arm again
 ARM_TOPICS = {
     'measured': 'joint_states',
     'estimated': 'estimated_joint_states',
     'simulated': 'sim/joint_states',
 }
 SET, GET = 'hardware_emulator/set_parameters', 'hardware_emulator/get_parameters'
-DO = 'controller/stop', 'controller/reset', 'estimator/reset', 'replay/pause', 'replay/resume'
+DO = (
+    'controller/stop', 'controller/reset', 'estimator/reset', 'estimator/restore',
+    'replay/pause', 'replay/resume',
+)  # fmt: skip
 SERVICES = {'controller/explore': SetBool, **dict.fromkeys(DO, Trigger), GET: GetParameters}
 SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
 SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
@@ -85,6 +89,7 @@ class View(Node):
         self.told = self.looked = self.reported = -math.inf  # [s] of the monotonic clock
         self.ruptured: list[str] = []
         self.payload = 0.0
+        self.reset_at = math.inf  # [s], of the last reset that has not been judged yet
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
         self.answers = SingleThreadedExecutor()
         self.answers.add_node(self)
@@ -222,10 +227,47 @@ class View(Node):
             f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
             'waiting for muscle_states' if states is None else told.hint(),
         ]
-        shown = np.zeros((2, self.robot.muscle_count)) if states is None else states[1:]
+        if isolated := self.robot.names(self._isolated()):
+            lines.append(f'isolated: {isolated}')
+        shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
         values = error, anomaly, told.distance, told.limit
-        self.page.tell([*filter(None, lines)], told.trouble(), shown, time.monotonic(), values)
+        trouble = self.page.with_buttons(told.trouble())
+        self.page.tell([*filter(None, lines)], trouble, shown, time.monotonic(), values)
+        self._judge_reset()
         self.page.follow(self.payload, self._newest('played', math.inf))
+
+    def _judge_reset(self) -> None:
+        """Say what became of a reset, once a cause that is still present has stopped it again."""
+        if time.monotonic() > self.reset_at + SETTLED:
+            self.reset_at = math.inf
+            trouble = self.page.with_buttons(self.situation.trouble())
+            is_stopped = self.situation.is_stopped
+            self.page.notify(f'stopped again: {trouble}' if is_stopped else 'reset', not is_stopped)
+
+    def _reset(self) -> None:
+        """Reset anomaly and stop, unless a muscle of the emulated arm is still cut."""
+        sound = set(self.robot.names(self._isolated()).split(', '))
+        if cut := [name for name in self.ruptured if name not in sound]:
+            problem = f'{", ".join(cut)} is cut, which would stop the arm again: press "Mend" first'
+            self.page.notify(problem, False)
+            return
+
+        def go_on(answer: Any) -> None:
+            if answer.success:
+                self._ask('controller/reset', then=judge, quiet=True)
+            else:
+                self.page.notify(printable(f'estimator/reset: {answer.message}'), False)
+
+        def judge(answer: Any) -> None:
+            if answer.success:
+                self.reset_at = time.monotonic()
+            else:
+                self.page.notify(printable(f'controller/reset: {answer.message}'), False)
+
+        if self.ways['estimator/reset'].service_is_ready():
+            self._ask('estimator/reset', then=go_on, quiet=True)
+        else:
+            self._ask('controller/reset', then=judge, quiet=True)
 
     def _look(self) -> None:
         """Offer what the nodes that are there can do, and ask the emulator how it is."""
@@ -233,18 +275,24 @@ class View(Node):
         if any(push.get_subscription_count() for push in self.pushes):
             there.add('pushed')
         self.page.offer(there)
-        self._ask(GET, self._emulated, names=['ruptured_muscles', 'payload'])
+        self._ask(GET, self._emulated, quiet=True, names=['ruptured_muscles', 'payload'])
 
     def _emulated(self, answer: Any) -> None:
         match [parameter_value_to_python(value) for value in answer.values]:
             case [[*ruptured], float(payload)]:
                 self.ruptured, self.payload = [str(name) for name in ruptured if name], payload
 
-    def _ask(self, name: str, then: Callable[[Any], object] | None = None, **fields: Any) -> None:
-        """Call a service, tell the page what it said, and go on with the answer."""
+    def _ask(
+        self,
+        name: str,
+        then: Callable[[Any], object] | None = None,
+        quiet: bool = False,
+        **fields: Any,
+    ) -> None:
+        """Call a service, tell the page what it said unless `quiet`, and go on with the answer."""
 
         def answered(answer: Any) -> None:
-            if name != GET:
+            if not quiet:
                 said = [*getattr(answer, 'results', ()), answer][0]
                 good = getattr(said, 'success', getattr(said, 'successful', False))
                 why = getattr(said, 'message', getattr(said, 'reason', '')) or 'done'
@@ -283,7 +331,7 @@ class View(Node):
                 service = 'replay/set_parameters' if what == 'position' else SET
                 self._ask(service, parameters=[parameter])
             case 'reset':
-                self._ask('estimator/reset', lambda _: self._ask('controller/reset'))
+                self._reset()
             case _:
                 self._ask(what, None, **({'data': True} if SERVICES[what] is SetBool else {}))
 

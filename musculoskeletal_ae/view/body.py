@@ -25,6 +25,7 @@ from musculoskeletal_ae.robot.routes import ARC
 
 LARGEST_MESH = 50_000_000  # [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
+POSTURES = 20  # in which the arm is to be seen whole
 DASHES = 5  # of a straight segment of a muscle; whole muscles show no gaps
 #: red, green, blue at T_bias and at T_limit
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
@@ -114,6 +115,36 @@ def _capsules(robot: Robot) -> list[Solid]:
             mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end / length))
             solids.append((int(joint), mesh))
     return solids
+
+
+def space(robot: Robot, solids: list[Solid]) -> tuple[Array, float, float]:
+    """Return the centre [m] and the radius of a ball that holds the arm, and its lowest z.
+
+    That is the arm with all that is drawn of it, in its middle posture and in postures beside it.
+    """
+    middle = 0.5 * (robot.lower + robot.upper)
+    spread = 0.25 * (robot.upper - robot.lower)
+    rng = np.random.default_rng(0)
+    others = middle + spread * rng.uniform(-1.0, 1.0, (POSTURES, robot.joint_count))
+    kin, points = robot.kinematics, []
+    for theta in [middle, *others]:
+        points.append(robot.routes.points(theta[None])[0])
+        places = kin.transforms(theta[None])[0]
+        for joint, mesh in solids:
+            corners = trimesh.bounds.corners(mesh.bounds)
+            at = places[joint]
+            points.append(corners @ at[:3, :3].T + at[:3, 3])
+        for link in robot.description.end_effectors:
+            joint, tip = kin.placement(link)
+            points.append((places[joint] @ tip.homogeneous)[None, :3, 3])
+    every = np.concatenate(points)
+    centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    return centre, float(np.linalg.norm(every - centre, axis=1).max()), float(every[:, 2].min())
+
+
+def grid_cell(reach: float) -> float:
+    """Return a round size of the floor's cells [m] for an arm of a size [m]."""
+    return float(10.0 ** np.round(np.log10(0.15 * reach)))
 
 
 def pieces(robot: Robot) -> Ints:

@@ -10,17 +10,15 @@ What a visitor asks for goes to `act`, called in viser's threads with a name and
 import contextlib
 import io
 import logging
+import math
 import socket
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 import viser
-from jinja2 import Environment, FileSystemLoader
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array, Ints
@@ -29,22 +27,26 @@ from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, Kind
+from musculoskeletal_ae.view.readings import ARMS, HTML, History, Readings
 from musculoskeletal_ae.view.visits import checked_visits
 
-ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
-HISTORY = 60.0  # [s] that curves show
-GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
-DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
-CURVES: dict[str, tuple[list[Any], list[int]]] = {  # lines, and columns of what `tell` is given
-    'error [rad]': ([GREEN], [1]),
-    'A': ([BLUE], [2]),
-    'd (dashed: what is an anomaly)': ([DASHED, BLUE], [4, 3]),
+NARROW = 900  # [pixels] of a window in which two panels would hide the arm
+CAMERA_FOV = 0.8  # [rad] of the picture's height
+#: the half-angle within which the arm is seen between the panels of a window of 1280 × 800
+VISIBLE = math.atan(0.7 * math.tan(0.5 * CAMERA_FOV))
+VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
+EXPLORE, RESET, RESTORE, MEND = 'Explore', 'Reset after a stop', 'Restore isolated muscles', 'Mend'
+#: what the remedies of stops say, and the button that does it; longer phrases first
+BUTTONS = {
+    'call estimator/reset; call controller/reset': RESET,
+    'call estimator/reset': RESET,
+    'call controller/reset': RESET,
+    'call estimator/restore': RESTORE,
+    'controller/explore explores again': EXPLORE,
 }
 PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
 MOST_PAYLOAD = 5.0  # [kg]
 HOT = 80.0  # [°C] at the right end of a bar
-ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # its macros
 
 
 class Page:
@@ -66,25 +68,39 @@ class Page:
             told = f'no page at port {port} of {host}: {getattr(error, "strerror", error)}'
             raise MusculoskeletalError(f'{told}; choose another --port or --host') from error
         # viser announces itself.
-        with contextlib.redirect_stdout(io.StringIO()), checked_visits(host):
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            checked_visits(host, f'{robot.description.directory.name} – musculoskeletal_ae'),
+        ):
             server = self._server = viser.ViserServer(host, port, verbose=False)
         if server.get_port() != port:  # somebody was faster
             server.stop()
             raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
         # A tunnel to the world is nothing that a visitor may ask for.
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
-        server.on_client_connect(lambda client: self._count(client.client_id, True))
-        server.on_client_disconnect(lambda client: self._count(client.client_id, False))
-        self._curves: deque[list[float]] = deque()
+        self._history = History()
+        self._readings: dict[int, Readings] = {}  # by visitor
         self._kinds: Ints = np.zeros(robot.muscle_count, dtype=int)
         self._posture: dict[str, Array] = {}
         self._picked, self._targeted, self._pushing = '', False, False
         self._build_scene()
         self._build_panels()
         self._controls: dict[str, Any] = {}  # shown while a node is there
+        self._restore: Any = None
         if not read_only:
             self._build_controls()
         self.offer(())
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
+
+    def _on_connect(self, client: viser.ClientHandle) -> None:
+        is_narrow = client.camera.image_width < NARROW
+        self._readings[client.client_id] = Readings(client.gui, self._robot, is_narrow)
+        self._count(client.client_id, True)
+
+    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+        self._readings.pop(client.client_id, None)
+        self._count(client.client_id, False)
 
     def _count(self, visitor: int, here: bool) -> None:
         (self._visitors.add if here else self._visitors.discard)(visitor)
@@ -104,9 +120,7 @@ class Page:
         robot, scene, kin = self._robot, self._server.scene, self._robot.kinematics
         solids, self.notes = body.link_solids(robot)
         middle = 0.5 * (robot.lower + robot.upper)
-        points = robot.routes.points(middle[None])[0]
-        points = np.vstack([points, kin.end_effector_pose(middle).translation])
-        centre, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), float(np.ptp(points))
+        centre, reach, bottom = body.space(robot, solids)
         self._arms: dict[str, list[Any]] = {}  # its frame, then those of its joints
         for arm, colour in ARMS.items():
             frames = self._arms[arm] = [scene.add_frame(f'/{arm}', show_axes=False, visible=False)]
@@ -133,16 +147,19 @@ class Page:
         self._owner = body.pieces(robot).repeat(body.DASHES)
         own = [np.flatnonzero(self._owner == m) for m in range(robot.muscle_count)]
         self._middles = [each[len(each) // 2] for each in own]
-        floor = (*centre[:2], points[:, 2].min() - 0.15 * reach)
-        scene.add_grid('/floor', 4.0 * reach, 4.0 * reach, position=floor, cell_size=0.1)
+        floor = (*centre[:2], bottom - 0.1 * reach)
+        size = 8.0 * reach
+        scene.add_grid('/floor', size, size, position=floor, cell_size=body.grid_cell(reach))
         # Lights that leave colours what they are.
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_ambient('/light', intensity=1.5)
         scene.add_light_directional('/lamp', intensity=1.0, position=(2.0, -1.0, 3.0))
         camera = self._server.initial_camera
-        camera.look_at, camera.fov = centre, 0.8
-        camera.position = centre + reach * np.array([1.25, 1.15, 0.35])
+        camera.look_at, camera.fov = centre, CAMERA_FOV
+        distance = reach / math.sin(VISIBLE)
+        camera.position = centre + distance * VIEW_DIRECTION
+        camera.near, camera.far = 0.01 * distance, 100.0 * distance
         self._reach = reach
 
     def _build_panels(self) -> None:
@@ -151,20 +168,6 @@ class Page:
         gui.set_panel_label('musculoskeletal_ae')
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
-        panel = gui.add_panel()
-        with panel.add_tab(self._robot.description.directory.name):
-            self._status = gui.add_html('')
-            empty, x = np.zeros(2), {'time': False, 'auto': False, 'range': (-HISTORY, 0.0)}
-            look: dict[str, Any] = {'legend': {'show': False}, 'cursor': {'show': False}}
-            look |= {'height': 96, 'scales': {'x': x}}
-            self._plots = [
-                gui.add_uplot((empty, *[empty] * len(lines)), ({}, *lines), title=title, **look)
-                for title, (lines, _) in CURVES.items()
-            ]
-            self._bars = gui.add_html('')
-            gui.add_html(str(HTML.legend(ARMS, [tuple(end.tolist()) for end in body.ENDS])))
-        panel.dock_left()
-        panel.set_width(350)
         with gui.add_folder('Show'):
             self._names = gui.add_checkbox('names of muscles', False)
             self._names.on_update(lambda _: self._mark())
@@ -213,23 +216,17 @@ class Page:
 
         Those are error [rad], A, d and its limit at a time [s]. NaN is not known.
         """
-        self._status.content = str(HTML.status(alarm, lines))
-        self._bars.content = str(HTML.bars(self._muscles(*states)))
-        self._curves.append([now, *values])
-        while self._curves[0][0] < now - HISTORY:
-            self._curves.popleft()
-        if len(self._curves) > 1:
-            table = np.array(self._curves)
-            # No curve that has a NaN in it is drawn: an unknown limit hides below d.
-            table[:, 4] = np.where(np.isnan(table[:, 4]), *table[:, 3:].T)
-            table = np.nan_to_num(table)
-            for plot, (_, columns) in zip(self._plots, CURVES.values()):
-                plot.data = (table[:, 0] - now, *table[:, columns].T)
+        self._history.add(now, values)
+        status, bars = str(HTML.status(alarm, lines)), str(HTML.bars(self._muscles(*states)))
+        for readings in list(self._readings.values()):
+            readings.show(status, bars, self._history)
 
     def _muscles(self, tension: Array, temperature: Array) -> list[dict[str, Any]]:
         """Return what the bars show of each muscle."""
         columns = {
-            'rgb': map(tuple, body.colours(self._robot, tension, self._kinds).tolist()),
+            'rgb': map(
+                tuple, body.colours(self._robot, np.nan_to_num(tension), self._kinds).tolist()
+            ),
             'share': 100.0 * np.clip(np.nan_to_num(tension) / self._robot.tension.limit, 0.0, 1.0),
             'heat': 100.0 * np.clip(np.nan_to_num(temperature) / HOT, 0.0, 1.0),
             'name': self._robot.muscles,
@@ -239,6 +236,12 @@ class Page:
             'warm': [whole(each, '°C') for each in temperature],
         }
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
+
+    def with_buttons(self, text: str) -> str:
+        """Return a text for people that names buttons of the page instead of their services."""
+        for calls, button in BUTTONS.items() if self._controls else ():
+            text = text.replace(calls, f'press "{button}"')
+        return text
 
     def notify(self, text: str, good: bool) -> None:
         """Show every visitor what became of a request."""
@@ -273,8 +276,10 @@ class Page:
 
         with gui.add_folder('Arm') as arm:
             button('Stop', 'controller/stop', color='red')
-            button('Explore', 'controller/explore')
-            button('Reset after a stop', 'reset')
+            button(EXPLORE, 'controller/explore')
+            button(RESET, 'reset')
+            self._restore = gui.add_button(RESTORE, visible=False)
+            heed(self._restore.on_click, 'estimator/restore')
             gizmo = gui.add_checkbox('move the hand with the mouse', False)
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
             # A hundredth of the range, or less, so that ends are near the limits.
@@ -290,7 +295,7 @@ class Page:
             self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on one')
             self._muscle.on_update(lambda event: self._pick(chosen(event)))
             button('Cut', 'cut', lambda _: self._muscle.value, 'orange')
-            button('Mend', 'mend', lambda _: self._muscle.value)
+            button(MEND, 'mend', lambda _: self._muscle.value)
             self._payload = slider('payload [kg]', 0.0, MOST_PAYLOAD, 0.1, 'payload', chosen)
         with gui.add_folder('Recording') as recording:
             self._timeline = slider('at [s]', 0.0, 1.0, 0.1, 'position', chosen)
@@ -315,6 +320,8 @@ class Page:
             handle.visible = node in nodes
         if self._controls and 'controller' not in nodes:
             self._gizmo.visible = False
+        if self._restore is not None:
+            self._restore.visible = bool((self._kinds == Kind.ISOLATED).any())
 
     def follow(self, payload: float, played: Sequence[float] | None) -> None:
         """Let the controls show what is: sliders the estimate, until a target was given."""

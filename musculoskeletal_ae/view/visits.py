@@ -7,14 +7,17 @@ no way to check either, but serves its page by the public function `websockets.a
 and the public class `ServerConnection`, which `checked_visits` extends while viser starts.
 """
 
+import gzip
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
 from websockets.asyncio import server
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -46,6 +49,21 @@ def _may_be_handled(data: str | bytes) -> bool:
     return isinstance(updates, dict) and updates.keys() <= {'value'}
 
 
+def with_title(response: Response, title: str) -> Response:
+    """Return a page with a title of ours in the browser's tab."""
+    is_packed = response.headers.get('Content-Encoding') == 'gzip'
+    if not response.headers.get('Content-Type', '').startswith('text/html'):
+        return response
+    body = gzip.decompress(response.body) if is_packed else bytes(response.body)
+    body = body.replace(b'<title>Viser</title>', f'<title>{escape(title)}</title>'.encode(), 1)
+    body = gzip.compress(body, compresslevel=1) if is_packed else body
+    headers = Headers(response.headers.raw_items())
+    if 'Content-Length' in headers:
+        del headers['Content-Length']
+        headers['Content-Length'] = str(len(body))
+    return Response(response.status_code, response.reason_phrase, headers, body)
+
+
 def is_foreign(host: str, request: Request) -> bool:
     """Return whether a page of another site opens a connection to a page served at `host`.
 
@@ -62,8 +80,10 @@ def is_foreign(host: str, request: Request) -> bool:
 
 
 @contextmanager
-def checked_visits(host: str) -> Iterator[None]:
+def checked_visits(host: str, title: str) -> Iterator[None]:
     """Check the visits to whatever websockets begins to serve meanwhile at `host`.
+
+    The page has a title in the browser's tab.
 
     Raises:
         MusculoskeletalError: If it serves nothing meanwhile: then nothing would be checked.
@@ -78,7 +98,7 @@ def checked_visits(host: str) -> Iterator[None]:
             if is_foreign(host, request):
                 return connection.respond(HTTPStatus.FORBIDDEN, 'a page of another site\n')
             answer: Response | None = process_request(connection, request)
-            return answer
+            return answer if answer is None else with_title(answer, title)
 
         options |= {'process_request': check, 'create_connection': Visit}
         return serve(handler, *where, **options)

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page as a visitor sees it: a real Chromium, real nodes. Screenshots stay in log/view."""
 
+import gzip
+import math
 import socket
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
+from musculoskeletal_ae.control.stops import EXPLORE, StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED
 
@@ -27,6 +31,7 @@ from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view.page import Page
+from musculoskeletal_ae.view.readings import History, scale_top
 from view.browser import Browser, find_chromium
 
 SCREENSHOTS = Path(__file__).parents[2] / 'log' / 'view'
@@ -61,6 +66,92 @@ def view(graph):
         return port
 
     return start
+
+
+@chromium
+@pytest.mark.parametrize('size', [(1280, 800), (800, 600)])
+def test_readings_and_controls_leave_room_for_the_arm(arm26, tmp_path, size):
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    port, states = free_port(), np.array([[30.0] * 6, [25.0] * 6])
+    page = Page(arm26, '127.0.0.1', port, False, lambda *_: None)
+    page.offer(['controller'])
+    browser = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}', size)
+    try:
+        browser._wait(page.looked_at.is_set, 'the visitor')
+        for now in range(3):
+            page.draw({'estimated': np.array([0.0, -1.0])}, states[0], np.array([2, *[0] * 5]))
+            page.offer(['controller'])
+            page.tell(['error 0.1'], 'STOPPED: why', states, now, (0.1, np.nan, np.nan, np.nan))
+        for text in ('STOPPED: why', 'Explore', 'Restore isolated muscles', '30 N', 'A: '):
+            browser.wait_for(text)
+        width = browser.evaluate('document.querySelector("canvas").getBoundingClientRect().width')
+        assert width > 0.45 * size[0]
+        browser.close_notifications()
+        browser.screenshot(SCREENSHOTS / f'page_{size[0]}.png')
+    finally:
+        browser.close()
+        page.close()
+
+
+@pytest.mark.parametrize('robot', ['arm26', 'musashi_left_arm', 'musashi_upper_body', 'slider'])
+def test_the_camera_sees_the_whole_arm_with_its_hand(robot, tmp_path):
+    robot = Robot.load(write_robot(tmp_path, slider=True) if robot == 'slider' else robot)
+    page = Page(robot, '127.0.0.1', free_port(), True, lambda *_: None)
+    try:
+        camera = page._server.initial_camera
+        eye, ahead = np.array(camera.position), np.array(camera.look_at) - camera.position
+        middle = 0.5 * (robot.lower + robot.upper)
+        seen = [*robot.routes.points(middle[None])[0]]
+        seen += [
+            robot.kinematics.link_pose(middle, link).translation
+            for link in robot.description.end_effectors
+        ]
+        to = np.array(seen) - eye
+        cosine = to @ ahead / (np.linalg.norm(to, axis=1) * np.linalg.norm(ahead))
+        # Half of the height is 0.4 rad; panels leave less than that of the width.
+        assert np.arccos(cosine).max() < math.atan(0.7 * math.tan(0.4))
+    finally:
+        page.close()
+
+
+def test_values_that_are_not_known_are_not_drawn():
+    history = History()
+    for time, known in enumerate([1, 1, 0, 0, 1, 1, 0]):
+        history.add(0.5 * time, [0.2 if known else math.nan, math.nan])
+    time, values = history.curve([0])
+    np.testing.assert_allclose(time, [-1.0, -0.5])  # since the gap, until it was known last
+    np.testing.assert_allclose(values, 0.2)
+    assert all(len(line) == 0 for line in history.curve([1]))
+
+
+@pytest.mark.parametrize(('largest', 'top'), [(0.0, 1.0), (0.03, 0.05), (1.0, 1.0), (43.0, 50.0)])
+def test_a_plot_has_a_scale_of_round_numbers(largest, top):
+    assert scale_top(largest) == pytest.approx(top)
+
+
+def test_remedies_name_the_buttons_of_the_page(arm26):
+    page = Page(arm26, '127.0.0.1', free_port(), False, lambda *_: None)
+    try:
+        for cause in StopCause:
+            text = page.with_buttons(f'{cause.remedy}; {EXPLORE}')
+            assert 'call ' not in text and 'press "Explore"' in text
+            assert text.count('Reset after a stop') <= 1
+    finally:
+        page.close()
+
+
+def test_the_tab_of_the_browser_names_the_arm(arm26):
+    port = free_port()
+    page = Page(arm26, '127.0.0.1', port, True, lambda *_: None)
+    try:
+        for coding in ('identity', 'gzip'):
+            request = Request(f'http://127.0.0.1:{port}/', headers={'Accept-Encoding': coding})
+            with urlopen(request, timeout=60) as answer:
+                data = answer.read()
+            data = gzip.decompress(data) if answer.headers['Content-Encoding'] == 'gzip' else data
+            assert '<title>arm26 – musculoskeletal_ae</title>'.encode() in data
+    finally:
+        page.close()
 
 
 def visit(port: int, origin: str):
@@ -117,6 +208,9 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.click(*page.centre('Cut'))
         see('ANOMALY: ')
         assert detected[-1].data
+        page.click(*page.centre('Reset after a stop'))  # it would stop again
+        see('press "Mend" first')
+        assert 'controller/reset' not in page.text
         graph.spin(1.0)
         page.close_notifications()
         page.screenshot(SCREENSHOTS / 'cut.png')
@@ -136,6 +230,8 @@ def test_muscles_are_shown_although_an_isolated_one_sends_nan(graph, view, arm26
             return '61 N' in page.text
 
         graph.wait(shown, 'the tension of the others')
+        page.wait_for('isolated: brachialis')
+        assert page.evaluate('document.title') == 'arm26 – musculoskeletal_ae'
         assert 'brachialis' in page.text and 'nan' not in page.text
     finally:
         page.close()

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a visitor reads beside the arm: how it is, curves, and a bar for each muscle."""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.view import body
+
+ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
+ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
+HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # its macros
+DURATION = 60.0  # [s] that curves show
+GAP = 1.0  # [s] without a value, after which a curve begins anew
+GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
+DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
+HEIGHT = 104  # [pixels] of a plot
+
+
+class Curve(NamedTuple):
+    """One plot: its title, how its lines look, and which of the values they show."""
+
+    title: str
+    lines: tuple[Any, ...]
+    values: tuple[int, ...]
+
+
+def curves(unit: str) -> tuple[Curve, ...]:
+    """Return the plots of an arm whose postures differ by so many `unit`."""
+    return (
+        Curve(f'error of the estimate [{unit}]', (GREEN,), (0,)),
+        Curve('A: how badly T and l fit together', (BLUE,), (1,)),
+        Curve('d: A in healthy spreads (dashed: anomaly)', (BLUE, DASHED), (2, 3)),
+    )
+
+
+class History:
+    """The last minute of the values that curves show; NaN is not known."""
+
+    def __init__(self) -> None:
+        self._rows: deque[list[float]] = deque()
+
+    def add(self, now: float, values: Sequence[float]) -> None:
+        """Take the values of a moment [s]."""
+        self._rows.append([now, *values])
+        while self._rows[0][0] < now - DURATION:
+            self._rows.popleft()
+
+    def curve(self, values: Sequence[int]) -> tuple[Array, ...]:
+        """Return the time before now [s] and values since the last gap, where the first is known.
+
+        A value after it that is not known is drawn as the first one, which hides it.
+        """
+        table = np.array(self._rows)
+        if not len(table):
+            return (np.zeros(0),) * (1 + len(values))
+        time, columns = table[:, 0], table[:, 1:].T[list(values)]
+        known = ~np.isnan(columns[0])
+        now, time, columns = time[-1], time[known], columns[:, known]
+        gaps = np.flatnonzero(np.diff(time) > GAP)
+        start = gaps[-1] + 1 if len(gaps) else 0
+        time, columns = time[start:], columns[:, start:]
+        columns = np.where(np.isnan(columns), columns[0], columns)
+        return (time - now, *columns)
+
+
+def scale_top(largest: float) -> float:
+    """Return the least 1, 2 or 5 times a power of ten that is not below a value."""
+    if not 0.0 < largest < math.inf:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(largest))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= largest)
+
+
+class Readings:
+    """The readings of one visitor, in a panel of their own unless the window is narrow."""
+
+    def __init__(self, gui: Any, robot: Robot, is_narrow: bool) -> None:
+        self._plots: list[tuple[Curve, Any]] = []
+        self._tops: list[float] = []
+        if is_narrow:
+            self._status = gui.add_html('', order=-2.0)
+            with gui.add_folder('Muscles', order=100.0):
+                self._bars = gui.add_html('')
+                self._add_legend(gui)
+            with gui.add_folder('Curves', order=101.0, expand_by_default=False):
+                self._add_plots(gui, robot)
+            return
+        panel = gui.add_panel()
+        with panel.add_tab(robot.description.directory.name):
+            self._status = gui.add_html('')
+            self._add_plots(gui, robot)
+            self._bars = gui.add_html('')
+            self._add_legend(gui)
+        panel.dock_left()
+        panel.set_width(350)
+
+    @staticmethod
+    def _add_legend(gui: Any) -> None:
+        gui.add_html(str(HTML.legend(ARMS, [tuple(end.tolist()) for end in body.ENDS])))
+
+    def _add_plots(self, gui: Any, robot: Robot) -> None:
+        look: dict[str, Any] = {'legend': {'show': False}, 'cursor': {'show': False}}
+        for curve in curves(robot.kinematics.distance_unit):
+            empty = (np.zeros(0),) * (1 + len(curve.lines))
+            plot = gui.add_uplot(
+                empty, ({}, *curve.lines), title=curve.title, height=HEIGHT,
+                scales=_scales(1.0), axes=_axes(1.0), padding=(8, 8, 0, 0), **look,
+            )  # fmt: skip
+            self._plots.append((curve, plot))
+            self._tops.append(1.0)
+
+    def show(self, status: str, bars: str, history: History) -> None:
+        """Show texts as HTML, and curves."""
+        self._status.content, self._bars.content = status, bars
+        for number, (curve, plot) in enumerate(self._plots):
+            data = history.curve(curve.values)
+            top = scale_top(1.05 * max(float(line.max(initial=0.0)) for line in data[1:]))
+            if top != self._tops[number]:
+                self._tops[number] = top
+                plot.scales, plot.axes = _scales(top), _axes(top)
+            plot.data = data
+
+
+def _scales(top: float) -> dict[str, Any]:
+    x = {'time': False, 'auto': False, 'range': (-DURATION, 0.0)}
+    return {'x': x, 'y': {'auto': False, 'range': (0.0, top)}}
+
+
+def _axes(top: float) -> tuple[Any, ...]:
+    """Return axes with ticks at 0, at half of the range, and at its end."""
+    return {'size': 30, 'space': 40}, {'incrs': [0.5 * top], 'space': 8, 'size': 56}
