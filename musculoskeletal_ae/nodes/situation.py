@@ -146,7 +146,11 @@ class Situation:
         parts = [*self._stops(), *self._mismatches(), *self._silent()]
         errors, warnings = [], []
         for name, node in self._nodes.items():
-            if _is_own(name) or self._is_shown(name, node) or node.level == DiagnosticStatus.OK:
+            if _is_own(name) or node.level == DiagnosticStatus.OK:
+                continue
+            if self._is_shown(name, node):
+                if refused := node.values.get('refused'):
+                    warnings.append(f'warning: {name}: refused {refused}')
                 continue
             if node.level == DiagnosticStatus.WARN:
                 warnings.append(f'warning: {name}: {node.message}')
@@ -219,7 +223,7 @@ class Situation:
     @property
     def is_stopped(self) -> bool:
         """Whether the controller reports a stop that holds until it is reset."""
-        return self._control.get('mode') == STOPPED
+        return self._values('controller').get('mode') == STOPPED
 
     def hint(self) -> str:
         """Return why the error may rise before anything is learned, '' once something is."""

@@ -227,12 +227,14 @@ class View(Node):
             f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
             'waiting for muscle_states' if states is None else told.hint(),
         ]
-        if isolated := self.robot.names(self._isolated()):
-            lines.append(f'isolated: {isolated}')
+        trouble = self.page.with_buttons(told.trouble())
+        isolated = f'isolated: {self.robot.names(self._isolated())}'
+        if len(self._isolated()) and isolated not in trouble:  # without reports of the estimator
+            lines.append(isolated)
         shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
         values = error, anomaly, told.distance, told.limit
-        trouble = self.page.with_buttons(told.trouble())
-        self.page.tell([*filter(None, lines)], trouble, shown, time.monotonic(), values)
+        now, is_urgent = time.monotonic(), told.level() == 'error'
+        self.page.tell([*filter(None, lines)], trouble, shown, now, values, is_urgent)
         self._judge_reset()
         self.page.follow(self.payload, self._newest('played', math.inf))
 

@@ -210,14 +210,23 @@ class Page:
             label.text = MARKS[kind] + name + (f' {Kind(kind).name.lower()}' if kind else '')
 
     def tell(
-        self, lines: list[str], alarm: str, states: Array, now: float, values: Sequence[float]
+        self,
+        lines: list[str],
+        alarm: str,
+        states: Array,
+        now: float,
+        values: Sequence[float],
+        is_urgent: bool = True,
     ) -> None:
         """Show what is going on: T [N] and temperatures [°C], (2, M), as bars, values as curves.
 
         Those are error [rad], A, d and its limit at a time [s]. NaN is not known.
         """
         self._history.add(now, values)
-        status, bars = str(HTML.status(alarm, lines)), str(HTML.bars(self._muscles(*states)))
+        status, bars = (
+            str(HTML.status(alarm, lines, is_urgent)),
+            str(HTML.bars(self._muscles(*states))),
+        )
         for readings in list(self._readings.values()):
             readings.show(status, bars, self._history)
 

@@ -199,6 +199,16 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
     assert 'the same again' not in situation.trouble()
 
 
+def test_a_refused_command_is_shown_beside_a_stop():
+    situation = Situation('/left')
+    reported = stopped(StopCause.OPERATOR)
+    refused = "target_joint_states: unknown joint: 'elbo'"
+    reported.status[0].values.append(KeyValue(key='refused', value=refused))
+    situation.diagnosed(reported)
+    assert f'STOPPED: controller/stop was called {RESET}' in situation.trouble()
+    assert f'refused {refused}' in situation.trouble()
+
+
 def test_a_joint_sensor_without_a_number_is_named_and_the_others_are_used(graph):
     node = graph.host(bringup_status.BringupStatus, robot='arm26')
     graph.listen(DiagnosticArray, '/diagnostics')
