@@ -1,14 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes what is made from the code: `reference/api.md`, and the picture of the elastic unit.
+"""Writes the pages and pictures that are generated from the code.
 
-python doc/make.py
+    python doc/make.py
+
+- `reference/api.md`: public classes and functions
+- `reference/parameters.md`: the parameters of all nodes
+- `reference/command_line.md`: `--help` of all scripts and executables
+- `reference/stops.md`: modes and stop causes
+- the tables of results in `README.md`
+- `images/elastic_unit.png`: the series elastic element; `images/muscles.png`: an arm
+- the charts of the results in `results/`
 """
 
 import ast
+import json
+import os
+import subprocess
+import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from musculoskeletal_ae.control import stops_page
+from musculoskeletal_ae.experiments import plots, robustness, sensors
+from musculoskeletal_ae.experiments.results import individuals, read
+from musculoskeletal_ae.experiments.study import Measured
+from musculoskeletal_ae.robot.drawing import draw_arm
+from musculoskeletal_ae.robot.robot import Robot
 
 FOLDER = Path(__file__).resolve().parent
 PACKAGE = FOLDER.parent / 'musculoskeletal_ae'
+README = FOLDER.parent / 'README.md'
 #: what a program in Python builds on, module by module
 MODULES = {
     'robot/robot.py': ['Robot'],
@@ -49,6 +75,24 @@ MODULES = {
     'bags/streams.py': ['read_streams', 'Streams'],
     'exceptions.py': ['MusculoskeletalError'],
 }
+
+
+MUSCLE_COLOURS = colormaps['tab10'].colors
+PARAMETERS_INTRODUCTION = """\
+`python doc/make.py` writes this page from the code. Pass parameters with `--ros-args -p
+NAME:=VALUE`, `--params-file FILE`, or `./bringup.sh -p NODE:NAME:=VALUE`.
+[config/nodes.yaml](../../config/nodes.yaml) holds all defaults as a parameter file, and `ros2 param
+describe` gives the same texts.
+
+Parameters marked * can be set while the node runs. To empty a list of names, use `"['']"`. A
+parameter that no node has, and a value outside the legal range, are refused with the legal set."""
+COMMAND_LINE_INTRODUCTION = """\
+`python doc/make.py` writes this page from `--help`. `ros2 run musculoskeletal_ae NAME` and
+`install/musculoskeletal_ae/lib/musculoskeletal_ae/NAME` run the same executable. Nodes take no
+options of their own, only `--ros-args`; [Parameters](parameters.md) lists their parameters.
+
+A node ends with status 0 on Ctrl-C (SIGINT) and SIGTERM. A tool ends with 130; `record` and
+`replay`, for which that is the usual end, end with 0."""
 
 
 def _first(node: ast.AST) -> str:
@@ -98,34 +142,207 @@ def api() -> str:
     return '\n'.join(lines).rstrip() + '\n'
 
 
-def draw_elastic_unit(file: Path) -> None:
-    """Draw what force, rate and wire_stretch each do to L_e(T)."""
-    import numpy as np
-    from matplotlib.figure import Figure
+def parameters() -> str:
+    """Return the page of all parameters of all nodes."""
+    from musculoskeletal_ae.nodes.parameters import PARAMETERS
 
+    lines = ['# Parameters', '', *PARAMETERS_INTRODUCTION.splitlines(), '']
+    for node, table in PARAMETERS.items():
+        lines += [
+            f'## {node}',
+            '',
+            '| parameter | default | meaning | legal |',
+            '|---|---|---|---|',
+        ]
+        for name, parameter in table.items():
+            mark = '*' if parameter.settable else ''
+            default = json.dumps(parameter.default)
+            meaning, legal = (
+                text.replace('|', '\\|') for text in (parameter.meaning, parameter.legal_values)
+            )
+            lines.append(f'| `{name}`{mark} | `{default}` | {meaning} | {legal} |')
+        lines.append('')
+    return '\n'.join(lines).rstrip() + '\n'
+
+
+def _printed(command: list[str]) -> str:
+    environment = os.environ | {'COLUMNS': '100'}
+    return subprocess.run(  # noqa: S603 - commands of this file only
+        command, capture_output=True, text=True, check=True, env=environment
+    ).stdout.rstrip()
+
+
+def command_line() -> str:
+    """Return the page of all scripts and executables."""
+    from musculoskeletal_ae import executables
+
+    usage = _printed([str(FOLDER.parent / 'bringup.sh'), '--help'])
+    lines = ['# Command line', '', *COMMAND_LINE_INTRODUCTION.splitlines(), '']
+    lines += ['## ./bringup.sh', '', '```text', usage, '```', '']
+    for name in sorted(name for name, value in vars(executables).items() if callable(value)):
+        function = getattr(executables, name)
+        if not isinstance(function, partial):
+            continue
+        code = f'from musculoskeletal_ae.executables import {name} as run; raise SystemExit(run())'
+        text = _printed([sys.executable, '-c', code, '--help'])
+        lines += [
+            f'## {name}',
+            '',
+            '```text',
+            text.partition('\nParameters:')[0].rstrip(),
+            '```',
+            '',
+        ]
+    return '\n'.join(lines).rstrip() + '\n'
+
+
+#: of README: key of `experiment robustness`, label, and what the paper measured on Musashi
+ESTIMATES = {
+    'before_rad': ('before learning', '0.414'),
+    'least_squares_rad': ('least squares on the geometric model', '–'),
+    'paper_after_rad': ('preset `paper`, after learning', '0.186'),
+    'after_rad': ('**preset `default`, after learning**', '–'),
+    'joint_sensors_rad': ('the joint sensors that it learned from', '–'),
+}
+#: of README: what, a text with numbers of an experiment's result.json, and the experiment
+CAPABILITIES = (
+    ('learning without joint sensors', '{none_rad:.3f} rad', 'sensors'),
+    (
+        'the same, with a marker seen in 1 of 10 rest samples',
+        '{marker_tenth_rad:.3f} rad',
+        'sensors',
+    ),
+    (
+        'naming a ruptured muscle',
+        '{named_share:.0%} named correctly in {detection_s:.2f} s; {false_alarms} false alarms',
+        'estimation',
+    ),
+    (
+        'moving on without it (`on_anomaly: isolate`)',
+        '{right_isolations_share:.0%} isolated correctly within 10 s',
+        'resilience',
+    ),
+    ('tracking joint motions of 1 s', '{track_1s_rad:.3f} rad', 'motion'),
+    (
+        'external force of 10–50 N, without a force sensor',
+        '{wrench_error:.0%} and {wrench_error_deg:.1f}° off',
+        'motion',
+    ),
+)
+
+
+def estimates_table() -> str:
+    """Return the table of errors in README."""
+    result = read(FOLDER / 'results')['robustness']
+    about = result['about']
+    lines = [
+        '| | emulator `kin` | emulator `foreign` | paper, on Musashi |',
+        '|---|---|---|---|',
+    ]
+    for key, (label, printed) in ESTIMATES.items():
+        cells = [f'{result[reality][key]:.3f}' for reality in ('kin', 'foreign')]
+        if key == 'after_rad':
+            cells = [f'**{cell}**' for cell in cells]
+        lines.append(f'| {label} | {" | ".join(cells)} | {printed} |')
+    lines += ['', f'`experiment robustness`, mean of {individuals(about["seeds"])}.']
+    return '\n'.join(lines)
+
+
+def capabilities_table() -> str:
+    """Return the table of capabilities in README."""
+    results = read(FOLDER / 'results')
+    lines = ['| capability, measured on `kin` | result | command |', '|---|---|---|']
+    for what, text, name in CAPABILITIES:
+        lines.append(f'| {what} | {text.format(**results[name])} | `experiment {name}` |')
+    return '\n'.join(lines)
+
+
+def readme(text: str) -> str:
+    """Return README with its tables written from the committed results."""
+    for name, make in {'estimates': estimates_table, 'capabilities': capabilities_table}.items():
+        begin, end = f'<!-- {name} -->', f'<!-- /{name} -->'
+        head, _, rest = text.partition(begin)
+        text = f'{head}{begin}\n\n{make()}\n\n{end}{rest.partition(end)[2]}'
+    return text
+
+
+PAGES = {
+    'api.md': api,
+    'parameters.md': parameters,
+    'command_line.md': command_line,
+    'stops.md': stops_page.page,
+}
+
+
+def draw_series_elastic(file: Path) -> None:
+    """Draw what force, rate and wire_stretch each do to L_e(T)."""
     from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
     tension = np.linspace(0.0, 300.0, 200)
-    figure = Figure(figsize=(11.0, 3.6), layout='constrained')
     changes = {
-        'force': ('[N]: how far the soft part reaches', (50.0, 100.0, 200.0)),
-        'rate': ('[1/m]: how soon it stiffens', (20.0, 30.0, 45.0)),
-        'wire_stretch': ('[1/N]: slope of the wire, for l_abs = 0.5 m', (0.0, 2e-5, 1e-4)),
+        'force': ('N', (50.0, 100.0, 200.0)),
+        'rate': ('1/m', (20.0, 30.0, 45.0)),
+        'wire_stretch': ('1/N', (0.0, 2e-5, 1e-4)),
     }
-    for axes, (name, (told, values)) in zip(figure.subplots(1, 3, sharey=True), changes.items()):
-        for value in values:
+    figure, panels = plots.new_figure(9.5, 3.6, 1, len(changes), sharey=True)
+    for panel, (name, (unit, values)) in zip(panels, changes.items()):
+        for value, colour in zip(values, (plots.BEFORE, plots.TRUE, plots.AFTER)):
             constants = {key: np.array(v) for key, v in (DEFAULT | {name: value}).items()}
             stretch = 1e3 * SeriesElastic(**constants).elongation(np.array(0.5), tension)
-            style = '-' if value == DEFAULT[name] else '--'
-            axes.plot(tension, stretch, style, label=f'{name} {value:g}')
-        axes.set(title=f'{name} {told}', xlabel='T [N]')
-        axes.title.set_fontsize(10)
-        axes.legend()
-        axes.grid(alpha=0.3)
-    figure.axes[0].set_ylabel('elongation L_e [mm]')
-    figure.savefig(file, dpi=90)
+            default = ' (default)' if value == DEFAULT[name] else ''
+            panel.plot(tension, stretch, color=colour, label=f'{value:g} {unit}{default}')
+        plots.tidy(panel, 'tension T [N]', '', name)
+        panel.legend(fontsize=9)
+    panels[0].set_ylabel('elongation of 0.5 m [mm]')
+    figure.savefig(file, dpi=plots.DPI)
+
+
+def draw_muscles(file: Path) -> None:
+    """Draw an arm with its muscles, each in a colour of its own and with its name."""
+    robot = Robot.load('musashi_left_arm')
+    theta = robot.lower + 0.35 * (robot.upper - robot.lower)
+    theta[0] = 0.4 * robot.upper[0]
+    parts = draw_arm(robot, theta, np.full(robot.muscle_count, robot.tension.bias))
+    figure = Figure(figsize=(9.5, 4.6))
+    figure.subplots_adjust(0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
+    points = np.vstack([part.points for part in parts])
+    low, high = points.min(axis=0) - 0.02, points.max(axis=0) + 0.02
+    handles = {}
+    for place, (title, azimuth) in enumerate({'front': 0.0, 'left side': 90.0}.items(), 1):
+        axes: Any = figure.add_axes((0.4 * (place - 1), 0.0, 0.4, 0.95), projection='3d')
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        axes.set_box_aspect(tuple(high - low), zoom=1.3)
+        axes.view_init(elev=8.0, azim=azimuth + 12.0)
+        axes.set_axis_off()
+        axes.set_title(title, y=0.98)
+        muscles = iter(zip(robot.muscles, MUSCLE_COLOURS))
+        for part in parts:
+            if part.kind != 'muscles':
+                axes.plot(*part.points.T, color='#D8D4C8', lw=9.0, solid_capstyle='round', zorder=1)
+                continue
+            name, colour = next(muscles)
+            (handles[name],) = axes.plot(*part.points.T, color=colour, lw=2.2, label=name, zorder=2)
+    figure.legend(handles=[*handles.values()], loc='center right', frameon=False)
+    figure.savefig(file, dpi=plots.DPI)
+
+
+def draw_results() -> None:
+    """Draw the charts of the committed results."""
+    results = read(FOLDER / 'results')
+    for name, draws in {
+        'robustness': (robustness.kin, robustness.foreign, robustness.ablation),
+        'sensors': (sensors.sensors,),
+    }.items():
+        rows = {int(s): Measured(numbers, {}) for s, numbers in results[name]['seeds'].items()}
+        for draw in draws:
+            figure, _ = draw(None, rows)
+            figure.savefig(FOLDER / 'results' / name / f'{draw.__name__}.png', dpi=plots.DPI)
 
 
 if __name__ == '__main__':
-    (FOLDER / 'reference' / 'api.md').write_text(api(), encoding='utf-8')
-    draw_elastic_unit(FOLDER / 'images' / 'elastic_unit.png')
+    for page, make in PAGES.items():
+        (FOLDER / 'reference' / page).write_text(make(), encoding='utf-8')
+    README.write_text(readme(README.read_text('utf-8')), encoding='utf-8')
+    draw_series_elastic(FOLDER / 'images' / 'elastic_unit.png')
+    draw_muscles(FOLDER / 'images' / 'muscles.png')
+    draw_results()

@@ -2,7 +2,7 @@
 """What the messages of a driver say about it while nothing is commanded.
 
 By what values are possible at all and, where θ is known, by l beside the geometric model's
-(doc/explanation/method.md, The driver's contract).
+(doc/explanation/control_and_safety.md, Judging a driver).
 """
 
 import math

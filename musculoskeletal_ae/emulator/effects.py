@@ -6,7 +6,7 @@
     NONE                                 a body as its description or its file has it
 
 An individual has between 3/4 and all of a size, or a normal deviation with that spread (σ). The
-sources of the sizes are in doc/explanation/method.md.
+sources of the sizes are in doc/explanation/emulators.md.
 """
 
 import zlib

@@ -14,7 +14,8 @@ from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 
 # Told apart by people who see colours differently, and in grey.
-BEFORE, AFTER, PAPER, TRUE, MARK = '#D55E00', '#0072B2', '#CC79A7', '#222222', '#777777'
+# The page draws the estimated arm in the colour of AFTER.
+BEFORE, AFTER, PAPER, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
 #: before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110
@@ -80,6 +81,36 @@ def bars(
     panel.invert_yaxis()
     panel.margins(x=0.12)
     tidy(panel, xlabel, '', title, legend='below' if len(groups) > 1 else '')
+
+
+def ranked_bars(
+    panel: Any,
+    values: Mapping[str, Sequence[float | None]],
+    colours: Sequence[str],
+    xlabel: str,
+    title: str,
+    digits: int = 3,
+) -> None:
+    """Draw one bar per name: the mean over individuals, a dot for each, and the mean in a column.
+
+    Values are by name; None: there is none.
+    """
+    place = np.arange(len(values))
+    numbers = {name: np.array(each, dtype=float) for name, each in values.items()}
+    means = [float(np.mean(each)) for each in numbers.values()]
+    panel.barh(place, means, 0.7, color=list(colours))
+    for at, each, mean in zip(place, numbers.values(), means):
+        panel.plot(each, [at] * len(each), 'o', color=TRUE, ms=4, mfc='white', mew=1.0)
+        text = 'none' if np.isnan(mean) else f'{mean:.{digits}f}'
+        # In a column beside the axes, where it hides no dot.
+        style = {'textcoords': panel.get_yaxis_transform(), 'va': 'center', 'fontsize': 9}
+        panel.annotate(text, (0.0, at), (1.02, at), annotation_clip=False, **style)
+    heading = {'va': 'bottom', 'fontsize': 9, 'fontweight': 'bold'}
+    panel.text(1.02, 1.0, 'mean', transform=panel.transAxes, **heading)
+    panel.set_yticks(place, [*values])
+    panel.invert_yaxis()
+    panel.margins(x=0.05)
+    tidy(panel, xlabel, '', title)
 
 
 def pictures(

@@ -255,16 +255,18 @@ def readme_table(results: Results) -> str:
     about = next(iter(results.values()))['about']
     text = (
         f'\n\n{about["robot"]}, emulated {individuals(about["seeds"])}, '
-        f'{about["minutes"]:g} minutes of exploration; {NOTHING}: not printed, or nothing to '
-        'compare. Bound: least squares on the true body (estimate), the least ‖T‖ that can hold '
-        'the posture where the arm came to rest (control), the true body without friction '
+        f'{about["minutes"]:g} minutes of exploration. {NOTHING}: not printed, or nothing to '
+        'compare. Reference: least squares on the true body (estimate), the least ‖T‖ that can '
+        'hold the posture where the arm came to rest (control), the true body without friction '
         '(simulator).\n\n'
-        '| | paper, on Musashi | preset `paper` | preset `default` | bound | aim |\n'
+        '| | paper, on Musashi | preset `paper` | preset `default` | reference | goal |\n'
         '|---|---|---|---|---|---|'
     )
-    for each in table(results):
-        text += f'\n| {each.quantity} | {each.printed} | {each.paper} | **{each.default}** | '
-        text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
+    for name in filter(ROWS.get, results):
+        text += f'\n| **`experiment {name}`** | | | | | |'
+        for each in table({name: results[name]}):
+            text += f'\n| {each.quantity} | {each.printed} | {each.paper} | **{each.default}** | '
+            text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
     return ''.join([text, *(f'\n\nFailed: {line}' for line in failures(results)), '\n\n'])
 
 

@@ -14,6 +14,7 @@ one, of link lengths, axes and masses, which the paper takes as exact.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from shutil import copyfile
 from typing import Any
@@ -32,7 +33,7 @@ from musculoskeletal_ae.experiments.recording import (
     mean_error,
     record,
 )
-from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.presets import PRESETS
 
 REALITIES = KIN, FOREIGN
@@ -51,20 +52,26 @@ ABLATED = {
     'delays': ('delay', 'jitter', 'dropouts'),
 }
 QUICK = ('friction',)
+ABLATION_INDIVIDUALS = 3
+REPEATED = 'nothing: another run'  # what runs differ by, with other postures explored
+OTHER_RUN = 1000  # added to the seed of exploration and training
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Measure an individual of each body; the ablation is of the first one."""
+    """Measure an individual of each emulator model; the ablation is of the first few."""
     parts = {reality: _learned(study, seed, reality) for reality in REALITIES}
     numbers: dict[str, Any] = {at: _numbers(part, seed) for at, part in parts.items()}
     if not study.quick:
-        numbers['links_rad'] = _otherwise(parts[FOREIGN], seed, links=1.0)
-    if seed == study.seeds[0]:
+        numbers['links_rad'] = _otherwise(parts[FOREIGN], seed, {'links': 1.0})
+    if seed in study.seeds[:ABLATION_INDIVIDUALS]:
         numbers['ablation_rad'] = {
-            name: _otherwise(parts[FOREIGN], seed, **dict.fromkeys(effects, 0.0))
+            name: _otherwise(parts[FOREIGN], seed, dict.fromkeys(effects, 0.0))
             for name, effects in ABLATED.items()
             if name in QUICK or not study.quick
         }
+        if not study.quick:
+            again = _otherwise(parts[FOREIGN], seed, {}, run=seed + OTHER_RUN)
+            numbers['ablation_rad'][REPEATED] = again
     return Measured(numbers, {})
 
 
@@ -114,8 +121,13 @@ def _informed(arm: Any, recording: Recording) -> float:
     return estimator.error(part._replace(tension=pull, length=length), np.s_[:])
 
 
-def _otherwise(study: Study, seed: int, **effects: float) -> float:
-    """Return what learning is left with where an individual has other effects [rad]."""
+def _otherwise(
+    study: Study, seed: int, effects: Mapping[str, float], run: int | None = None
+) -> float:
+    """Return the error after learning where an individual has other effects [rad].
+
+    `run` is the seed of exploration and training; default: that of the individual.
+    """
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm
 
@@ -123,51 +135,76 @@ def _otherwise(study: Study, seed: int, **effects: float) -> float:
         return ForeignArm(study.robot, seed, replace(Effects(), **effects))
 
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
-    learner, loop = online_learning.beginner(study, arm(), seed, study.preset)
+    explorer = seed if run is None else run
+    learner, loop = online_learning.beginner(study, arm(), explorer, study.preset)
     stream = online_learning.explore(loop, learner, 60.0 * study.minutes)
     online_learning.teach(learner, stream)
     return estimation_error(learner.mae, held_out)
 
 
+#: key, label and colour of what the charts compare
 ESTIMATES = {
-    'least_squares_rad': 'least squares, geometric model',
-    'before_rad': 'before learning',
-    'paper_after_rad': 'preset paper',
-    'after_rad': 'learned',
-    'oracle_rad': 'oracle',
-    'informed_oracle_rad': 'informed oracle',
-    'joint_sensors_rad': 'joint sensors',
+    'before_rad': ('before learning', plots.BEFORE),
+    'least_squares_rad': ('least squares, geometric model', plots.MARK),
+    'paper_after_rad': ('preset paper, learned', plots.PAPER),
+    'after_rad': ('preset default, learned', plots.AFTER),
+    'joint_sensors_rad': ('joint sensors that it learns from', plots.MARK),
 }
 
 
-def robustness(_: Study, rows: Rows) -> Plot:
-    """Draw the errors of all estimators on both bodies."""
-    figure, (panel,) = plots.new_figure(9.0, 5.6)
-    groups = {}
-    for reality, colour in zip(REALITIES, plots.WHEN.values(), strict=True):
-        said = [[row.numbers[reality][key] for key in ESTIMATES] for row in rows.values()]
-        groups[f'reality: {reality}'] = colour, np.array(said, dtype=float)  # None: NaN
-    plots.bars(panel, [*ESTIMATES.values()], groups, 'mean error [rad], held-out motion', '')
+def _estimates(rows: Rows, reality: str) -> Plot:
+    """Draw the errors of all estimators on one emulator model."""
+    figure, (panel,) = plots.new_figure(8.0, 3.2)
+    values = {
+        label: [row.numbers[reality][key] for row in rows.values()]
+        for key, (label, _) in ESTIMATES.items()
+    }
+    colours = [colour for _, colour in ESTIMATES.values()]
+    title = f'Joint-angle error on emulator model {reality}'
+    plots.ranked_bars(panel, values, colours, 'mean error on held-out motion [rad]', title)
     return figure, (
-        'Errors on the motion never used for learning, means over individuals; dots: each.'
+        f'Emulator model {reality}: mean joint-angle error on held-out motion; a dot is one of the '
+        f'individuals {", ".join(map(str, rows))}.'
     )
 
 
-def ablation(_: Study, rows: Rows) -> Plot:
-    """Draw what learning is left with where the foreign body lacks some effects."""
-    seed, (numbers, _traces) = first(rows)
-    figure, (panel,) = plots.new_figure(9.0, 4.6)
-    without = numbers.get('ablation_rad', {})
-    names = sorted(without, key=without.__getitem__, reverse=True)
-    groups = {'without': (plots.AFTER, [[without[name] for name in names]])}
-    whole = numbers[FOREIGN]['after_rad']
-    panel.axvline(whole, color=plots.MARK, ls=':')
-    title = f'without (dotted: with all effects, {whole:.3f} rad)'
-    plots.bars(panel, names, groups, 'mean error after learning [rad]', title)
+def kin(_: Study | None, rows: Rows) -> Plot:
+    """Draw the errors of all estimators on the emulator model `kin`."""
+    return _estimates(rows, KIN)
+
+
+def foreign(_: Study | None, rows: Rows) -> Plot:
+    """Draw the errors of all estimators on the emulator model `foreign`."""
+    return _estimates(rows, FOREIGN)
+
+
+def ablation(_: Study | None, rows: Rows) -> Plot:
+    """Draw how the error changes if some effects of emulator model `foreign` are left out."""
+    known = {seed: row.numbers for seed, row in rows.items() if row.numbers.get('ablation_rad')}
+    every = {seed: numbers['ablation_rad'] for seed, numbers in known.items()}
+    changes = {
+        name: [1e3 * (every[seed][name] - known[seed][FOREIGN]['after_rad']) for seed in every]
+        for name in next(iter(every.values()), {})
+    }
+    repeated = changes.pop(REPEATED, None)
+    changes = dict(sorted(changes.items(), key=lambda item: float(np.mean(item[1]))))
+    figure, (panel,) = plots.new_figure(8.0, 4.6)
+    colours = [plots.AFTER] * len(changes)
+    title = 'Change of the learned error if one group of effects is left out'
+    xlabel = 'change of the mean error on held-out motion [mrad]; negative: the effect matters'
+    plots.ranked_bars(panel, changes, colours, xlabel, title, digits=1)
+    panel.axvline(0.0, color=plots.TRUE, lw=1.0)
+    whole = float(np.mean([numbers[FOREIGN]['after_rad'] for numbers in known.values()]))
+    spread = ''
+    if repeated:
+        largest = float(np.max(np.abs(repeated)))
+        panel.axvspan(-largest, largest, color=plots.MARK, alpha=0.15, lw=0.0)
+        spread = f' Grey: the largest change of a repeated run, {largest:.1f} mrad.'
     return figure, (
-        f'The foreign body with some effects left out, individual {seed}: the shorter the bar, the '
-        'more those effects matter.'
+        'Emulator model foreign with one group of effects left out: change of the error after '
+        f'learning. With all effects it is {1e3 * whole:.0f} mrad (individuals '
+        f'{", ".join(map(str, known))}).{spread}'
     )
 
 
-EXPERIMENT = Experiment(__doc__, measure, (robustness, ablation), 40.0)
+EXPERIMENT = Experiment(__doc__, measure, (kin, foreign, ablation), 70.0)

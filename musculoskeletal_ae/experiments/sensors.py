@@ -90,24 +90,26 @@ def ellipsoid_share(mae: Mae, recording: Recording) -> float:
 
 BARS = {
     'before_rad': 'before learning',
-    'none_rad': 'none',
-    'imu_rad': 'none, accelerometer',
-    'elbow_only_rad': 'elbow only',
-    'marker_tenth_rad': 'marker in 1 of 10',
+    'none_rad': 'no joint sensors',
+    'imu_rad': 'none, accelerometer on the hand',
+    'elbow_only_rad': 'sensors of the elbow only',
+    'marker_tenth_rad': 'none, marker in 1 of 10 samples',
     'all_rad': 'all joint sensors',
 }
 
 
-def sensors(_: Study, rows: Rows) -> Plot:
-    """Draw the error that is left with less and less sensors."""
-    figure, (panel,) = plots.new_figure(9.0, 3.6)
-    values = [[row.numbers[key] for key in BARS] for row in rows.values()]
-    groups = {'learned': (plots.AFTER, values)}
-    title = 'what the learner sees of the joints'
-    plots.bars(panel, [*BARS.values()], groups, 'mean error [rad], held-out motion', title)
+def sensors(_: Study | None, rows: Rows) -> Plot:
+    """Draw the error that is left with fewer and fewer joint sensors."""
+    figure, (panel,) = plots.new_figure(8.0, 3.2)
+    means = {key: np.mean([row.numbers[key] for row in rows.values()]) for key in BARS}
+    ranked = sorted(BARS, key=means.__getitem__, reverse=True)
+    values = {BARS[key]: [row.numbers[key] for row in rows.values()] for key in ranked}
+    colours = [plots.BEFORE if key == 'before_rad' else plots.AFTER for key in ranked]
+    title = 'Joint-angle error by what the learner knows of the joints'
+    plots.ranked_bars(panel, values, colours, 'mean error on held-out motion [rad]', title)
     return figure, (
-        'Error on the motion never used for learning, by what the learner sees of the joints: '
-        f'means over individuals {", ".join(map(str, rows))}; dots: each.'
+        'Mean joint-angle error on held-out motion, by what the learner knows of the joints; a dot '
+        f'is one of the individuals {", ".join(map(str, rows))}.'
     )
 
 

@@ -7,7 +7,7 @@ A motor that warms its housing, which the surroundings cool (arXiv 2407.08055):
 
 The housing's temperature c₂ is measured, the winding's c₁ is not. While the arm moves, an extended
 Kalman filter learns c₁ − c₂, c₂, the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a, each
-a random walk; r = R₁/R₂ cannot be learned (doc/explanation/method.md says why).
+a random walk; r = R₁/R₂ cannot be learned (doc/explanation/control_and_safety.md).
 
 The highest tension of a muscle is the one that, held for a time from now on, brings its winding to
 the highest temperature. A constant that leaves what it was, once that was known, says that the

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs every command of README, tutorials and how-to guides in a fresh clone.
+
+    python -m bench documents [PAGE …] [--keep DIR]
+
+The commands are those of the ```sh blocks, in their order, one shell for each page. What a page
+tells its readers, it also tells this bench:
+
+- `Ctrl-C ends it` in the comment of a command: it runs in the background until the next such
+  command of the same script, or the end of the page. The next command starts once `bringup.sh`
+  prints its first status line.
+- `<!-- bench: skip REASON -->` above a block: the block is listed and not run.
+- `<!-- bench: ros2 -->` above a block of doc/howto/install.md: it builds the command `ros2`, and
+  runs before the first command that needs it, if there is no `ros2`.
+
+`REPOSITORY` stands for a clone of what is committed here. The shell has no ROS and a home of its
+own. A page ends at its first command that fails; exit status 1 if there was one. The first page
+installs about 2 GB of wheels; all pages take about half an hour.
+"""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from argparse import Namespace
+from pathlib import Path
+from typing import NamedTuple
+
+from musculoskeletal_ae.options import Parser
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = (
+    'README.md',
+    *(str(file.relative_to(ROOT)) for file in sorted(ROOT.glob('doc/tutorials/*.md'))),
+    *(str(file.relative_to(ROOT)) for file in sorted(ROOT.glob('doc/howto/*.md'))),
+)
+BACKGROUND = 'Ctrl-C ends it'
+KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
+START_PATIENCE = 1800  # [s] for the first status line, installation included
+COMMAND_PATIENCE = 900  # [s] for all other commands of a page
+NAME = 'musculoskeletal_ae'
+INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'
+FUNCTIONS = f"""
+exec 2>&1
+declare -A running=()
+stop() {{ # SCRIPT: ends what runs in the background
+  local pid=${{running[$1]-}}
+  [ -n "$pid" ] || return 0
+  kill -INT -- -"$pid" 2>/dev/null
+  wait "$pid"
+  unset "running[$1]"
+}}
+trap 'for script in "${{!running[@]}}"; do stop "$script"; done' EXIT
+background() {{ # SCRIPT COMMAND
+  stop "$1"
+  local log
+  log=$(mktemp)
+  set -m
+  eval "$2" >"$log" 2>&1 &
+  running[$1]=$!
+  set +m
+  [[ $1 == *bringup.sh ]] || {{ sleep 5; kill -0 "${{running[$1]}}"; return; }}
+  for ((second = 0; second < {START_PATIENCE}; second++)); do
+    grep -q ' s  ' "$log" && {{ tail -n 1 "$log"; return 0; }}
+    kill -0 "${{running[$1]}}" 2>/dev/null || break
+    sleep 1
+  done
+  tail -n 20 "$log"
+  return 1
+}}
+"""
+
+
+class Command(NamedTuple):
+    """One command of a page."""
+
+    line: str
+    is_background: bool
+    skipped_because: str  # '' if it is run
+
+
+def commands(page: Path) -> list[Command]:
+    """Return the commands of a page in their order."""
+    found = []
+    for mark, block in _blocks(page):
+        reason = 'only without a ros2 command' if mark == ROS2 else mark.removeprefix('skip ')
+        for command in _joined(block.splitlines()):
+            line = re.sub(r'\s+#.*', '', command)
+            if line:
+                found.append(Command(line, BACKGROUND in command, reason))
+    return found
+
+
+def _blocks(page: Path) -> list[tuple[str, str]]:
+    """Return the marks for this bench ('' without one) and the texts of the blocks of a page."""
+    pattern = r'(?:<!-- bench: (?P<mark>[^>]*?) -->\s*)?^ *```sh\n(?P<block>.*?)^ *```'
+    text = page.read_text('utf-8')
+    return [(m['mark'] or '', m['block']) for m in re.finditer(pattern, text, re.S | re.M)]
+
+
+def _joined(lines: list[str]) -> list[str]:
+    """Join lines that end in a backslash or inside quotes; drop lines that are comments."""
+    joined: list[str] = []
+    for line in map(str.strip, lines):
+        is_open = joined and (joined[-1].endswith('\\') or joined[-1].count('"') % 2)
+        if is_open:
+            joined[-1] = f'{joined[-1].removesuffix(chr(92))} {line}'
+        elif line and not line.startswith('#'):
+            joined.append(line)
+    return joined
+
+
+def script(page: Path, repository: str) -> str:
+    """Return a shell script that follows a page."""
+    lines, has_ros2 = [FUNCTIONS], False
+    (build_ros2,) = (block for mark, block in _blocks(ROOT / INSTALL) if mark == ROS2)
+    for command in commands(page):
+        line = command.line.replace('REPOSITORY', repository)
+        shown = f'$ {line}' + f'   (skipped: {command.skipped_because})' * bool(
+            command.skipped_because
+        )
+        if command.line.startswith('ros2 ') and not command.skipped_because and not has_ros2:
+            lines.append(f'command -v ros2 >/dev/null || {{\n{build_ros2}}}')
+            has_ros2 = True
+        lines.append(f"printf '\\n[%(%H:%M:%S)T] %s\\n' -1 {shlex.quote(shown)}")
+        if command.skipped_because:
+            continue
+        if command.is_background:
+            line = f'background {shlex.quote(line.split()[0])} {shlex.quote(line)}'
+        lines += [line, 'status=$?; [ $status = 0 ] || { echo "exit status $status"; exit 1; }']
+    return '\n'.join(lines)
+
+
+def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
+    """Follow a page; return whether every command succeeded."""
+    print(f'\n== {page}', flush=True)
+    paths = os.environ['PATH'].split(os.pathsep)
+    paths = [path for path in paths if not path.startswith(sys.prefix)]
+    environment = {name: os.environ[name] for name in KEPT if name in os.environ}
+    environment |= {'HOME': str(home), 'PATH': os.pathsep.join(paths)}
+    folder = clone.parent if page == 'README.md' else clone
+    if not clone.exists() and folder == clone:
+        subprocess.run(['git', 'clone', '-q', repository, clone], check=True)
+    patience = str(START_PATIENCE + COMMAND_PATIENCE)
+    done = subprocess.run(
+        ['timeout', patience, 'bash', '-c', script(ROOT / page, str(repository))],
+        cwd=folder, env=environment, text=True, check=False,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    print(done.stdout.replace(str(clone), '…').replace(str(home), '~'), flush=True)
+    # The next page finds a clean clone, with what is installed.
+    subprocess.run(['git', 'clean', '-fdq'], cwd=clone, check=True)
+    return done.returncode == 0
+
+
+def _parse(argv: list[str]) -> Namespace:
+    parser = Parser('documents', 'Runs every command of the documents in a fresh clone.')
+    parser.add_argument('pages', nargs='*', metavar='PAGE', help='default: all of them')
+    parser.add_argument('--list', action='store_true', help='list the commands and run none')
+    parser.add_argument('--keep', type=Path, metavar='DIR', help='work here, and leave it')
+    return parser.parse_args(argv)
+
+
+def main(argv: list[str]) -> int:
+    """Follow the pages; exit status 1 if a command failed."""
+    options = _parse(argv)
+    pages = options.pages or PAGES
+    if options.list:
+        for page in pages:
+            for command in commands(ROOT / page):
+                note = f'   (skipped: {command.skipped_because})' if command.skipped_because else ''
+                print(f'{page}: {command.line}{" &" * command.is_background}{note}')
+        return 0
+    with tempfile.TemporaryDirectory(prefix='documents_') as temporary:
+        folder = options.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        repository, clone, home = folder / f'{NAME}.git', folder / NAME, folder / 'home'
+        home.mkdir(exist_ok=True)
+        if not repository.exists():
+            subprocess.run(['git', 'clone', '-q', '--bare', ROOT, repository], check=True)
+        failed = [page for page in pages if not follow(page, clone, home, repository)]
+    print(f'failed: {", ".join(failed)}' if failed else 'every command succeeded')
+    return 1 if failed else 0

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records the film of the README: the running system on its page, in a headless Chromium.
+
+    python -m bench film [--out doc/images]
+
+It runs `./bringup.sh --view` with `on_anomaly: isolate` and takes screenshots of the page:
+
+1. The arm explores and learns; the estimate converges to the measured arm.
+2. A click on the button "Cut" ruptures the muscle that is chosen on the page.
+3. The estimator isolates the muscle, and the arm moves on.
+
+Everything that the film shows came over ROS topics from the nodes of a real run; nothing is drawn
+by this program. Needs Chromium and about three minutes. Writes `view.gif`, and `view.png` with the
+first picture in which the ruptured muscle is named.
+"""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Callable
+from pathlib import Path
+
+from PIL import Image
+
+from bench.processes import end_processes
+from musculoskeletal_ae.options import Parser, whole
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / 'test' / 'view'))
+from browser import Browser  # noqa: E402 - the tests' own browser
+
+SIZE, SCALED, COLOURS = (1280, 720), (960, 540), 128
+LEARNING, MOVING_ON = 60.0, 25.0  # [s] before the rupture, and after the isolation
+EVERY, EVERY_LATER = 1.0, 0.4  # [s] between pictures while learning, and around the rupture
+FRAME, LAST = 110, 1500  # [ms] that a picture of the film is shown, and the last one
+SETTLE = 3.0  # [s] from the first status until the whole page is drawn
+PATIENCE = 600.0  # [s] for the start, and for what the film waits for
+
+
+def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], int]:
+    """Return the pictures, and the number of the first one that names the ruptured muscle."""
+    frames: list[Image.Image] = []
+    browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
+
+    def take(seconds: float, every: float, until: Callable[[str], bool] = lambda _: False) -> bool:
+        """Take pictures for a time, or until the page's text fulfils a condition."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            begun = time.monotonic()
+            shot = browser.screenshot(folder / 'frame.png')
+            picture = Image.open(io.BytesIO(shot)).convert('RGB')
+            frames.append(picture.resize(SCALED, Image.Resampling.LANCZOS))
+            if until(browser.text):
+                return True
+            time.sleep(max(0.0, begun + every - time.monotonic()))
+        return False
+
+    try:
+        browser.wait_for('samples')
+        time.sleep(SETTLE)
+        browser.close_notifications()
+        take(options.learning, EVERY)
+        browser.click(*browser.centre('Cut'))
+        if not take(PATIENCE, EVERY_LATER, until=lambda text: 'ANOMALY' in text):
+            raise AssertionError(f'no anomaly was detected within {PATIENCE:g} s')
+        named = len(frames) - 1
+        if not take(PATIENCE, EVERY_LATER, until=lambda text: 'ANOMALY' not in text):
+            raise AssertionError(f'the muscle was not isolated within {PATIENCE:g} s')
+        take(MOVING_ON, EVERY_LATER)
+        return frames, named
+    finally:
+        browser.close()
+
+
+def write(frames: list[Image.Image], named: int, out: Path) -> None:
+    """Write the film with one palette for all pictures, and the picture of the rupture."""
+    several = frames[:: max(1, len(frames) // 8)]
+    collage = Image.new('RGB', (SCALED[0], SCALED[1] * len(several)))
+    for i, frame in enumerate(several):
+        collage.paste(frame, (0, SCALED[1] * i))
+    palette = collage.quantize(COLOURS, method=Image.Quantize.FASTOCTREE)
+    small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    durations = [FRAME] * (len(small) - 1) + [LAST]
+    film = out / 'view.gif'
+    small[0].save(
+        film, save_all=True, append_images=small[1:], duration=durations, loop=0, optimize=True
+    )
+    frames[named].save(out / 'view.png')
+    print(f'{film}: {len(small)} pictures, {film.stat().st_size / 1e6:.2f} MB')
+
+
+def main(argv: list[str]) -> int:
+    """Run the system, record its page and write the film."""
+    parser = Parser('film', 'Records the film of the README from the running system.')
+    parser.add_argument('--port', type=whole(1, 65535), default=8099, metavar='N')
+    parser.add_argument('--learning', type=float, default=LEARNING, metavar='S')
+    parser.add_argument('--frames', type=Path, metavar='DIR', help='keep every picture here')
+    parser.add_out('DIR', default=ROOT / 'doc' / 'images')
+    options = parser.parse_args(argv)
+    command = ['./bringup.sh', '--view', '--port', str(options.port)]
+    command += ['-p', 'estimator:on_anomaly:=isolate']
+    with tempfile.TemporaryDirectory() as folder, subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=os.environ
+    ) as system:  # fmt: skip
+        try:
+            for line in system.stdout or ():
+                print(line, end='')
+                if ' s  error ' in line:
+                    break
+            frames, named = record(options, Path(folder))
+        finally:
+            end_processes([system], signal.SIGINT)
+    for i, frame in enumerate(frames if options.frames else ()):
+        options.frames.mkdir(parents=True, exist_ok=True)
+        frame.save(options.frames / f'{i:04d}.png')
+    write(frames, named, options.out)
+    return 0
