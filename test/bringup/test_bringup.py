@@ -118,9 +118,7 @@ def reaches(run):
     return [each for process in variables for each in process if each.startswith(name)]
 
 
-def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(
-    environment, tmp_path
-):
+def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(environment, tmp_path):
     # A sourced Jazzy exports SUBNET.
     environment = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
     file = tmp_path / 'my.yaml'
