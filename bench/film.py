@@ -10,8 +10,9 @@ It runs `./bringup.sh --view` with `on_anomaly: isolate` and takes screenshots o
 3. The estimator isolates the muscle, and the arm moves on.
 
 Everything that the film shows came over ROS topics from the nodes of a real run; nothing is drawn
-by this program. Needs Chromium and about three minutes. Writes `view.gif`, and `view.png` with the
-first picture in which the ruptured muscle is named.
+by this program. Needs Chromium and about three minutes; a busy machine takes fewer pictures. Writes
+`view.gif` and three of its pictures: `view.png` at the end of learning, `view_rupture.png` when the
+ruptured muscle is named, and `view_isolated.png` when the arm moves on.
 """
 
 import io
@@ -42,8 +43,8 @@ SETTLE = 3.0  # [s] from the first status until the whole page is drawn
 PATIENCE = 600.0  # [s] for the start, and for what the film waits for
 
 
-def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], int]:
-    """Return the pictures, and the number of the first one that names the ruptured muscle."""
+def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
+    """Return the pictures, and which of them are kept as files of their own."""
     frames: list[Image.Image] = []
     browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
 
@@ -65,20 +66,22 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], int]:
         time.sleep(SETTLE)
         browser.close_notifications()
         take(options.learning, EVERY)
+        kept = {'view.png': len(frames) - 1}
         browser.click(*browser.centre('Cut'))
         if not take(PATIENCE, EVERY_LATER, until=lambda text: 'ANOMALY' in text):
             raise AssertionError(f'no anomaly was detected within {PATIENCE:g} s')
-        named = len(frames) - 1
+        kept['view_rupture.png'] = len(frames) - 1
         if not take(PATIENCE, EVERY_LATER, until=lambda text: 'ANOMALY' not in text):
             raise AssertionError(f'the muscle was not isolated within {PATIENCE:g} s')
         take(MOVING_ON, EVERY_LATER)
-        return frames, named
+        kept['view_isolated.png'] = len(frames) - 1
+        return frames, kept
     finally:
         browser.close()
 
 
-def write(frames: list[Image.Image], named: int, out: Path) -> None:
-    """Write the film with one palette for all pictures, and the picture of the rupture."""
+def write(frames: list[Image.Image], kept: dict[str, int], out: Path) -> None:
+    """Write the film with one palette for all pictures, and the pictures that are kept."""
     several = frames[:: max(1, len(frames) // 8)]
     collage = Image.new('RGB', (SCALED[0], SCALED[1] * len(several)))
     for i, frame in enumerate(several):
@@ -90,7 +93,8 @@ def write(frames: list[Image.Image], named: int, out: Path) -> None:
     small[0].save(
         film, save_all=True, append_images=small[1:], duration=durations, loop=0, optimize=True
     )
-    frames[named].save(out / 'view.png')
+    for name, number in kept.items():
+        frames[number].save(out / name)
     print(f'{film}: {len(small)} pictures, {film.stat().st_size / 1e6:.2f} MB')
 
 
@@ -112,11 +116,11 @@ def main(argv: list[str]) -> int:
                 print(line, end='')
                 if ' s  error ' in line:
                     break
-            frames, named = record(options, Path(folder))
+            frames, kept = record(options, Path(folder))
         finally:
             end_processes([system], signal.SIGINT)
     for i, frame in enumerate(frames if options.frames else ()):
         options.frames.mkdir(parents=True, exist_ok=True)
         frame.save(options.frames / f'{i:04d}.png')
-    write(frames, named, options.out)
+    write(frames, kept, options.out)
     return 0
