@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Attacks the running system with messages, requests, kills, faults and files; counts what breaks.
 
-    python -m bench attack [--quick] [--seed 0]
+    python -m bench attack [--quick] [--seeds 0,1,2,3,4] [--kinds 'false zeros',…]
 
-The whole system runs on an emulated arm that explores. A stranger publishes on every topic that a
-node listens to (heard messages changed, and such as were never sane), calls every service with odd
-content, breaks sensors, wires and motors, and kills nodes; every command of the controller is
-recorded and judged. Beside it hostile files are read, and, but for the quick form, a learner is
+The whole system runs on an emulated arm, once for each seed. First it is misled in known ways
+(`attack_kinds`), in several shapes, while it holds and while it explores; the seeds share them.
+After each, what the status line advises is done literally, until the arm goes on. Then random
+events follow: targets, services, faults, suspended and killed nodes, false states of the body. Then
+a stranger publishes on every topic that a node listens to (heard messages changed, and such as were
+never sane), and calls every service with odd content. Every command, every tension and every status
+is recorded and judged. Beside it hostile files are read, and, but for the quick form, a learner is
 killed as in `kills`.
 
 Prints a table: promise, how often it was tried, how often it was broken. Exit status 1 if any was.
@@ -14,32 +17,40 @@ What a stranger may do on an open graph is not tried: command the modules, whom 
 their limits; ask for a stop; set a parameter to a legal value.
 """
 
+import random
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from bench import attack_files, kills
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.options import Parser, whole
+from musculoskeletal_ae.options import Parser, names, numbers, whole
 from musculoskeletal_ae.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from bench.attack_graph import Attack
 
 JITTER = 0.03  # [s] by which a loaded machine publishes a command later than it was made
 RELIEF = 0.3  # [s] for which a tension that is being relieved was measured before
 SILENT = 10.0  # [s] that a node under attack may keep /diagnostics waiting
 GROWTH = 1.2  # of a node's memory, over what it was after five minutes
 YOUNG = 300.0  # [s]
+ABOVE, MOMENT = 1.1, 0.5  # of tension.limit, and how long [s] a tension may be above that
+STILL = 0.002  # [m] that a stopped arm may be wound in
 MOST_MEMORY = 500.0  # [MB] of any node at any time
 
 
 class Size(NamedTuple):
-    """How much is tried."""
+    """How much is tried, in all seeds together."""
 
+    attacks: int | None  # known ones; None: all of them
+    events: int
     messages: int
     node_kills: int
     learner_kills: int
@@ -47,8 +58,10 @@ class Size(NamedTuple):
     episodes: int
 
 
-FULL = Size(messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=60)
-QUICK = Size(messages=2000, node_kills=2, learner_kills=0, files=42, episodes=2)
+FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
+QUICK = Size(4, 20, messages=2000, node_kills=2, learner_kills=0, files=42, episodes=1)
+SEEDS = 0, 1, 2, 3, 4
+EVENTS_IN_A_ROW = 50  # until the arm is recovered
 
 
 class Row(NamedTuple):
@@ -105,71 +118,164 @@ def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscle
     return np.asarray(counted[end] > counted[begin])
 
 
-def attack_graph(folder: Path, initial: Path, size: Size, seed: int) -> list[Row]:
-    """Attack the running system."""
-    from bench.attack_graph import LENGTH, Attack
+def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array:
+    """Return how long each muscle pulled more than `highest` [N] without a break, at most [s] (M,).
 
-    messages = -(-size.messages // size.episodes)
+    `loads` are times [s] and measured T [N] (M,).
+    """
+    if not loads:
+        return np.zeros(0)
+    longest, since = np.zeros(len(loads[0][1])), np.full(len(loads[0][1]), np.inf)
+    for at, load in loads:
+        since = np.where(load > highest, np.minimum(since, at), np.inf)
+        longest = np.maximum(longest, np.where(np.isfinite(since), at - since, 0.0))
+    return longest
+
+
+def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
+    """Return by how much a muscle was wound in, at most, between two times [m]."""
+    during = value[(time > begin) & (time < end)]
+    if len(during) < 2:
+        return 0.0
+    return float((np.maximum.accumulate(during, axis=0) - during).max())
+
+
+def without(times: Array, intervals: list[tuple[float, float]]) -> Bools:
+    """Return which times lie in none of the intervals."""
+    outside = np.ones(len(times), dtype=bool)
+    for begin, end in intervals:
+        outside &= (times < begin) | (times > end)
+    return outside
+
+
+def attack_graph(
+    folder: Path, initial: Path, size: Size, seed: int, planned: list[tuple[str, int, str]]
+) -> list[Row]:
+    """Attack the running system of one seed."""
+    from bench.attack_graph import Attack
+    from bench.attack_kinds import Scene, random_event
+
+    folder.mkdir(parents=True, exist_ok=True)
     with Attack(folder, initial, seed) as attack:
+        scene = Scene(attack)
         attack.spin(2.0)
+        for number, (kind, shape, moment) in enumerate(planned):
+            begun = time.monotonic()
+            scene.play(kind, shape, moment)
+            took = time.monotonic() - begun
+            print(f'  {number + 1} of {len(planned)}: {scene.what}: {took:.0f} s', flush=True)
+        begun = time.monotonic()
+        while attack.tried['events'] < size.events:
+            scene.what = 'random events'
+            if scene.bring('exploring'):
+                for _ in range(min(EVENTS_IN_A_ROW, size.events - attack.tried['events'])):
+                    random_event(scene)
+                attack.set_faults([])
+                scene.recover('exploring')
+            else:
+                break
+        print(f'  {attack.tried["events"]} events: {time.monotonic() - begun:.0f} s', flush=True)
+        begun = time.monotonic()
         for episode in range(size.episodes):
-            kills = (episode + 1) * size.node_kills // size.episodes
-            attack.episode(messages, kills - attack.tried['kills'])
-            print(f'episode {episode + 1} of {size.episodes}: {dict(attack.tried)}', flush=True)
+            kills = size.node_kills // size.episodes
+            attack.episode(-(-size.messages // size.episodes), kills)
+            print(f'  episode {episode + 1} of {size.episodes}', flush=True)
+        print(f'  messages: {time.monotonic() - begun:.0f} s', flush=True)
         attack.moving()
-        robot, tried, found = attack.robot, attack.tried, attack.findings
-    steps = []
+    return judged(attack)
+
+
+def judged(attack: 'Attack') -> list[Row]:
+    """Return the promises and what broke them, from all that was recorded."""
+    from bench.attack_graph import LENGTH
+
+    robot, tried, found = attack.robot, attack.tried, attack.findings
+    fast, wound, count = list[str](), list[str](), 0
+    stops = [
+        (begin, end, mode)
+        for (begin, mode), (end, _) in zip(attack.modes, [*attack.modes[1:], (np.inf, '')])
+        if mode.startswith('stopped')
+    ]
     for life in range(attack.life + 1):
         mine = [c for c in attack.commands if c.life == life and c.topic == LENGTH]
-        if mine:
-            at = np.array([command.time for command in mine])
-            eased = relieved(at, attack.loads, robot.tension.limit, robot.muscle_count)
-            value = np.array([command.value for command in mine])
-            number = np.array([command.number for command in mine])
-            steps.append(changes(at, number, value, Settings().rate_limit, eased))
-    fast = [what for step in steps for what in step.too_fast]
-    print(
-        f'{sum(step.count for step in steps)} commands; largest change in one tick: '
-        f'{1e3 * max(step.largest_in for step in steps):.2f} mm in, '
-        f'{1e3 * max(step.largest_out for step in steps):.2f} mm out'
-    )
-    print(f'longest silence of a node: {max(attack.silences.values(), default=0.0):.1f} s')
+        if not mine:
+            continue
+        at = np.array([command.time for command in mine])
+        kept = without(at, attack.foreign)
+        at, mine = at[kept], [command for command, is_kept in zip(mine, kept) if is_kept]
+        if not mine:
+            continue
+        eased = relieved(at, attack.loads, robot.tension.limit, robot.muscle_count)
+        value = np.array([command.value for command in mine])
+        number = np.array([command.number for command in mine])
+        steps = changes(at, number, value, Settings().rate_limit, eased)
+        count += steps.count
+        fast += steps.too_fast
+        for begin, end, mode in stops:
+            if (length := wound_in(at, value, begin + JITTER, end)) > STILL:
+                wound.append(f'{1e3 * length:.1f} mm in {mode}')
+    true = [load for load in attack.loads if without(np.array([load[0]]), attack.lying)[0]]
+    tense = [
+        f'{robot.muscles[m]} for {seconds:.1f} s'
+        for m, seconds in enumerate(overloads(true, ABOVE * robot.tension.limit))
+        if seconds > MOMENT
+    ]
+    highest = max((float(load.max()) for _, load in true), default=0.0)
+    tense = [f'{what}, highest tension {highest:.0f} N' for what in tense]
     silent = [f'{name}: {s:.1f} s' for name, s in attack.silences.items() if s > SILENT]
     fat = []
     for name, process in attack.processes.items():
         most = max((memory for _, memory in process.memory), default=0.0)
         old = [memory for age, memory in process.memory if age > YOUNG] or [most]
-        print(f'{name}: at most {most:.0f} MB, {old[0]:.0f} MB at five minutes or never so old')
         if most > MOST_MEMORY or max(old) > GROWTH * old[0]:
             fat.append(f'{name} from {old[0]:.0f} to {most:.0f} MB')
     sent = tried['messages'] + tried['requests']
-    commands = sum(step.count for step in steps)
+    take = found.pop
     return [
-        Row('no message or request ends a node', sent, found.pop('no node ends', [])),
-        Row('every node goes on and reports', sent, silent + found.pop('every node goes on', [])),
-        Row('every node answers', tried['requests'], found.pop('every node answers', [])),
-        Row('no command changes faster than allowed', commands, fast),
-        Row('samples survive', tried['kills'], found.pop('samples survive', [])),
+        Row('no message, request or event ends a node', sent, take('no node ends', [])),
+        Row('every node goes on and reports', sent, silent + take('every node goes on', [])),
+        Row('every node answers', tried['requests'], take('every node answers', [])),
+        Row('no command changes faster than allowed', count, fast),
+        Row('tension above 1.1 × limit lasts 0.5 s at most', len(true), tense),
+        Row('a stopped arm is not wound in', len(stops), wound),
+        Row('no status OK while wrong for 2 s', tried['status'], take('status OK while wrong', [])),
+        Row('the advice of the status line helps', tried['attacks'], take('the advice helps', [])),
+        Row('samples survive', tried['kills'], take('samples survive', [])),
         Row('memory stays', len(attack.processes), fat),
         Row(
             'the arm moves again afterwards',
-            size.episodes + 1,
+            tried['attacks'] + tried['events'],
             [what for broken in found.values() for what in broken],
         ),
     ]
 
 
+def together(rows: list[Row]) -> list[Row]:
+    """Return one row for each promise, of all seeds."""
+    merged: dict[str, Row] = {}
+    for row in rows:
+        before = merged.get(row.promise, Row(row.promise, 0, []))
+        merged[row.promise] = Row(
+            row.promise, before.tried + row.tried, [*before.broken, *row.broken]
+        )
+    return list(merged.values())
+
+
 def main(argv: list[str]) -> int:
     """Attack, and print the table."""
+    from bench.attack_kinds import KINDS, all_attacks
+
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
     parser.add_quick('a minute of it')
     parser.add_argument('--messages', type=whole(1, 10_000_000), help='instead of 100 000')
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
     parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
-    parser.add_seed('of what is done')
+    parser.add_argument('--seeds', type=numbers, help='of what is done (default: 0,1,2,3,4)')
+    parser.add_argument('--kinds', type=names, help='known attacks (default: all)')
     options = parser.parse_args(argv)
     size, begun = QUICK if options.quick else FULL, time.monotonic()
     size = size._replace(messages=options.messages or size.messages)
+    seeds = [int(seed) for seed in options.seeds or (SEEDS[:1] if options.quick else SEEDS)]
     with tempfile.TemporaryDirectory() as name:
         folder = options.out or Path(name)
         folder.mkdir(parents=True, exist_ok=True)
@@ -177,16 +283,35 @@ def main(argv: list[str]) -> int:
         if initial is None:
             initial = folder / 'initial.safetensors'
             checkpoint.save(initial_mae(robot).mae, initial)
-        rows = attack_graph(folder, initial, size, options.seed)
+        planned = [each for each in all_attacks() if each[0] in (options.kinds or KINDS)]
+        random.Random(seeds[0]).shuffle(planned)  # noqa: S311 - must be repeatable
+        planned, rows = planned[: size.attacks], []
+        share = size._replace(
+            events=-(-size.events // len(seeds)),
+            messages=-(-size.messages // len(seeds)),
+            node_kills=-(-size.node_kills // len(seeds)),
+            episodes=-(-size.episodes // len(seeds)),
+        )
+        for number, seed in enumerate(seeds):
+            print(f'seed {seed}', flush=True)
+            mine = planned[number :: len(seeds)]
+            rows += attack_graph(folder / f'seed_{seed}', initial, share, seed, mine)
+            print_rows(together(rows))
+        rows = together(rows)
         if count := size.learner_kills:
-            lost = kills.run(robot, Path(name) / 'killed', initial, count, options.seed)
+            lost = kills.run(robot, Path(name) / 'killed', initial, count, seeds[0])
             rows.append(Row('a killed learner loses nothing', count, lost))
-    tried, broken, outcomes = attack_files.attack(size.files, options.seed)
+    tried, broken, outcomes = attack_files.attack(size.files, seeds[0])
     print(', '.join(f'{count} {what}' for what, count in sorted(outcomes.items())))
     rows.append(Row('a file is used or refused, soon', tried, broken))
-    print(f'\n{"promise":<44} {"tried":>8} {"broken":>8}')
-    for row in rows:
-        print(f'{row.promise:<44} {row.tried:>8} {len(row.broken):>8}')
-        print(''.join(f'    {what[:400]}\n' for what in row.broken[:5]), end='')
+    print_rows(rows)
     print(f'{time.monotonic() - begun:.0f} s')
     return int(any(row.broken for row in rows))
+
+
+def print_rows(rows: list[Row]) -> None:
+    """Print promises, how often they were tried, and how they were broken."""
+    print(f'\n{"promise":<46} {"tried":>8} {"broken":>8}')
+    for row in rows:
+        print(f'{row.promise:<46} {row.tried:>8} {len(row.broken):>8}')
+        print(''.join(f'    {what[:400]}\n' for what in row.broken[:5]), end='', flush=True)

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -37,8 +37,9 @@ from rcl_interfaces.srv import (
 from rclpy.node import NodeNameNonExistentError
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from bench.processes import end_processes, memory
@@ -48,6 +49,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.ros_tool import Spinner, message_class
+from musculoskeletal_ae.nodes.situation import Situation
 from musculoskeletal_ae.robot.robot import Robot
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
@@ -63,6 +65,7 @@ SERVICES = {
     'rcl_interfaces/srv/ListParameters': ListParameters,
 }
 OWN = QoSProfile(depth=1000)
+JUDGE_PERIOD = 0.25  # [s] between looks at what the status line would say
 PATIENCE = 90.0  # [s] for anything that has to come about
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
@@ -124,8 +127,9 @@ class Attack:
         self.folder, self.initial, self.rate = folder, initial, rate
         self.robot = Robot.load('arm26')
         self.rng = random.Random(seed)  # noqa: S311 - must be repeatable
-        self.namespace = f'/attack_{os.getpid()}'
-        rclpy.init()
+        self.namespace = f'/attack_{os.getpid()}_{seed}'
+        # `bench.__main__` handles stop signals; rclpy's handlers would end the context first.
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self.node = rclpy.create_node('stranger', namespace=self.namespace)
         self.executor = Spinner(self.node)
         self.processes: dict[str, Process] = {}
@@ -141,9 +145,18 @@ class Attack:
         self.tried: Counter[str] = Counter()
         self.findings: dict[str, list[str]] = {}
         self.samples = 0
+        self.situation = Situation(self.namespace)
+        self.status: list[tuple[float, str, str]] = []  # time [s], level and text
+        self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
+        #: when commands may come from others than the controller, and when sensors lie [s]
+        self.foreign: list[tuple[float, float]] = []
+        self.lying: list[tuple[float, float]] = []
+        self.strangers: list[Process] = []  # second nodes
+        self.watches_processes = True  # whether one that ends is a finding
+        self._lying_since = 0.0  # [s]; 0: sensors do not
         self._topics: dict[str, str] = {}
         self._services: dict[str, str] = {}
-        self._looked = 0.0
+        self._looked = self._judged = 0.0
         self._listen()
 
     def __enter__(self) -> Attack:
@@ -152,15 +165,38 @@ class Attack:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end_strangers()
+        for process in self.processes.values():  # one that is paused hears no other signal
+            with suppress(ProcessLookupError):
+                process.process.send_signal(signal.SIGCONT)
         end_processes([process.process for process in self.processes.values()], signal.SIGTERM)
         self.node.destroy_node()
         rclpy.try_shutdown()
 
     def start(self, name: str) -> None:
         """Start a node."""
+        self.processes[name] = self.process(name)
+        self.levels.pop(name, None)
+        self.life += name == 'controller'
+
+    def start_second(self, name: str, node: str = '') -> None:
+        """Start a second node of a kind, under a `node` name of its own if one is given."""
+        remapping = ['-r', f'__node:={node}'] if node else []
+        self.strangers.append(self.process(name, f'second_{name}', remapping))
+
+    def end_strangers(self) -> None:
+        """End everything that the stranger has on the graph."""
+        end_processes([process.process for process in self.strangers], signal.SIGTERM)
+        self.strangers.clear()
+        for publisher in self.publishers.values():
+            self.node.destroy_publisher(publisher)
+        self.publishers.clear()
+
+    def process(self, name: str, log: str = '', remapping: Sequence[str] = ()) -> Process:
+        """Start the process of a node."""
         own = {
             'controller': ['max_age:=1.0', 'explore:=true'],
-            'learner': [f'state_directory:={self.folder / "state"}'],
+            'learner': [f'state_directory:={self.folder / (log or "state")}'],
             'hardware_emulator': ['marker_pose_rate:=10.0'],
         }
         parameters = ['robot:=arm26', f'rate:={float(self.rate)}', *own.get(name, [])]
@@ -168,9 +204,8 @@ class Attack:
             parameters.append(f'checkpoint:={self.initial}')
         words = [part for parameter in parameters for part in ('-p', parameter)]
         command = [sys.executable, '-c', RUN, name, '--ros-args', '-r', f'__ns:={self.namespace}']
-        self.processes[name] = Process(name, [*command, *words], self.folder / f'{name}.log')
-        self.levels.pop(name, None)
-        self.life += name == 'controller'
+        file = self.folder / f'{log or name}.log'
+        return Process(name, [*command, *remapping, *words], file)
 
     def found(self, promise: str, what: str) -> None:
         """Note a broken promise."""
@@ -187,6 +222,7 @@ class Attack:
             self._subscribe(JointState, topic, OWN)
         for topic in ('mae_checkpoint', 'accepted_checkpoint'):
             self._subscribe(UInt8MultiArray, topic, LATCHED)
+        self.node.create_subscription(String, 'controller_mode', self._changed_mode, LATCHED)  # type: ignore[arg-type]
         take = self._diagnosed
         self.node.create_subscription(DiagnosticArray, '/diagnostics', take, OWN)  # type: ignore[arg-type]
 
@@ -204,7 +240,11 @@ class Attack:
 
         self.node.create_subscription(kind, topic, take, qos)  # type: ignore[arg-type]
 
+    def _changed_mode(self, message: String, info: dict[str, Any]) -> None:
+        self.modes.append((info['source_timestamp'] / 1e9, message.data))
+
     def _diagnosed(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+        self.situation.diagnosed(message)
         for status in message.status:
             name = status.name.removeprefix(f'{self.namespace}/').removesuffix(': state')
             if status.hardware_id == self.robot.description.directory.name and name in NODES:
@@ -228,11 +268,16 @@ class Attack:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.executor.spin_once(0.05)
+            if time.monotonic() > self._judged + JUDGE_PERIOD:
+                self._judged = time.monotonic()
+                self.situation.tick()
+                now, level = time.time(), self.situation.level()
+                self.status.append((now, level, self.situation.trouble()))
             if time.monotonic() > self._looked + 1.0:
                 self._looked = time.monotonic()
                 for name, process in self.processes.items():
                     process.look()
-                    if not process.alive():
+                    if not process.alive() and self.watches_processes:
                         end_of_log = process.log.read_text('utf-8', 'replace')[-500:]
                         status = process.process.returncode
                         self.found('no node ends', f'{name} ended with {status}: {end_of_log}')
@@ -267,19 +312,33 @@ class Attack:
             self.clients[service] = self.node.create_client(kind, service)
         return self.clients[service]
 
+    def send(self, kind: Any, service: str, request: Any = None) -> None:
+        """Call a service and do not wait."""
+        client = self._client(kind, service)
+        if client.service_is_ready():
+            client.remove_pending_request(client.call_async(request or kind.Request()))
+            self.tried['requests'] += 1
+
+    def send_parameter(self, node: str, name: str, value: Any) -> None:
+        """Set a parameter and do not wait."""
+        self.send(SetParameters, f'{node}/set_parameters', set_request(name, value))
+
     def set_faults(self, lines: list[str]) -> None:
         """Let the emulated arm be broken in so many ways."""
-        parameter = Parameter('faults', value=lines or ['']).to_parameter_msg()
-        self.call(
-            SetParameters,
-            'hardware_emulator/set_parameters',
-            SetParameters.Request(parameters=[parameter]),
-        )
+        if self._lying_since:
+            self.lying.append((self._lying_since, time.time() + 1.0))
+        is_lying = any(line.split(':')[0] not in MECHANICAL for line in lines)
+        self._lying_since = time.time() if is_lying else 0.0
+        request = set_request('faults', lines or [''])
+        self.call(SetParameters, 'hardware_emulator/set_parameters', request)
 
     def moving(self) -> bool:
         """Clear what is latched and explore; say whether commands come within patience."""
         self.wait(lambda: set(self.levels) == set(NODES), 'every node goes on', 'all reports')
         self.set_faults([])
+        for node, name, value in HEALTHY:
+            self.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
+        self.call(Trigger, 'estimator/restore')
         self.call(Trigger, 'hardware_emulator/reset')
         self.call(SetBool, 'learner/enable', SetBool.Request(data=True))
         end = time.monotonic() + PATIENCE
@@ -428,13 +487,31 @@ class Attack:
                 when.pop(0)
                 self.kill()
             self.spin(rng.choice((0.01, 0.05)))
-        for publisher in self.publishers.values():
-            self.node.destroy_publisher(publisher)
-        self.publishers.clear()
+        self.end_strangers()
 
 
-LATCHING = ('mae_checkpoint', 'accepted_checkpoint', 'anomaly_detected')
+LATCHING = (
+    'mae_checkpoint',
+    'accepted_checkpoint',
+    'anomaly_detected',
+    'isolated_muscles',
+    'muscle_length_zeros',
+)
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}
+
+
+MECHANICAL = 'stuck_motor', 'slack', 'winch_speed', 'overheat'  # faults that no sensor reads wrong
+#: parameters of an arm that is well
+HEALTHY: tuple[tuple[str, str, Any], ...] = (
+    ('hardware_emulator', 'ruptured_muscles', ['']),
+    ('controller', 'method', 'proposed'),
+    ('estimator', 'on_anomaly', 'stop'),
+)
+
+
+def set_request(name: str, value: Any) -> SetParameters.Request:
+    """Return the request that sets one parameter."""
+    return SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
 
 
 def digest(message: Any) -> int:

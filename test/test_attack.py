@@ -9,6 +9,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from bench import attack
 from bench.attack_graph import digest, filled
+from bench.attack_kinds import KINDS, all_attacks
 
 RATE = 0.1  # [m/s]
 TIME = np.arange(50) * 0.01
@@ -42,6 +43,21 @@ def test_only_paying_out_a_muscle_that_pulls_too_much_may_be_faster():
     (found,) = steps(out, eased=eased).too_fast
     assert 'muscle 0' in found
     assert len(steps(-out, eased=eased).too_fast) == 2
+
+
+def test_the_longest_overload_and_the_winding_in_of_a_stopped_arm_are_measured():
+    loads = [(t, np.array([300.0 * (0.1 < t < 0.35), 10.0])) for t in TIME]
+    np.testing.assert_allclose(attack.overloads(loads, 220.0), [0.23, 0.0], atol=1e-9)
+    out_and_in = np.stack([np.minimum(TIME, 0.2), 0.0 * TIME], axis=1)
+    out_and_in[30:, 0] -= 0.01
+    assert attack.wound_in(TIME, out_and_in, 0.0, 1.0) == pytest.approx(0.01)
+    assert attack.wound_in(TIME, out_and_in, 0.0, 0.29) == 0.0
+    assert attack.without(TIME, [(0.1, 0.4)]).sum() == np.sum((TIME < 0.1) | (TIME > 0.4))
+
+
+def test_every_known_attack_is_tried_at_every_moment():
+    attacks = all_attacks()
+    assert len(set(attacks)) == len(attacks) == 2 * sum(map(len, KINDS.values()))
 
 
 def test_what_is_hostile_can_be_sent_and_told_from_what_is_not():

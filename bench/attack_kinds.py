@@ -1,0 +1,468 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known ways to mislead an arm, each in several shapes, while it holds and while it explores.
+
+Each attack says while what is wrong (`Scene.wrong`). Afterwards the scene does literally what the
+status line advises, until the arm goes on.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rcl_interfaces.srv import SetParameters
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
+from std_srvs.srv import SetBool, Trigger
+
+from bench.attack_graph import NODES, OWN, PATIENCE, Attack, digest, set_request
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import LENGTH_SCALE
+from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
+
+MOMENTS = 'holding', 'exploring'
+LASTING = 4.0  # [s] of an attack
+SAID = 2.0  # [s] after which the status line has to say that something is wrong
+OFFSET = 0.08  # [m] of false length zeros
+
+
+class Scene:
+    """An arm that holds or explores, attacked in one known way."""
+
+    def __init__(self, attack: Attack) -> None:
+        """Attack the system of `attack`."""
+        self.attack, self.rng = attack, attack.rng
+        self.what = ''  # that is tried, for findings
+
+    # -- the course of an attack ----------------------------------------------------------------
+
+    def play(self, kind: str, shape: int, moment: str) -> None:
+        """Bring the arm into the moment, attack it, and recover it by what the status line says."""
+        self.what = f'{kind}, shape {shape}, {moment}'
+        if not self.bring(moment):
+            return
+        KINDS[kind][shape](self)
+        self.recover(moment)
+        self.attack.watches_processes = True
+        self.attack.tried['attacks'] += 1
+
+    @contextmanager
+    def wrong(self) -> Iterator[None]:
+        """Hold the status line against what is wrong meanwhile."""
+        begin = time.time()
+        yield
+        silent = [
+            at
+            for at, level, _ in self.attack.status
+            if begin + SAID < at < time.time() and level == 'ok'
+        ]
+        self.attack.tried['status'] += 1
+        if silent:
+            late = max(silent) - begin
+            self.attack.found('status OK while wrong', f'{self.what}: OK after {late:.1f} s')
+
+    def bring(self, moment: str) -> bool:
+        """Let a healthy arm hold a posture, or explore; say whether it does."""
+        attack = self.attack
+        if not attack.moving():
+            return False
+        if moment == 'holding':
+            robot = attack.robot
+            attack.call(SetBool, 'controller/explore', SetBool.Request(data=False))
+            middle = JointState(name=robot.joints)
+            middle.position = (0.6 * robot.lower + 0.4 * robot.upper).tolist()
+            self.publish('target_joint_states', middle)
+            attack.spin(1.5)
+        return True
+
+    def recover(self, moment: str) -> None:
+        """Do what the status line says until nothing is wrong and the arm is as it was."""
+        attack, end, said = self.attack, time.monotonic() + PATIENCE, ''
+        while time.monotonic() < end:
+            attack.spin(1.0)
+            level = attack.situation.level()
+            said = attack.situation.trouble()
+            if level != 'error' and self._goes_on(moment):
+                return
+            self.follow_advice(said)
+        attack.found('the advice helps', f'{self.what}: not in {PATIENCE:g} s; last: {said}')
+        attack.end_strangers()
+        for name in NODES:
+            self.resume(name)
+
+    def _goes_on(self, moment: str) -> bool:
+        mode = self.attack.modes[-1][1] if self.attack.modes else ''
+        if moment == 'exploring' and mode in ('idle', 'holding'):
+            request = SetBool.Request(data=True)
+            self.attack.call(SetBool, 'controller/explore', request)
+            return False
+        return mode in ('idle', 'holding', 'moving', 'exploring')
+
+    def follow_advice(self, said: str) -> None:
+        """Do literally what a status line says."""
+        attack = self.attack
+        for node in re.findall(r'/(\w+): no report', said):
+            attack.processes[node].kill()
+            attack.start(node)
+            attack.wait(lambda node=node: node in attack.levels, 'the advice helps', node)
+        for steps in [
+            *re.findall(r'\(to go on: ([^)]*)\)', said),
+            *re.findall(r'end [^,;]*', said),
+        ]:
+            for step in steps.split('; '):
+                self._do(step)
+
+    def _do(self, step: str) -> None:
+        attack = self.attack
+        service = re.search(r'(controller|estimator|learner)/(\w+)', step)
+        if step.startswith('end '):
+            attack.end_strangers()
+        elif step.startswith(('repair', 'free', 'check the sensor')):
+            attack.set_faults([])
+            self.set('hardware_emulator', 'ruptured_muscles', [''])
+            attack.spin(1.0)
+        elif step.startswith('wait'):
+            attack.spin(3.0)
+        elif step.startswith('check that'):
+            for name in ('hardware_emulator', 'estimator'):
+                self.resume(name)
+        elif service and service[2] in ('explore', 'enable'):
+            attack.call(SetBool, service[0], SetBool.Request(data=True))
+        elif service:
+            attack.call(Trigger, service[0])
+            attack.spin(0.5)
+
+    # -- what a stranger does -------------------------------------------------------------------
+
+    def publish(self, topic: str, *messages: Any, period: float = 0.1, qos: Any = OWN) -> None:
+        """Publish messages, as a node of another name."""
+        attack = self.attack
+        if topic not in attack.publishers:
+            kind = type(messages[0])
+            attack.publishers[topic] = attack.node.create_publisher(kind, topic, qos)
+            attack.spin(0.3)
+        for message in messages:
+            attack.sent.add(digest(message))
+            attack.publishers[topic].publish(message)
+            attack.tried['messages'] += 1
+            attack.spin(period)
+
+    def latch(self, topic: str, *messages: Any) -> None:
+        """Publish messages on a latched topic, and watch what comes of them."""
+        with self.wrong():
+            self.publish(topic, *messages, qos=LATCHED)
+            self.attack.spin(LASTING)
+
+    def set(self, node: str, name: str, value: Any) -> None:
+        """Set a parameter."""
+        self.attack.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
+
+    def pause(self, name: str) -> None:
+        """Suspend a node."""
+        self.attack.processes[name].process.send_signal(signal.SIGSTOP)
+
+    def resume(self, name: str) -> None:
+        """Let a node go on."""
+        self.attack.processes[name].process.send_signal(signal.SIGCONT)
+
+    def genuine(self, topic: str) -> Any:
+        """Return the last message of a topic that is not ours."""
+        return self.attack.genuine[topic]
+
+
+def _zeros(scene: Scene, offset: float, deviation: float) -> Float64MultiArray:
+    muscles = scene.attack.robot.muscle_count
+    sign = np.where(np.arange(muscles) % 2, 1.0, -1.0)
+    return array_message(
+        np.array([sign * offset, np.full(muscles, deviation)]), 'quantity', 'muscle'
+    )
+
+
+def zeros_unknown_then_false(scene: Scene) -> None:
+    """B13."""
+    scene.latch('muscle_length_zeros', _zeros(scene, 0.0, 1.0), _zeros(scene, OFFSET, 1e-3))
+
+
+def zeros_false(scene: Scene) -> None:
+    """B13."""
+    scene.latch('muscle_length_zeros', _zeros(scene, OFFSET, 1e-3))
+
+
+def zeros_alternating(scene: Scene) -> None:
+    """B13."""
+    pair = [_zeros(scene, OFFSET, 1e-3), _zeros(scene, -OFFSET, 1e-3)]
+    scene.latch('muscle_length_zeros', *pair * 10)
+
+
+def isolate_most(scene: Scene) -> None:
+    """B14."""
+    scene.latch('isolated_muscles', String(data=','.join(scene.attack.robot.muscles[:-1])))
+
+
+def isolate_all(scene: Scene) -> None:
+    """B14."""
+    scene.latch('isolated_muscles', String(data=','.join(scene.attack.robot.muscles)))
+
+
+def isolate_in_turns(scene: Scene) -> None:
+    """B14."""
+    names = [String(data=name) for name in (*scene.attack.robot.muscles, '')]
+    scene.latch('isolated_muscles', *names)
+
+
+def deny_an_anomaly(scene: Scene) -> None:
+    """B15."""
+    attack = scene.attack
+    muscle = attack.robot.muscles[scene.rng.randrange(attack.robot.muscle_count)]
+    scene.set('hardware_emulator', 'ruptured_muscles', [muscle])
+    with scene.wrong():
+        attack.wait(lambda: attack.situation.detected, 'a rupture is detected', muscle)
+        scene.publish('anomaly_detected', Bool(data=False), qos=LATCHED)
+        attack.call(Trigger, 'controller/reset')
+        attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
+        attack.spin(LASTING)
+
+
+def deny_and_go(scene: Scene) -> None:
+    """B15: the stranger leaves before the reset."""
+    attack = scene.attack
+    scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[0]])
+    with scene.wrong():
+        attack.wait(lambda: attack.situation.detected, 'a rupture is detected', 'the first')
+        scene.publish('anomaly_detected', *[Bool(data=False)] * 3, qos=LATCHED)
+        attack.end_strangers()
+        attack.spin(0.5)
+        answer = attack.call(Trigger, 'controller/reset')
+        if answer is not None and answer.success:
+            attack.found('a latch holds', f'{scene.what}: reset with a ruptured muscle')
+        attack.spin(LASTING)
+
+
+def repeat_an_estimate(scene: Scene) -> None:
+    """B16."""
+    old = scene.genuine('estimated_joint_states')
+    scene.pause('estimator')
+    with scene.wrong():
+        scene.publish('estimated_joint_states', *[old] * int(50 * LASTING), period=0.02)
+    scene.resume('estimator')
+
+
+def shifted(topic: str, joints: float) -> Callable[[Scene], None]:
+    """B16: return an attack that publishes joint states, shifted, beside the genuine ones."""
+
+    def attack(scene: Scene) -> None:
+        with scene.wrong():
+            for _ in range(int(50 * LASTING)):
+                message = scene.genuine(topic)
+                other = JointState(header=message.header, name=message.name)
+                other.position = [angle + joints for angle in message.position]
+                scene.publish(topic, other, period=0.02)
+
+    return attack
+
+
+def second(name: str, node: str = '') -> Callable[[Scene], None]:
+    """B16: return an attack that starts a second node."""
+
+    def attack(scene: Scene) -> None:
+        begin, graph = time.time(), scene.attack
+        graph.start_second(name, node)
+        own = {'controller': 'muscle_length_command', 'estimator': 'anomaly'}
+        topic = f'{graph.namespace}/{own.get(name, "mae_checkpoint")}'
+        graph.wait(
+            lambda: graph.node.count_publishers(topic) > 1, 'a second node starts', scene.what
+        )
+        with scene.wrong():
+            graph.spin(LASTING)
+        graph.call(Trigger, 'controller/stop')
+        graph.end_strangers()
+        if name == 'controller':
+            graph.foreign.append((begin, time.time() + 0.5))
+
+    return attack
+
+
+def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
+    """B17: return an attack that proposes a network that is wrong as a whole."""
+
+    def attack(scene: Scene) -> None:
+        mae = checkpoint.from_bytes(
+            bytes(scene.genuine('accepted_checkpoint').data), scene.attack.robot
+        )
+        other = replace(change(mae), version=mae.version + 1000)
+        message: UInt8MultiArray = bytes_message(checkpoint.to_bytes(other))
+        scene.latch('mae_checkpoint', message)
+
+    return attack
+
+
+def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae], Mae]:
+    """Return what scales all or some lengths of a network, in and out, and shifts them [m]."""
+
+    def change(mae: Mae) -> Mae:
+        mean, std = mae.mean.copy(), mae.std.copy()
+        lengths = slice(len(mae.joints) + len(mae.muscles), None, every)
+        mean[lengths] = mean[lengths] * scale + offset / LENGTH_SCALE
+        std[lengths] *= scale
+        return replace(mae, mean=mean, std=std)
+
+    return change
+
+
+def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
+    """A5: return an attack that suspends or kills a node."""
+
+    def attack(scene: Scene) -> None:
+        scene.attack.watches_processes = False  # `recover` starts it again, if it is told to
+        if is_paused:
+            scene.pause(name)
+        else:
+            scene.attack.processes[name].kill()
+        scene.attack.tried['kills'] += 1
+        with scene.wrong():
+            scene.attack.spin(1.5 * LASTING)
+
+    return attack
+
+
+def fault(line: str, *services: str) -> Callable[[Scene], None]:
+    """A1, A2, A6: return an attack that breaks the arm, then calls services."""
+
+    def attack(scene: Scene) -> None:
+        scene.attack.set_faults([line])
+        scene.attack.spin(0.5 * LASTING)
+        for service in services:
+            scene.attack.call(Trigger, service)
+        scene.attack.spin(LASTING)
+        scene.attack.set_faults([])
+
+    return attack
+
+
+def change_method(*methods: str) -> Callable[[Scene], None]:
+    """A3: return an attack that changes the method under way."""
+
+    def attack(scene: Scene) -> None:
+        for method in (*methods, 'proposed'):
+            scene.set('controller', 'method', method)
+            scene.attack.spin(1.0)
+
+    return attack
+
+
+def stop_a_verification(scene: Scene) -> None:
+    """A2: an operator stops the arm while a suspect muscle is verified."""
+    attack = scene.attack
+    scene.set('estimator', 'on_anomaly', 'isolate')
+    scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[1]])
+    with scene.wrong():
+        attack.wait(lambda: attack.situation.detected, 'a rupture is detected', 'the second')
+        attack.call(Trigger, 'controller/stop')
+        attack.spin(2.0 * LASTING)
+    scene.set('hardware_emulator', 'ruptured_muscles', [''])
+    scene.set('estimator', 'on_anomaly', 'stop')
+    attack.spin(1.0)
+    attack.call(Trigger, 'estimator/restore')
+
+
+def random_event(scene: Scene) -> None:
+    """Do something that happens on a graph now and then."""
+    attack, rng = scene.attack, scene.rng
+    robot = attack.robot
+    name = rng.choice(NODES)
+
+    def target() -> None:
+        message = JointState(name=robot.joints)
+        message.position = [rng.uniform(a, b) for a, b in zip(robot.lower, robot.upper)]
+        scene.publish('target_joint_states', message, period=0.0)
+
+    def false_state() -> None:
+        topic, message = rng.choice((
+            ('isolated_muscles', String(data=rng.choice(robot.muscles))),
+            ('muscle_length_zeros', _zeros(scene, rng.choice((OFFSET, -OFFSET)), 1e-3)),
+            ('anomaly_detected', Bool(data=rng.random() < 0.5)),
+        ))  # fmt: skip
+        scene.publish(topic, message, qos=LATCHED)
+        attack.end_strangers()
+
+    def suspend() -> None:
+        scene.pause(name)
+        attack.spin(rng.uniform(0.1, 3.0))
+        scene.resume(name)
+
+    def restart() -> None:
+        attack.processes[name].kill()
+        attack.tried['kills'] += 1
+        attack.start(name)
+
+    def call() -> None:
+        service = rng.choice((
+            'controller/stop', 'controller/reset', 'estimator/reset', 'estimator/restore',
+            'estimator/zero', 'learner/save',
+        ))  # fmt: skip
+        attack.send(Trigger, service)
+
+    def explore() -> None:
+        attack.send(SetBool, 'controller/explore', SetBool.Request(data=rng.random() < 0.7))
+
+    def method() -> None:
+        attack.send_parameter('controller', 'method', rng.choice(('proposed', 'tension', 'second')))
+
+    often = (target, explore, call, method, attack.fault, suspend, false_state)
+    rng.choice(often * 4 + (restart,))()
+    attack.tried['events'] += 1
+    attack.spin(rng.uniform(0.05, 0.5))
+
+
+#: the shapes of every kind
+KINDS: dict[str, tuple[Callable[[Scene], None], ...]] = {
+    'lost zeros': (fault('unzeroed:0.05'), fault('unzeroed:0.02')),
+    'stop of a verification': (stop_a_verification,),
+    'change of method': (change_method('tension'), change_method('geometric', 'tension', 'second')),
+    'silent node': tuple(
+        without(name, is_paused)
+        for name in ('controller', 'sim', 'learner', 'estimator', 'hardware_emulator')
+        for is_paused in (False, True)
+    ),
+    'hot reading': (fault('spike:temperature:199'), fault('bias:temperature:60')),
+    'false zeros': (zeros_unknown_then_false, zeros_false, zeros_alternating),
+    'false isolation': (isolate_most, isolate_all, isolate_in_turns),
+    'denied anomaly': (deny_an_anomaly, deny_and_go),
+    'foreign postures': (
+        repeat_an_estimate,
+        shifted('estimated_joint_states', 0.3),
+        shifted('joint_states', 0.3),
+    ),
+    'second node': (
+        second('controller'),
+        second('controller', 'other_controller'),
+        second('estimator'),
+        second('estimator', 'other_estimator'),
+        second('learner'),
+    ),
+    'wrong network': (
+        wrong_network(_lengths(0.5)),
+        wrong_network(_lengths(1.5)),
+        wrong_network(_lengths(1.0, OFFSET)),
+        wrong_network(_lengths(1.0, -OFFSET)),
+        wrong_network(_lengths(-1.0, every=2)),
+        wrong_network(lambda mae: replace(mae, anomaly=None)),
+    ),
+}
+
+
+def all_attacks() -> list[tuple[str, int, str]]:
+    """Return every kind in every shape at every moment."""
+    return [
+        (kind, shape, moment)
+        for kind, shapes in KINDS.items()
+        for shape in range(len(shapes))
+        for moment in MOMENTS
+    ]
