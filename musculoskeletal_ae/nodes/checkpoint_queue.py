@@ -15,6 +15,7 @@ from musculoskeletal_ae.reception import Reception
 CANDIDATES, ACCEPTED = 'mae_checkpoint', 'accepted_checkpoint'
 #: Time between steps [s]. A step takes a few milliseconds: at most a quarter of a core is used.
 STEP_PERIOD = 0.02
+LARGEST = 64 << 20  # [bytes] of a checkpoint; one of ours has half a MB
 
 
 class CheckpointQueue:
@@ -53,7 +54,13 @@ class CheckpointQueue:
         return self._steps is not None or self._next is not None
 
     def propose(self, message: UInt8MultiArray) -> None:
-        """Handle a checkpoint as soon as the one before is done."""
+        """Handle a checkpoint as soon as the one before is done.
+
+        Raises:
+            CheckpointError: If it is too large to be a network, and is not kept.
+        """
+        if len(message.data) > LARGEST:
+            raise CheckpointError(f'{len(message.data)} bytes, at most {LARGEST}')
         self._next = message
         if self._timer.is_canceled():
             self._timer.reset()

@@ -259,6 +259,8 @@ class Controller(Shell):
         report = status.report(self.core, time.monotonic())
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
+        if left_out := self.recording.left_out:
+            report.values['messages too large for a stop recording'] = str(left_out)
         stopped = [] if self.core.supervisor.is_running else [report.message]
         changing = self.core.is_following and self.core.activities.follower.is_moving
         held = {} if changing else report.values

@@ -164,8 +164,12 @@ class Situation:
 
     def _is_shown(self, name: str, node: Node) -> bool:
         """Whether a report is shown otherwise: an anomaly, a stop, or isolated muscles."""
-        if node.level == DiagnosticStatus.OK or {'fault', SEVERAL} & node.values.keys():
+        if node.level == DiagnosticStatus.OK or 'fault' in node.values:
             return False
+        if SEVERAL in node.values:  # the stop names them
+            control = self._values('controller')
+            is_stopped = control.get('stop cause') == StopCause.SECOND_PUBLISHER.identifier
+            return is_stopped and node.values[SEVERAL] in control.get('stop', '')
         if name == f'{self._here}/controller':
             return node.values.get('mode') in (STOPPED, VERIFYING)
         if name == f'{self._here}/estimator':

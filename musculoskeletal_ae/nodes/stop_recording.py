@@ -23,7 +23,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 SECONDS = 10.0  # that are kept
 MOST = 50_000  # messages, however fast they come
-MOST_BYTES = 64 << 20  # of messages, however large they are
+MOST_BYTES = 32 << 20  # of messages, however large they are
+LARGEST_MESSAGE = 4 << 20  # [bytes] of a message that is kept; a network of ours has half a MB
 FILE = 'cause.txt'  # why the node stopped, in the bag's directory; written last
 #: of the bags' directories, also of those that a kill cut off
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
@@ -45,11 +46,15 @@ class StopRecording:
         self._recent_size = 0  # [bytes]
         self._latched: dict[str, Heard] = {}  # the last ones before those
         self._writing: threading.Thread | None = None
+        self.left_out = 0  # messages that were too large
         self.problem = ''  # why the last recording could not be written
         self.saved: Path | None = None  # the last one
 
     def heard(self, topic: str, data: bytes) -> None:
-        """Remember a message of one of `bags.topics.TOPICS`, in CDR."""
+        """Remember a message of one of `bags.topics.TOPICS`, in CDR, unless it is too large."""
+        if len(data) > LARGEST_MESSAGE:
+            self.left_out += 1
+            return
         now = time.time_ns()
         self._recent.append((now, topic, data))
         self._recent_size += len(data)

@@ -195,6 +195,10 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
         'error',
         '/estimator: two, warning: /sim: slow',
     )
+    stop = 'several publishers: joint_states come from a and b'
+    values = {'mode': 'stopped', 'stop_cause': 'second_publisher', 'stop': stop, 'remedy': 'end it'}
+    situation.diagnosed(said('/controller', 'stopped', DiagnosticStatus.ERROR, **values))
+    assert situation.trouble() == f'STOPPED: {stop} (to go on: end it), warning: /sim: slow'
     situation.diagnosed(said('/bringup_status', 'the same again', DiagnosticStatus.ERROR))
     assert 'the same again' not in situation.trouble()
 
