@@ -24,8 +24,8 @@ OLD = 1.0  # [s] after which something that moves is no longer shown
 SILENT = 2.0
 #: [s] between two ticks, and the most that counts as such: our own pause makes no node silent
 TICK, LONGEST_TICK = 1.0, 1.5
-#: nodes whose end is nobody's concern
-OBSERVERS = 'bringup_status', 'view', 'replay', 'record'
+#: nodes whose silence is an error, once they were heard of
+NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'
 #: reports, one a second, in which the estimator's earlier networks are no mismatch, and after which
@@ -212,7 +212,7 @@ class Situation:
         return [
             f'{name}: no report for {now - node.heard_at:.0f} s: see its log; start it again'
             for name, node in self._nodes.items()
-            if now - node.heard_at > SILENT and name.rpartition('/')[2] not in OBSERVERS
+            if now - node.heard_at > SILENT and name.rpartition('/')[2] in NEEDED
         ]
 
     def _body(self) -> list[str]:
