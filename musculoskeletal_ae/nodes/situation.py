@@ -24,6 +24,7 @@ OLD = 1.0  # [s] after which something that moves is no longer shown
 SILENT = 2.0
 #: [s] between two ticks, and the most that counts as such: our own pause makes no node silent
 TICK, LONGEST_TICK = 1.0, 1.5
+FORGOTTEN = 5.0  # [s] without a report after which any other node no longer counts
 #: nodes whose silence is an error, once they were heard of
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
@@ -94,6 +95,10 @@ class Situation:
         if elapsed > LONGEST_TICK:  # what was sent meanwhile is still to be read
             self._slept += elapsed - TICK
         self._ticked_at = now
+        awake = now - self._slept
+        for name, node in list(self._nodes.items()):  # what another node said last is over then
+            if not _is_needed(name) and awake - node.heard_at > FORGOTTEN:
+                del self._nodes[name]
 
     def diagnosed(self, message: DiagnosticArray) -> None:
         """Take a message of /diagnostics."""
@@ -212,7 +217,7 @@ class Situation:
         return [
             f'{name}: no report for {now - node.heard_at:.0f} s: see its log; start it again'
             for name, node in self._nodes.items()
-            if now - node.heard_at > SILENT and name.rpartition('/')[2] in NEEDED
+            if now - node.heard_at > SILENT and _is_needed(name)
         ]
 
     def _body(self) -> list[str]:
@@ -233,6 +238,11 @@ class Situation:
         """Return why the error may rise before anything is learned, '' once something is."""
         why = 'nothing learned yet: the error may rise while the arm leaves its first posture'
         return why if self.samples == '0' else ''  # '' without a learner
+
+
+def _is_needed(name: str) -> bool:
+    """Whether a node's silence is an error."""
+    return name.rpartition('/')[2] in NEEDED
 
 
 def _is_own(name: str) -> bool:

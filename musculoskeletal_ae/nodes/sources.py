@@ -72,13 +72,12 @@ class Authorship:
     """Decides from looks at the graph whether one topic has more than one publisher.
 
     Attributes:
-        intruders: Which nodes publish it, if they are several; else ''.
+        intruders: Which nodes publish it, if they are several: `/a and /b`; else ''.
         is_certain: Whether the graph is clear; while it is not, latched messages can wait.
     """
 
-    def __init__(self, topic: str) -> None:
+    def __init__(self) -> None:
         self.intruders, self.is_certain = '', True
-        self._topic = topic
         self._first_seen: dict[bytes, float] = {}  # by publisher [s]
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
 
@@ -104,7 +103,7 @@ class Authorship:
             names = (
                 f'{count} nodes {node}' if count > 1 else node for node, count in nodes.items()
             )
-            self.intruders = f'{self._topic} come from {" and ".join(sorted(names))}'
+            self.intruders = ' and '.join(sorted(names))
         self.is_certain = not fresh
 
 
@@ -158,7 +157,7 @@ class Sources:
         """Watch these topics as well, as far as they have one rightful publisher."""
         for topic in topics:
             if topic in AUTHORS and topic not in self._authorships:
-                self._authorships[topic] = Authorship(topic)
+                self._authorships[topic] = Authorship()
 
     def check(self, topic: str, is_latched: bool) -> None:
         """Check a message that comes now.
@@ -172,7 +171,7 @@ class Sources:
         if authorship.intruders or (is_latched and not authorship.is_certain):
             if is_latched:
                 self._to_renew.add(topic)
-            raise MessageError(SEVERAL, authorship.intruders or f'{topic}: one is not known yet')
+            raise MessageError(SEVERAL, authorship.intruders or 'one is not known yet')
 
     def look(self) -> None:
         """Look at the graph; read anew what could not be used."""
@@ -187,7 +186,13 @@ class Sources:
     @property
     def intruders(self) -> str:
         """Which topics come from several nodes, and from which; or ''."""
-        return '; '.join(each.intruders for each in self._authorships.values() if each.intruders)
+        topics: dict[str, list[str]] = {}
+        for topic, each in self._authorships.items():
+            if each.intruders:
+                topics.setdefault(each.intruders, []).append(topic)
+        return '; '.join(
+            f'{", ".join(sorted(names))} come from {nodes}' for nodes, names in topics.items()
+        )
 
     def remedy(self) -> str:
         """Return what to do about the intruders."""

@@ -177,6 +177,11 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s: ')
     assert 'sim' not in trouble and 'view' not in trouble
     assert second('sim', 'learner') == ('ok', '')
+    situation.diagnosed(said('/left/second', 'wrong', DiagnosticStatus.ERROR))
+    assert second('sim', 'learner')[1] == '/left/second: wrong'
+    for _ in range(6):  # it has ended, and is none of the arm's own nodes
+        second('sim', 'learner')
+    assert second('sim', 'learner') == ('ok', '')
 
 
 def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_body():
