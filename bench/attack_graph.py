@@ -51,6 +51,7 @@ from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.ros_tool import Spinner, message_class
 from musculoskeletal_ae.nodes.situation import Situation
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.stop_signals import STOP
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
 RUN = 'import sys; from musculoskeletal_ae.nodes import running; running.run(sys.argv.pop(1))'
@@ -268,6 +269,7 @@ class Attack:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.executor.spin_once(0.05)
+            STOP.raise_if_received()
             if time.monotonic() > self._judged + JUDGE_PERIOD:
                 self._judged = time.monotonic()
                 self.situation.tick()
