@@ -30,10 +30,9 @@ from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.collector import NONE
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import Job, Trainer
-from musculoskeletal_ae.learning.update import make_updater
+from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 60.0  # [s]
@@ -53,7 +52,7 @@ def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: floa
     teach(learner, zip(*exploring, strict=True), lambda *_: None)
     nothing = Healthy(np.empty((0, 3 * robot.muscle_count), np.float32), 0.0, 0)
     job, mae = Job(learner.samples.observations(), nothing, True, STEPS), driver
-    updater = make_updater(robot, driver, DEFAULT, seed)
+    updater = BodyUpdater(robot, driver, seed)
     for _ in range(UPDATES):
         mae = updater.update(job).mae
     return mae

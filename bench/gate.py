@@ -40,7 +40,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside

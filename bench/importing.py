@@ -22,7 +22,7 @@ from musculoskeletal_ae.experiments import control, online_learning
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.importing.convert import check_verdict, import_robot
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -27,7 +27,7 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, number
-from musculoskeletal_ae.presets import DEFAULT
+from musculoskeletal_ae.presets.registry import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM = 'musashi_left_arm'
@@ -251,7 +251,7 @@ def main(argv: list[str]) -> None:
         _, large_update, _ = learning(LARGE, Path(folder))
         started(network)  # this may compile, and is not counted
         used, held = started(network)
-        steps = timings.measure(Robot.load(ARM), DEFAULT.name)
+        steps = timings.measure(Robot.load(ARM), DEFAULT)
         moved = wire(args.seconds)
         ((_, _, long),) = systems(ARM, (FLAME_RATE,), ('with learner',), args.late)
         ratio = {row.name: row.torch_eager / row.ours for row in steps}

@@ -37,11 +37,10 @@ from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import CAPACITY, Observations
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.trainer import Job
-from musculoskeletal_ae.learning.update import make_updater
+from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import one_thread, random_states
 from musculoskeletal_ae.options import Parser, names
-from musculoskeletal_ae.presets import DEFAULT
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -100,7 +99,7 @@ def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
     """Return the time of an update from a store that is full [s], the median of five."""
     columns = exploring.tension, exploring.length, np.zeros_like(exploring.length)
     messages = np.concatenate(columns, axis=1)[::10].astype(np.float32)
-    updater, count = make_updater(robot, mae, DEFAULT), len(exploring.theta)
+    updater, count = BodyUpdater(robot, mae), len(exploring.theta)
     kept, rng = np.linspace(0, count - 1, CAPACITY, dtype=int), np.random.default_rng(0)
     times = []
     with one_thread():  # as the training process

@@ -31,6 +31,8 @@ from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
 from musculoskeletal_ae.mae.training import initial_mae, random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, visible
 from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.paper import control as paper
+from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -132,9 +134,7 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
             products=2 * products(mae, None),
         ),
         Row('muscle Jacobian G from ①', lambda: mae.muscle_jacobian(theta, tension)),
-        Row(
-            'the same by forward difference', lambda: mae.muscle_jacobian_difference(theta, tension)
-        ),
+        Row('the same by forward difference', lambda: paper.muscle_jacobian(mae, theta, tension)),
         *control_rows(robot, mae, eager),
     ]
 
@@ -153,7 +153,7 @@ def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
         ),
         Row(
             'control solve: proposed, paper',
-            lambda: control.proposed_paper(robot, mae, theta, torque, tension),
+            lambda: paper.proposed(robot, mae, theta, torque, tension),
             lambda: eager_proposed_paper(robot, eager, theta, torque, tension),
         ),
         Row(
@@ -199,7 +199,7 @@ def eager_proposed(
 def eager_proposed_paper(
     robot: Robot, network: Network, theta: Array, torque: Array, tension: Array
 ) -> Array:
-    """Return l_target [m] of preset `paper`; arguments as for `control.proposed_paper`."""
+    """Return l_target [m] of preset `paper`; arguments as for `paper.control.proposed`."""
     joints, muscles, step = network.joints, network.muscles, 0.01
     with torch.no_grad():
         postures = _tensor(theta) + torch.cat([torch.zeros(1, joints), step * torch.eye(joints)])
@@ -208,17 +208,18 @@ def eager_proposed_paper(
         lengths = network.decode(latent)[:, -muscles:] / LENGTH_SCALE
         jacobian = (lengths[1:] - lengths[0]) / step / TENSION_SCALE  # (D, M), acts on scaled T
         z, aim, load = latent[0], _tensor(theta), _tensor(torque)
-        steps = torch.linspace(0.0, control.SEARCH.largest_step, control.SEARCH.candidates + 1)
+        steps = torch.linspace(0.0, paper.SEARCH.largest_step, paper.SEARCH.candidates + 1)
 
     def loss(y: Tensor) -> Tensor:
         pull = y[..., joints : joints + muscles]
+        tension_weight, posture_weight, torque_weight = CONTROL_WEIGHTS
         return (
-            control.TENSION_WEIGHT * pull.norm(dim=-1)
-            + control.POSTURE_WEIGHT * (y[..., :joints] - aim).norm(dim=-1)
-            + control.TORQUE_WEIGHT * (load + pull @ jacobian.T).norm(dim=-1)
+            tension_weight * pull.norm(dim=-1)
+            + posture_weight * (y[..., :joints] - aim).norm(dim=-1)
+            + torque_weight * (load + pull @ jacobian.T).norm(dim=-1)
         )
 
-    for _ in range(control.SEARCH.epochs):
+    for _ in range(paper.SEARCH.epochs):
         leaf = z.clone().requires_grad_()
         gradient = torch.autograd.grad(loss(network.decode(leaf)), leaf)[0]
         with torch.no_grad():

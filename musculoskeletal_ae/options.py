@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.stop_signals import INTERRUPTED
 

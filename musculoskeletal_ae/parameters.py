@@ -19,8 +19,10 @@ from msgspec import Meta
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
-from musculoskeletal_ae.presets import DEFAULT, PRESETS
+from musculoskeletal_ae.presets.registry import DEFAULT, PRESETS
 
+#: where networks are trained
+DEVICES = 'cpu', 'cuda'
 UNBOUNDED = 2**63 - 1  # the greatest whole number that a ROS parameter holds
 
 
@@ -100,6 +102,6 @@ CHECKPOINT = Parameter(
     '', 'file of a trained network (empty: wait for one by topic)', settable=True
 )
 PRESET = Parameter(
-    DEFAULT.name, 'the best we can measure, or as printed in the paper', legal=tuple(PRESETS)
+    DEFAULT, 'the best we can measure, or as printed in the paper', legal=tuple(PRESETS)
 )
 SEED = Parameter(0, 'random seed: which arm is emulated, exploration, learning', '', (0, UNBOUNDED))

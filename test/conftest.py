@@ -53,7 +53,7 @@ def trained_files(alone) -> dict[str, Path]:
     # Torch is loaded for tests that want a network only.
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.mae.training import initial_mae
-    from musculoskeletal_ae.presets import PRESETS
+    from musculoskeletal_ae.presets.registry import PRESETS
     from musculoskeletal_ae.robot.robot import Robot
 
     with alone('networks') as folder:

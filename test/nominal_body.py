@@ -16,6 +16,7 @@ from musculoskeletal_ae.control.methods import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.paper.control import proposed as proposed_as_printed
 from musculoskeletal_ae.robot.robot import Robot
 
 SETTLING, PERIOD = 3.0, 0.02  # [s]
@@ -55,8 +56,8 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
             'bound: QP on the true body': bound,
             'QP on the true G, l from ①': methods.first_command(robot, mae, theta, least),
             'proposed': methods.proposed(robot, mae, theta, torque, bias, limit).length,
-            'proposed, paper': methods.proposed_paper(robot, paper, theta, torque, bias).length,
-            'geometric': methods.geometric_command(robot, theta),
+            'proposed, paper': proposed_as_printed(robot, paper, theta, torque, bias).length,
+            'geometric': robot.muscle_lengths(theta, bias),
         }.items():
             arm.reset(theta)
             measure(name, command)

@@ -36,7 +36,7 @@ class Pull(NamedTuple):
 def msc_compensation(robot: Robot, tension: Array) -> Array:
     """Return how far l_target lies below l for muscle stiffness control to carry a tension.
 
-        l_comp(T) = −(T − T_bias) / K_stiff                     (paper, section "Control")
+        l_comp(T) = −(T − T_bias) / K_stiff              (paper, §III-E, eq. 6)
 
     Args:
         robot: The body.

@@ -34,8 +34,8 @@ from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.planner import Plan, Planner
-from musculoskeletal_ae.control.ramps import LengthRamps, PaperMethods
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget, length_methods
+from musculoskeletal_ae.control.settings import BY_TENSION, Settings
 from musculoskeletal_ae.control.stopping import SafeStop
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
@@ -44,7 +44,6 @@ from musculoskeletal_ae.control.trajectory import Points, Setpoint
 from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
@@ -84,8 +83,8 @@ class Activities:
     def __init__(self, robot: Robot, settings: Settings, seed: int) -> None:
         self.ramps = LengthRamps(robot, settings)
         self.follower = Follower(robot, settings)
-        self.paper_methods = PaperMethods(self.ramps, robot, settings)
-        exploration = Exploration(robot, seed, PRESETS[settings.preset].to_limits)
+        self.ramped_target = RampedTarget(self.ramps, robot, settings)
+        exploration = Exploration(robot, seed, settings.preset)
         self.exploring = Exploring(exploration, self.ramps)
         self.calibrating = Calibrating(robot, settings, seed)
         self.torque = TorqueControl(robot, settings)
@@ -98,18 +97,18 @@ class Activities:
         for part in (
             self.ramps,
             self.follower,
-            self.paper_methods,
+            self.ramped_target,
             self.calibrating,
             self.torque,
             self.gravity_compensation,
         ):
             part.use(robot, settings)
-        self.exploring.stream.use(robot, PRESETS[settings.preset].to_limits)
+        self.exploring.stream.use(robot, settings.preset)
 
     def of(self, activity: Activity, settings: Settings) -> ActivityControl | None:
         """Return the object that carries out an activity; None for none."""
         if activity in (Activity.HOLDING, Activity.MOVING):
-            return self.follower if by_follower(settings) else self.paper_methods
+            return self.follower if by_follower(settings) else self.ramped_target
         others: dict[Activity, ActivityControl] = {
             Activity.EXPLORING: self.exploring,
             Activity.CALIBRATING: self.calibrating,
@@ -163,8 +162,7 @@ class Suspicion:
 
 def by_follower(settings: Settings) -> bool:
     """Return whether targets are gone to by trajectories; by ramps of lengths otherwise."""
-    solved = settings.method == 'proposed' and PRESETS[settings.preset].equilibrium
-    return solved or settings.method == 'stiffness'
+    return settings.method not in (*BY_TENSION, *length_methods(settings))
 
 
 class Controller:
@@ -214,7 +212,7 @@ class Controller:
         self.mae, self.watchdog.has_checkpoint = mae, True
         self.stream.use_friction(mae.friction)
         self.activities.follower.use_network(mae)
-        if self.activities.entered is self.activities.paper_methods:
+        if self.activities.entered is self.activities.ramped_target:
             self.activities.ramps.solve_again()
 
     def take(self, message: Any, now: float) -> None:
@@ -499,7 +497,7 @@ class Controller:
         """Return a command that demands no tension for which the watchdog would stop the arm.
 
         Plans of `proposed` stay within tension.limit; feedback, an arm that does not come along,
-        `second` and preset `paper` demand more. Stiffness is as was asked for, whatever pushes the
+        and some length methods demand more. Stiffness is as was asked for, whatever pushes the
         arm.
         """
         if command is None or command.kind != LENGTH or self.sample is None:
@@ -563,7 +561,7 @@ class Controller:
         self.activities.leave()
         if state.theta is not None:
             self.activities.torque.set_target(state.theta, state.effort)
-            self.activities.paper_methods.set_target(state.theta, state.effort)
+            self.activities.ramped_target.set_target(state.theta, state.effort)
         self.supervisor.on_request(activity)
 
     def _approach(self, duration: float) -> None:

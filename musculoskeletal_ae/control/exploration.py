@@ -1,17 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random motion that collects data: the paper's three steps, repeated.
+"""Random motion that collects data: a stream of steps, and the activity that takes them.
 
-1. 5 s: `first` with a random θ_target and T_const = T_bias,
-2. 2 s: `second`, the same θ_target with the tension of the moment,
-3. 3 s: `first` again with a random T_const in [T_bias, T_limit]
-
-(paper, section "Online Learning of Musculoskeletal AutoEncoder"). Each step ramps the command and
-then rests, since the body is learned at rest. Targets are drawn among the postures that the arm can
-hold with tensions in [T_bias, T_limit].
-
-Our preset draws some joints' targets at one of their limits, since only their stops tell the zeros
-of their sensors (`learning.stops`), and of several random T_const takes the one that presses them
-there most.
+The preset draws the steps (`Preset.exploration`). Preset `default` draws some joints' targets at
+one of their limits, since only their stops tell the zeros of their sensors (`learning.stops`), and
+of several random T_const takes the one that presses them there most.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -25,12 +17,13 @@ from musculoskeletal_ae.control.activities import Inputs
 from musculoskeletal_ae.control.command import Command
 from musculoskeletal_ae.control.ramps import Goal, LengthRamps
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
-DURATIONS = (5.0, 2.0, 3.0)  # [s]
 TRIES = 1000
+AT_LIMITS = 0.25  # share of the targets of each joint that are at one of its limits
 SMALL = 1e-9  # [N·m]
 PRESSES = 10  # T_const, of which the one is taken that presses most towards limits
 
@@ -38,7 +31,7 @@ PRESSES = 10  # T_const, of which the one is taken that presses most towards lim
 class Step(NamedTuple):
     """One step of the exploration."""
 
-    method: str  # 'first' or 'second'
+    method: str  # 'first' or 'second', of the preset's length methods
     theta: Array  # θ_target [rad], (D,)
     # T_const [N] of `first`, (M,); of `second`, which takes the tension of the moment, what the
     # geometric model expects that to be
@@ -49,44 +42,38 @@ class Step(NamedTuple):
 class Exploration:
     """A reproducible stream of steps; iterating again goes on with it at a new posture."""
 
-    def __init__(self, robot: Robot, seed: int, to_limits: float = 0.0) -> None:
-        """Explore with `robot`; `to_limits` is the share of targets at a limit, of each joint."""
-        self._robot, self._rng = robot, np.random.default_rng([seed, 0xE8])
-        self.to_limits = to_limits
+    def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
+        """Explore with `robot` as a preset does."""
+        self._rng = np.random.default_rng([seed, 0xE8])
+        self.use(robot, preset)
 
-    def use(self, robot: Robot, to_limits: float) -> None:
+    def use(self, robot: Robot, preset: str) -> None:
         """Draw targets that this robot can hold without its isolated muscles."""
-        self._robot, self.to_limits = robot, to_limits
+        self._robot, self._draw = robot, preset_named(preset).exploration()
 
     def __iter__(self) -> Iterator[Step]:
         while True:
-            robot = self._robot
-            bias = np.full(robot.muscle_count, robot.tension.bias)
-            postures = (self._posture() for _ in range(TRIES))
-            ((theta, holding),) = holdable_postures(robot, postures, 1)
-            constant = self._constant_tension(theta)
-            yield Step('first', theta, bias, DURATIONS[0])
-            yield Step('second', theta, holding, DURATIONS[1])
-            yield Step('first', theta, constant, DURATIONS[2])
+            yield from self._draw(self._robot, self._rng)
 
-    def _posture(self) -> Array:
-        robot, rng = self._robot, self._rng
-        theta = robot.random_postures(1, rng)[0]
-        if self.to_limits:
-            chosen, upper = rng.uniform(size=(2, robot.joint_count))
-            limit = np.where(upper < 0.5, robot.upper, robot.lower)
-            theta = np.where(chosen < self.to_limits, limit, theta)
-        return theta
 
-    def _constant_tension(self, theta: Array) -> Array:
-        robot, limits = self._robot, self._robot.tension
-        way = (theta == robot.upper).astype(float) - (theta == robot.lower)
-        count = PRESSES if way.any() else 1
-        tension = self._rng.uniform(limits.bias, limits.limit, (count, robot.muscle_count))
-        torque = -tension @ robot.routes.muscle_jacobian(theta)
-        pressed = torque / np.maximum(np.abs(torque).max(axis=0), SMALL) @ way
-        most: Array = tension[np.argmax(pressed)]
-        return most
+def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_LIMITS) -> Array:
+    """Return a random θ [rad] (D,), each joint of which is at a limit in a share of the cases."""
+    theta = robot.random_postures(1, rng)[0]
+    chosen, upper = rng.uniform(size=(2, robot.joint_count))
+    limit = np.where(upper < 0.5, robot.upper, robot.lower)
+    return np.where(chosen < share, limit, theta)
+
+
+def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:
+    """Return random T [N] (M,) that press the joints of θ [rad] (D,) at their limits there."""
+    limits = robot.tension
+    way = (theta == robot.upper).astype(float) - (theta == robot.lower)
+    count = PRESSES if way.any() else 1
+    tension = rng.uniform(limits.bias, limits.limit, (count, robot.muscle_count))
+    torque = -tension @ robot.routes.muscle_jacobian(theta)
+    pressed = torque / np.maximum(np.abs(torque).max(axis=0), SMALL) @ way
+    most: Array = tension[np.argmax(pressed)]
+    return most
 
 
 def holdable_postures(

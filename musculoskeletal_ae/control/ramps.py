@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ramps of muscle lengths: how the paper's methods and the exploration reach a posture.
+"""Ramps of muscle lengths: how methods with one length command, and exploration, reach a posture.
 
-A target becomes one or two goals (`second` runs `first` before it, as in the paper); a goal is
-ramped to and then held. Every ramp starts from the command of the moment, so that nothing jumps:
+A target becomes one or two goals (`second` runs `first` before it); a goal is ramped to and then
+held. The preset lists the methods (`Preset.length_methods`). Every ramp starts from the command of
+the moment, so that nothing jumps:
 
     c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
 
@@ -12,23 +13,25 @@ starts: read again and again, `second` would raise the tension without end.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.activities import Inputs
 from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.feedback import depends_on_limit
-from musculoskeletal_ae.control.methods import Solution
+from musculoskeletal_ae.control.methods import LengthMethod, Solution
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 # Share of a movement in which the command moves; the arm settles and is sampled in the rest.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # fastest over mean speed of a ramp
+FIRST = 'first'  # the method that is commanded T_const
 
 
 class Ramp:
@@ -56,11 +59,11 @@ class Goal(NamedTuple):
     """A posture, and the method by which it becomes lengths.
 
     Attributes:
-        method: `geometric`, `first`, `second`, or `proposed` as printed.
+        method: One of the preset's length methods.
         theta: θ_target [rad], (D,).
         effort: Torque beyond holding the weight [N·m], (D,).
         duration: How long it may take [s].
-        tension: T_const of `first` [N], (M,); None reads T_current when the goal begins.
+        tension: T_const [N], (M,); None reads T_current when the goal begins.
     """
 
     method: str
@@ -144,20 +147,20 @@ class LengthRamps:
         self._remaining = max(goal.duration, self._ramp.duration)
 
     def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
-        robot, nothing = self._robot, np.zeros(self._robot.joint_count)
-        if goal.method == 'geometric':
-            bias = np.full(robot.muscle_count, robot.tension.bias)
-            return Solution(methods.geometric_command(robot, goal.theta), bias, nothing)
-        if goal.method in ('first', 'second'):
+        robot, method = self._robot, length_methods(self._settings)[goal.method]
+        if method.takes_tension:
             tension = np.minimum(tension, self._limit)
-            length = methods.first_command(robot, mae, goal.theta, tension)
-            return Solution(length, tension, nothing)
         torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
-        return methods.proposed_paper(robot, mae, goal.theta, torque, tension)
+        return method.command(robot, mae, goal.theta, torque, tension)
 
 
-class PaperMethods:
-    """The activity of holding a target by one of the paper's methods."""
+def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
+    """Return the methods that ramp to one length command, of the preset that is set."""
+    return preset_named(settings.preset).length_methods()
+
+
+class RampedTarget:
+    """The activity of holding a target by a method that ramps to one length command."""
 
     def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
         self.ramps = ramps
@@ -186,14 +189,15 @@ class PaperMethods:
         """End; the target stays, for the next time."""
 
     def _goals(self) -> list[Goal]:
-        if self._target is None:
-            return []
         chosen, limits = self._settings, self._robot.tension
+        method = length_methods(chosen).get(chosen.method)
+        if self._target is None or method is None:
+            return []
         constant = np.clip(chosen.constant_tension, limits.bias, limits.limit)
         constant = np.full(self._robot.muscle_count, constant)
-        first = Goal('first', *self._target, chosen.first_duration, constant)
-        if chosen.method == 'first':
+        first = Goal(FIRST, *self._target, chosen.first_duration, constant)
+        if chosen.method == FIRST:
             return [first]
-        if chosen.method == 'second':
-            return [first, Goal('second', *self._target, chosen.second_duration)]
+        if method.follows_first:
+            return [first, Goal(chosen.method, *self._target, chosen.second_duration)]
         return [Goal(chosen.method, *self._target, chosen.first_duration)]

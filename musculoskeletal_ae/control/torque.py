@@ -26,7 +26,7 @@ class TorqueControl:
         τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
         T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
 
-    with G from the network at (θ, T) (paper, section "Control", third; Kawamura 2016). θ is the
+    with G from the network at (θ, T) (paper, §III-E, third; Kawamura 2016). θ is the
     estimate, smoothed. Where a joint slides, K_p and K_d are those of a pinion of radius RACK. With
     both gains zero the arm's weight is carried and `effort` is exerted, nothing more: such an arm
     keeps no posture.

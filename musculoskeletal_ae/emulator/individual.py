@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One individual arm: how the true body that `seed` picks differs from its geometric model.
 
-In what, `Spread` says. Masses and link lengths are the model's (paper, Introduction: assumed
+In what, `Spread` says. Masses and link lengths are the model's (paper, §I: assumed
 correct).
 """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscle modules and sensors: what every emulated arm has, whatever its body is made of.
 
-    MSC        T_ref = T_bias + max(0, K (l − l_target))      (paper, eq. muscle stiffness control)
+    MSC        T_ref = T_bias + max(0, K (l − l_target))      (paper, §III-E, eq. 5)
     motor      dl/dt = −gain (T_ref − T), within the speed limit and the length limits
     heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
 

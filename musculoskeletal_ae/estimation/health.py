@@ -9,16 +9,13 @@ from collections.abc import Iterable
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
-from musculoskeletal_ae.estimation.detectors.jammed_module import JammedModule
 from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
-from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
-from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets import preset_named
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
 
@@ -42,15 +39,13 @@ class HealthMonitor:
 
         Args:
             robot: The nominal body.
-            preset: Its name says whether d or A alone decides.
+            preset: Chooses what decides by the residual, and by physics.
             settings: What the user may choose.
             heat: Thermal models of the modules, which the caller steps.
         """
         self.settings = settings or Detection()
-        uses_distance = preset_named(preset).whitened
-        slack = SlackTendon(robot, self.settings) if uses_distance else None
-        self.residual = ResidualDistance(robot, self.settings, uses_distance, slack)
-        by_physics: list[Detector] = [] if slack is None else [slack, JammedModule(robot)]
+        chosen = preset_named(preset)
+        self.residual, by_physics = chosen.residual_detectors(robot, self.settings)
         self._detectors: list[Detector] = [
             LengthJump(),
             MissingValues(),

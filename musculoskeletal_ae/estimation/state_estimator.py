@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimate the joint angles from one sample of muscle length and tension.
 
-(T_end, l) ─② of the MAE→ θ, T_est, l_est      (paper, section "State Estimation")
+(T_end, l) ─② of the MAE→ θ, T_est, l_est      (paper, §III-D)
 e = (T_est − T, l_est − l),   A = ‖T_est − T‖₂ + ‖l_est − l‖₂          scaled units
 """
 

@@ -95,9 +95,8 @@ def _residuals(core: Estimator) -> dict[str, str]:
         'suspect muscle': core.robot.muscles[suspect],
     }
     if residual.is_calibrated:
-        letter = 'd' if residual.uses_distance else 'A'
         limit = residual.limit(output.state.theta, output.sample.motor_tension)
-        values[f'{letter} limit'] = f'{limit:.3g}'
+        values[f'{residual.symbol} limit'] = f'{limit:.3g}'
     return values
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What learning changes in the body.
 
-Paper. l against S-p from −120° to 30° at T = 0, and against T from 0 to 500 N at θ = 0: changes up
-to 40 mm, largest in #2, #3 and #7; tension curves from linear to strongly curved, put down to wear
-of #2’s elastic unit and to much friction in #6.
+Paper (§IV-A). l against S-p from −120° to 30° at T = 0, and against T from 0 to 500 N at θ = 0:
+changes up to 40 mm, largest in #2, #3 and #7; tension curves from linear to strongly curved, put
+down to wear of #2’s elastic unit and to much friction in #6.
 
 Here. l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0, through ① of the
 network before and after learning, beside the true body. All other joints are at θ = 0; where that

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control.
 
-Paper. Five random θ_eval, each approached from five random postures, by the geometric model, by
-`first`, `second` and `proposed` after learning: all learned ones far better than geometric;
-`proposed` as exact as `second` with less tension than either.
+Paper (§IV-C). Five random θ_eval, each approached from five random postures, by the geometric
+model, by `first`, `second` and `proposed` after learning: all learned ones far better than
+geometric; `proposed` as exact as `second` with less tension than either.
 
-Here. The same as in the paper, in closed loop with the estimator and the controller that the nodes
+Here. The same, in closed loop with the estimator and the controller that the nodes
 run, on targets that the true body can hold within [T_bias, T_limit]; read 8 s after the command.
 Starts are reached by moving there, for all methods with `proposed` of the learned network.
-`geometric` is the model’s, the others run on the learned network, those called `…_paper` on that of
-preset paper, `proposed_paper` as printed. QP bound: the least ‖T‖ with which the true body holds
+`geometric` is the model’s, the others run on the learned network, those with the name of a preset
+behind them on that of the preset as printed. QP bound: the least ‖T‖ with which the true body holds
 θ_eval. "Bound reached": the same at the posture where the arm came to rest, as an arm that sags
 needs less. What all starts of a target have in common is the model’s error, their scatter is
 hysteresis. Where a controller stopped, the arm's place then counts, and the stop is counted.
@@ -30,17 +30,18 @@ from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.tension import holding_tension
 
-#: colours of the methods under test: the controller's, with `_paper` on that preset's network
+#: colours of the methods under test: the controller's, with the name of a preset on its network
 METHODS = {
     'geometric': '#999999',
     'first': '#E69F00',
     'second': '#009E73',
     'proposed': '#0072B2',
-    'first_paper': '#F5D999',
-    'second_paper': '#99D8C7',
-    'proposed_paper': '#CC79A7',
+    f'first_{AS_PRINTED}': '#F5D999',
+    f'second_{AS_PRINTED}': '#99D8C7',
+    f'proposed_{AS_PRINTED}': '#CC79A7',
 }
 APPROACHES = 5  # θ_eval, and starts for each
 # `second` is done after 5 s + 2 s; all methods are read at the same time.
@@ -102,7 +103,7 @@ def _bound(arm: Arm) -> float:
 
 def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
-    networks = {'default': study.network(seed), 'paper': study.network(seed, 'paper')}
+    networks = {'default': study.network(seed), AS_PRINTED: study.network(seed, AS_PRINTED)}
     ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
     numbers: dict[str, Any] = {'qp_bound_n': float(ended.bound.mean())}
@@ -111,7 +112,7 @@ def measure(study: Study, seed: int) -> Measured:
         common, held = offset.mean(axis=1, keepdims=True), np.isfinite(there)
         numbers[name] = {
             'error_rad': float(errors[name].mean()),
-            # Around each θ_eval's own mean: the scatter that hysteresis leaves, as in the paper.
+            # Around each θ_eval's own mean: the scatter that hysteresis leaves (paper, §IV-C).
             'error_var': float(errors[name].var(axis=1).mean()),
             # What every start has in common is the model's, what differs is hysteresis.
             'common_rad': float(np.linalg.norm(common, axis=-1).mean()),

@@ -9,7 +9,6 @@ from scipy.stats import mannwhitneyu
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.experiments.recording import (
@@ -21,10 +20,9 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.presets import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
-PAYLOAD = 3.6  # [kg], the paper's dumbbell
+PAYLOAD = 3.6  # [kg], the printed dumbbell
 GRASPING = 60.0  # [s] from grasp to release and from release to grasp
 #: a muscle carries tension if it pulls this much more than T_bias, far beyond the sensor's noise
 CARRYING = 10.0  # [N]
@@ -36,7 +34,7 @@ EARLIEST_CUT = 5.0  # [s] drawn uniformly up to it, so that cuts fall into motio
 
 
 class GraspAndCut:
-    """Script of the paper's estimation experiment: grasp midway, then cut; here every muscle.
+    """Script of the experiment (paper, §IV-B): grasp midway, then cut; here every muscle.
 
     A cut comes when the muscle carries tension; if it never does, it is cut all the same at the end
     of its wait, and `carried` says so. Muscles may be switched off instead: the wire is whole, and
@@ -52,7 +50,7 @@ class GraspAndCut:
         self.duration = duration + SLOT * count  # of everything [s]
         # Messages of the motion without weight, and with it before the first cut.
         self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
-        # The second muscle first: it is the one that the paper deactivates.
+        # The second muscle first: it is the one that is deactivated in print.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))]
         self.cut = np.full(count, np.nan)  # when each muscle was cut [s], (M,)
         self.carried: Bools = np.zeros(count, dtype=bool)  # whether it carried tension then, (M,)
@@ -154,7 +152,7 @@ def detection(
             delay[muscle] = SAMPLE_TIME * (at + 1)
             named[muscle] = seen.suspect[rows][at] == muscle
     statistics, counted = mae.anomaly, plan.counted
-    name = DISTANCE if PRESETS[mae.preset].whitened else NORM
+    name = HealthMonitor(robot, mae.preset).residual.threshold_name
     by_muscle = {'carried': plan.carried, 'detected': noticed, 'detection_s': delay, 'named': named}
     return {
         'threshold': float(statistics.thresholds.get(name, 0.0)) if statistics else 0.0,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """State estimation and anomaly.
 
-Paper. The same motions before and after learning, 0.414 → 0.186 rad; the error did not rise much
-when a 3.6 kg dumbbell was grasped; when muscle #2 was deactivated, A rose after learning but hardly
-before.
+Paper (§IV-B). The same motions before and after learning, 0.414 → 0.186 rad; the error did not rise
+much when a 3.6 kg dumbbell was grasped; when muscle #2 was deactivated, A rose after learning but
+hardly before.
 
 Here. One recording, seen by the networks before and after learning: the held-out motion, with 3.6
 kg in the hand from its middle on; then, weight in hand, every muscle in turn is cut for 3 s and
@@ -17,7 +17,7 @@ whole ("switched off"). Healthy messages: the held-out motion and another one wi
 grasped and released every minute, an hour over all individuals; false alarms are alarms that begin
 in the latter. AUROC compares d of those with d of cut messages from 0.1 s after the cut.
 "Threshold" is the detector’s, for d; A and d "ruptured min" are the smallest, over muscles, of the
-median while cut. Preset paper decides on A alone.
+median while cut. The preset as printed decides on A alone.
 """
 
 from collections.abc import Mapping
@@ -48,6 +48,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.roles import plotted
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.presets.registry import AS_PRINTED
 
 HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0  # [s] of motion for false alarms, over all individuals
@@ -63,7 +64,7 @@ NOTICED = ('detection_s', 'detected_share', 'named_share')  # of muscles switche
 def measure(study: Study, seed: int) -> Measured:
     """Return the numbers and traces of one individual."""
     robot, networks = study.robot, study.networks(seed)
-    printed = study.network(seed, 'paper')
+    printed = study.network(seed, AS_PRINTED)
     plan = GraspAndCut(robot, study.held_out_time, seed)
     driven_by = study.network(None, 'default')
     taken = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
@@ -89,7 +90,7 @@ def measure(study: Study, seed: int) -> Measured:
     numbers |= {f'{OFF}_{key}': noticed[key] for key in NOTICED}
     numbers |= detection(robot, plan, watched['after'], well['after'], networks['after'])
     by_a, well_by_a = (watch(robot, printed, each) for each in (taken, healthy))
-    numbers |= study.keyed('paper', detection(robot, plan, by_a, well_by_a, printed))
+    numbers |= study.keyed(AS_PRINTED, detection(robot, plan, by_a, well_by_a, printed))
     held_out = study.stream(seed, 'held_out')
     for when, mae in networks.items():
         numbers[f'{when}_held_out_rad'] = estimation_error(mae, held_out)
@@ -151,7 +152,7 @@ def grasp_and_cut(_: Study, rows: Rows) -> Plot:
     plots.tidy(panels[2], 'time [s]', 'd [healthy std. dev.]', legend='right')
     figure.suptitle(f'individual {seed}')
     return figure, (
-        'Estimation error, the paper’s anomaly A, and the distance d that the detector judges, on '
+        'Estimation error, the anomaly A, and the distance d that the detector judges, on '
         f'the same recording before and after learning: the arm grasps {PAYLOAD:g} kg (dashed), '
         f'then {trace["first_cut"]} is cut (yellow) and mended.'
     )
@@ -198,7 +199,7 @@ def cuts(study: Study, rows: Rows) -> Plot:
     robot, numbers = study.robot, [row.numbers for row in rows.values()]
     figure, panels = plots.new_figure(12.0, 0.42 * robot.muscle_count + 1.9, 1, 3, sharey=True)
     place = np.arange(robot.muscle_count)
-    labels = 'A of the paper [scaled units]', 'd [healthy std. dev.]'
+    labels = 'A [scaled units]', 'd [healthy std. dev.]'
     for letter, panel, label in zip('ad', panels, labels):
         for when, prefix, shift in (('before', '_before', -0.18), ('after', '', 0.18)):
             colour = plots.WHEN[when]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation with another loss.
 
-Paper. Elbow bent to 90°, −50 N in z and 50 N in y at the hand, then S-p forced to 30°.
+Paper (§IV-D). Elbow bent to 90°, −50 N in z and 50 N in y at the hand, then S-p forced to 30°.
 
 Here. The elbow is flexed to 90°; the hand is pushed with −50 N in z, then with 50 N in y; then the
 shoulder is forced to 30° and let go. The command holds the posture by `proposed` on the learned
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import geometric_command, proposed
+from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import Motion, columns
@@ -82,7 +82,7 @@ def _command(robot: Robot, mae: Mae, theta: Array) -> Array:
     """Return the lengths that hold a posture, by `proposed` on the learned network."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
-        return geometric_command(robot, theta)
+        return robot.muscle_lengths(theta, np.full(robot.muscle_count, robot.tension.bias))
     start = least_tension(robot.routes.muscle_jacobian(theta), torque, limits.bias, limits.limit)
     return proposed(robot, mae, theta, torque, start.tension, limits.limit).length
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion.
 
-Paper. Postures are approached in 5 s; it shows no motion at speed.
+Paper (§IV-C). Postures are approached in 5 s; it shows no motion at speed.
 
 Here. Minimum-jerk motions between random postures that the true body can hold, in 1 s and in 2 s,
 each 0.6 s apart, after learning: the joint trajectory is followed by inverse dynamics. Tracking:
@@ -61,7 +61,7 @@ OURS = 'trajectory'
 METHODS = {
     OURS: plots.AFTER,
     'proposed': '#56B4E9',
-    'tension': plots.PAPER,
+    'tension': plots.AS_PRINTED,
     'first': '#E69F00',
     'second': '#009E73',
 }

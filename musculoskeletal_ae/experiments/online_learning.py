@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Online learning.
 
-Paper. Ten minutes of random motion in three steps (5 s first, 2 s second, 3 s random tension,
-T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error went from 0.324 to
-0.154 rad.
+Paper (§IV-A). Ten minutes of random motion in three steps (5 s first, 2 s second, 3 s random
+tension, T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error went from
+0.324 to 0.154 rad.
 
 Here. The initial network knows the geometric model only. Each preset explores by itself, as the
 nodes do: in closed loop through estimate and controller, with the network that is being learned.
-Preset paper goes to random postures; the default one takes a quarter of the joints’ targets at
-their limits, where stops tell zeros of joint sensors. "Same stream" is preset paper taught by the
-messages of the default one’s exploration. All are judged on one held-out motion, which follows a
-fixed list of commands, to random postures, from a stream that is never used for learning; its
-error is the mean over all messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖ over all
-joints, with the true angles of the emulator. Oracle: weighted least squares on one message with the
-true routes, elastic constants and noise, friction taken as zero.
+The preset as printed goes to random postures; the default one takes a quarter of the joints’
+targets at their limits, where stops tell zeros of joint sensors. "Same stream" is that preset
+taught by the messages of the default one’s exploration. All are judged on one held-out motion,
+which follows a fixed list of commands, to random postures, from a stream that is never used for
+learning; its error is the mean over all messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖
+over all joints, with the true angles of the emulator. Oracle: weighted least squares on one message
+with the true routes, elastic constants and noise, friction taken as zero.
 """
 
 import json
@@ -47,18 +47,18 @@ from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
-from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors, training_states
+from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import AS_PRINTED, PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # of held-out messages, after every update
 FIRST_ERRORS = 10.0  # [s] whose mean starts the exponential fit
 PRINTED_MINUTES = 10.0
-PRINTED = (0.324, 0.154)  # [rad] the paper's fit at the start and after ten minutes
-QUICK_STEPS = 600  # of initial training: with fewer the gate refuses a network of preset paper
+PRINTED = (0.324, 0.154)  # [rad] the printed fit at the start and after ten minutes
+QUICK_STEPS = 600  # of initial training: with fewer a network as printed is rejected
 NOTED, TESTED = 25, 1000  # mini-batches between two of which errors are noted, states of a test
-COLOURS = {'paper': plots.PAPER, 'default': plots.AFTER}
+COLOURS = {AS_PRINTED: plots.AS_PRINTED, 'default': plots.AFTER}
 
 #: told learner, number of a message, true θ and what joint sensors read [rad] (D,); returns the θ
 #: that the learner is told, or None
@@ -119,7 +119,7 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
 def train_initial(study: Study, preset: str) -> None:
     """Train a network on the geometric model; keep it, and how its errors fell."""
     robot, rows = study.robot, list[list[float]]()
-    test = training_states(robot, preset, TESTED, np.random.default_rng([0, 2]))
+    test = preset_named(preset).training_states(robot, TESTED, np.random.default_rng([0, 2]))
 
     def note(step: int, _: float, network: Network, batch: Array) -> None:
         if step % NOTED:
@@ -167,9 +167,9 @@ def measure(study: Study, seed: int) -> Measured:
         values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
         numbers |= study.keyed(preset, values)
         traces[preset] = curve, values
-    listener = pupil(study, seed, 'paper')
+    listener = pupil(study, seed, AS_PRINTED)
     teach(listener, zip(*study.stream(seed, 'exploring'), strict=True))
-    numbers['paper_same_stream_after_rad'] = estimation_error(listener.mae, held_out)
+    numbers[f'{AS_PRINTED}_same_stream_after_rad'] = estimation_error(listener.mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 
@@ -204,7 +204,7 @@ def samples_to_halve(curve: Curve) -> int | None:
 
 
 def exponential_fit(time: Array, error: Array) -> Array:
-    """Return a + b e^{−t/c} at the times [s] of errors, fitted to them as in the paper [rad]."""
+    """Return a + b e^{−t/c} at the times [s] of errors, fitted to them (paper, §IV-A) [rad]."""
 
     def model(t: Array, a: float, b: float, c: float) -> Array:
         values: Array = a + b * np.exp(-t / c)
@@ -261,7 +261,7 @@ def online_learning(study: Study, rows: Rows) -> Plot:
             right.plot(curve.samples, curve.errors, color=colour, lw=1.2, alpha=0.7, label=label)
             label = ''
     if study.minutes >= PRINTED_MINUTES:
-        label = f'paper, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
+        label = f'printed, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
         at = 0.0, PRINTED_MINUTES
         left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=label)
     oracle = float(np.mean([row.numbers['oracle_rad'] for row in rows.values()]))

@@ -15,7 +15,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 # Told apart by people who see colours differently, and in grey.
 # The page draws the estimated arm in the colour of AFTER.
-BEFORE, AFTER, PAPER, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
+BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
 #: before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110

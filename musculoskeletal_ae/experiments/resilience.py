@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Resilience.
 
-Paper. A muscle that is switched off is noticed; the estimate goes on trusting it. Its successor
-(arXiv 2409.14951) goes on without a ruptured muscle.
+Paper (§III-D). A muscle that is switched off is noticed; the estimate goes on trusting it. Its
+successor (arXiv 2409.14951) goes on without a ruptured muscle.
 
 Here. Estimates of the held-out motion with every muscle isolated in turn, and with pairs of them,
 beside the healthy one. Then estimator and controller as the nodes connect them, `on_anomaly:

@@ -29,6 +29,7 @@ from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, rounded
 from musculoskeletal_ae.files import read_table, write_whole
+from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
@@ -95,7 +96,7 @@ def write(
         for file, (figure, _) in drawn.items():
             figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
             figure.set_layout_engine('none')  # it stays where it is now
-            # For a paper; without a date, so that the same numbers give the same file.
+            # Vector graphics; without a date, so that the same numbers give the same file.
             vector = (folder / file).with_suffix('.pdf')
             figure.savefig(vector, bbox_inches='tight', metadata={'CreationDate': None})
         files += [folder / file for file in ('result.json', *drawn)]
@@ -176,7 +177,7 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             result[key] = _mean(values)
         elif isinstance(first, str):
             result[key] = first if len(set(values)) == 1 else sorted(set(values))
-        elif key.removeprefix('paper_') in TOTALS:
+        elif key.removeprefix(f'{AS_PRINTED}_') in TOTALS:
             result[key] = sum(values)
         else:
             result[key] = np.mean(values, axis=0).tolist()
@@ -188,7 +189,7 @@ class Cells(NamedTuple):
 
     quantity: str
     printed: str
-    paper: str
+    as_printed: str
     default: str
     bound: str
     aim: str
@@ -200,8 +201,8 @@ class Row(Strict, frozen=True):
 
     quantity: str  # with its unit
     default: str  # key of the value with the preset of the run
-    printed: str = NOTHING  # in the paper, on Musashi
-    paper: str = ''  # key of the value with preset paper
+    printed: str = NOTHING  # on Musashi
+    as_printed: str = ''  # key of the value with the preset as printed, whose name is {preset}
     bound: str = ''  # key of what nothing can beat
     aim: float | None = None  # highest value aimed at; lowest, if `more_is_better`
     digits: int = 3
@@ -218,15 +219,18 @@ class Row(Strict, frozen=True):
 
     def cells(self, result: Mapping[str, Any]) -> Cells:
         """Return the line for a result.json."""
-        numbers = [self.number(result, key) for key in (self.paper, self.default, self.bound)]
-        paper, default, bound = (NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers)
+        as_printed_key = self.as_printed.format(preset=AS_PRINTED)
+        numbers = [self.number(result, key) for key in (as_printed_key, self.default, self.bound)]
+        as_printed, default, bound = (
+            NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers
+        )
         number, aim, verdict = numbers[1], NOTHING, ''
         if self.aim is not None:
             aim = f'{"≥" if self.more_is_better else "≤"} {self.aim:g}' if self.aim else '0'
             if number is not None:
                 missed = self.aim - number if self.more_is_better else number - self.aim
                 verdict = 'met' if missed <= 0.0 else f'missed by {missed:.{self.digits}f}'
-        return Cells(self.quantity, self.printed, paper, default, bound, aim, verdict)
+        return Cells(self.quantity, self.printed, as_printed, default, bound, aim, verdict)
 
 
 #: by experiment
@@ -259,13 +263,13 @@ def readme_table(results: Results) -> str:
         'compare. Reference: least squares on the true body (estimate), the least ‖T‖ that can '
         'hold the posture where the arm came to rest (control), the true body without friction '
         '(simulator).\n\n'
-        '| | paper, on Musashi | preset `paper` | preset `default` | reference | goal |\n'
+        f'| | paper, on Musashi | preset `{AS_PRINTED}` | preset `default` | reference | goal |\n'
         '|---|---|---|---|---|---|'
     )
     for name in filter(ROWS.get, results):
         text += f'\n| **`experiment {name}`** | | | | | |'
         for each in table({name: results[name]}):
-            text += f'\n| {each.quantity} | {each.printed} | {each.paper} | **{each.default}** | '
+            text += f'\n| {each.quantity} | {each.printed} | {each.as_printed} | **{each.default}** | '
             text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
     return ''.join([text, *(f'\n\nFailed: {line}' for line in failures(results)), '\n\n'])
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which joints of a robot play the parts that the paper gives to Musashi's elbow and shoulder."""
+"""Which joints of a robot play the parts of Musashi's elbow and shoulder (paper, §IV-D)."""
 
 import math
 

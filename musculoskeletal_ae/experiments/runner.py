@@ -20,7 +20,7 @@ from typing import Any
 
 from musculoskeletal_ae.experiments import NAMES, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study, rounded
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 
 EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fewer sensors.
 
-Paper. Musashi has joint sensors at few joints, and a marker on the hand takes their place; what a
-part of them or none is worth is not measured.
+Paper (§II-A). Musashi has joint sensors at few joints, and a marker on the hand takes their place;
+what a part of them or none is worth is not measured.
 
 Here. The messages of the default network’s exploration teach learners that see less of them: all
 joint sensors; only those of elbows (joints so named, else the last that turns); none; none but a

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation.
 
-Paper. Arm and simulator under the same commands: 0.335 → 0.162 rad and 105 → 92.2 N by learning.
+Paper (§IV-D). Arm and simulator under the same commands: 0.335 → 0.162 rad and 105 → 92.2 N by
+learning.
 
 Here. Arm and simulator follow the commands of the held-out motion, and all messages are compared;
 the simulator starts in the arm’s first posture and sees nothing else of it. θ beside the true
@@ -18,6 +19,7 @@ from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Motion, Recording, columns, times
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -31,7 +33,7 @@ def measure(study: Study, seed: int) -> Measured:
     recording = study.stream(seed, 'held_out')
     arm = Motion(recording.theta, recording.tension)
     numbers, traces = dict[str, Any](), {'arm': arm}
-    for preset in dict.fromkeys([study.preset, 'paper']):
+    for preset in dict.fromkeys([study.preset, AS_PRINTED]):
         for when, mae in study.networks(seed, preset).items():
             moved = simulate(study.robot, mae, preset, recording)
             numbers |= study.keyed(preset, _errors(when, moved, arm))
@@ -97,7 +99,7 @@ def simulation_errors(_: Study, rows: Rows) -> Plot:
             label = f'{when} learning: mean {numbers[f"{when}_{key}"]:.3g} {unit}'
             plots.line(panel, times(len(values)), values, 25, color=colour, lw=0.9, label=label)
         before, after = PRINTED[key]
-        label = f'paper: {before:g} → {after:g} {unit}'
+        label = f'printed: {before:g} → {after:g} {unit}'
         panel.axhline(after, color=plots.MARK, ls=':', lw=1, label=label)
         panel.set_ylim(bottom=0.0)
         plots.tidy(panel, '', f'‖{symbol}_sim − {symbol}‖ [{unit}]', legend='above')
@@ -105,7 +107,7 @@ def simulation_errors(_: Study, rows: Rows) -> Plot:
     panels[1].set_xlabel('time [s]')
     return figure, (
         'Distance of the simulator from the arm under the same commands (0.25 s running mean). '
-        'Dotted: the paper’s mean after learning.'
+        'Dotted: the printed mean after learning.'
     )
 
 

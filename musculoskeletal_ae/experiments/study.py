@@ -24,6 +24,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 
 DIGITS = 6  # significant, of numbers; more is noise
@@ -92,8 +93,8 @@ class Study:
             return list(arrays.values())
 
     def keyed(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a preset's numbers as result.json names them: those of preset paper `paper_…`."""
-        named = ('', self.preset), ('paper_', 'paper')
+        """Return a preset's numbers as result.json names them: those as printed get a prefix."""
+        named = ('', self.preset), (f'{AS_PRINTED}_', AS_PRINTED)
         prefixes = [prefix for prefix, name in named if name == preset]
         return {prefix + key: value for prefix in prefixes for key, value in numbers.items()}
 
@@ -130,7 +131,7 @@ def first(rows: Rows) -> tuple[int, Measured]:
 class Experiment(NamedTuple):
     """One experiment: how it is measured on an individual, drawn and explained."""
 
-    #: the module's docstring: heading; "Paper. …", what the paper did and found; "Here. …"
+    #: the module's docstring: heading; "Paper (section). …", what it did and found; "Here. …"
     text: str | None
     measure: Callable[[Study, int], Measured]  # of the individual of a seed
     plots: tuple[Callable[[Study, Rows], Plot], ...]  # functions named as the files they draw

@@ -94,7 +94,7 @@ class Learner:
         self.scheduler = UpdateScheduler(
             least if joint_source == SENSOR else max(least, LEAST_BLIND), steps
         )
-        self.keeper = CheckpointKeeper(robot, samples, directory, way.gated)
+        self.keeper = CheckpointKeeper(robot, samples, directory, way.validates_updates)
         saved = self.keeper.load()
         if self.samples:
             # They keep the versions of the body state that they were taken under: count on.

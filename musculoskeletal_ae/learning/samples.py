@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples: what the sensors said while the arm was at rest, and which of them are kept.
 
-A sample is new when θ or T differs from every stored one by more than a threshold (paper, section
-"Online Learning"). When the store is full, one of the two samples nearest to each other goes, the
-older one, so that what remains is spread over the postures and tensions ever seen, and the newest
-always stays.
+A sample is new when θ or T differs from every stored one by more than a threshold (paper,
+§III-C). When the store is full, one of the two samples nearest to each other goes, the older one,
+so that what remains is spread over the postures and tensions ever seen, and the newest always
+stays.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CalibratedBody
-from musculoskeletal_ae.mae.training import highest_tensions
+from musculoskeletal_ae.mae.default_training import highest_tensions
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -32,12 +32,12 @@ from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets import preset_named
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
-    from musculoskeletal_ae.learning.update import Updater
+    from musculoskeletal_ae.learning.updater import Updater
 
 
 class Job(NamedTuple):
@@ -76,9 +76,7 @@ class Trainer:
 
     def begin(self, mae: Mae) -> None:
         """Go on from a network; what was submitted before is forgotten."""
-        from musculoskeletal_ae.learning.update import make_updater
-
-        self._updater = make_updater(self.robot, mae, self.preset, self.seed)
+        self._updater = self.preset.make_updater(self.robot, mae, self.seed)
         self._update = None
 
     @property
@@ -128,7 +126,7 @@ class TrainerProcess(Trainer):
     """
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0, device: str = 'cpu') -> None:
-        """Learn on one of `presets.DEVICES`, or on the CPU where there is no such."""
+        """Learn on one of `parameters.DEVICES`, or on the CPU where there is no such."""
         super().__init__(robot, preset, seed)
         self._device = device
         self.restarts = 0  # how often a process was lost

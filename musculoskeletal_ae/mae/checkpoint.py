@@ -22,8 +22,8 @@ from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
-from musculoskeletal_ae.mae.units import UNITS
-from musculoskeletal_ae.presets import PRESETS, Activation
+from musculoskeletal_ae.mae.units import UNITS, ActivationName
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
@@ -60,7 +60,7 @@ class Metadata(Strict, frozen=True):
     layer_sizes: Annotated[tuple[Units, ...], Meta(min_length=3, max_length=21_000)]
     groups: Annotated[tuple[Group, ...], Meta(min_length=1, max_length=1000)]
     isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)]  # places of muscles
-    activation: Activation
+    activation: ActivationName
     preset: str
     version: Count
     training: Annotated[str, Meta(max_length=10_000)]

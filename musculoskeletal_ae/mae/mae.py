@@ -3,7 +3,7 @@
 
     z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z)
 
-(paper, section "Network Structure"). SI units go in and out. The units of the network, its
+(paper, §III-A). SI units go in and out. The units of the network, its
 standardisation and the constant mask inputs are folded into the first and last layers when the
 object is made, so one estimate is six small matrix products and nothing else. They are computed in
 single precision: a large body's weights then fit into a core's cache, and 1e-6 of a network's
@@ -29,7 +29,14 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints, Singles
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, Mask, State, scale_vector, visible
+from musculoskeletal_ae.mae.units import (
+    LENGTH_SCALE,
+    ActivationName,
+    Mask,
+    State,
+    scale_vector,
+    visible,
+)
 from musculoskeletal_ae.robot.groups import Group
 
 #: (weight, bias) of one layer
@@ -225,7 +232,7 @@ class Mae:
     joints: tuple[str, ...]  # D names, in the order of θ
     muscles: tuple[str, ...]  # M names, in the order of T and l
     preset: str
-    activation: str
+    activation: ActivationName
     #: weight (out, in), bias (out,), in scaled, standardised units; one group after the other
     encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
@@ -241,7 +248,7 @@ class Mae:
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
     _leave_length: Stack = field(init=False, repr=False)
-    #: z (..., D+M) to (θ, T, l) in the paper's scaled units, one array (..., D+2M)
+    #: z (..., D+M) to (θ, T, l) in scaled units, one array (..., D+2M)
     decode_scaled: Stack = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -342,7 +349,7 @@ class Mae:
         return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
 
     def estimate(self, tension: Array, length: Array) -> State:
-        """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, "State Estimation").
+        """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, §III-D).
 
         T is that of the elastic units: what a sensor reads, without friction (`friction`).
         Isolated muscles have no part in it: theirs is what the others make likely.
@@ -446,16 +453,6 @@ class Mae:
             rows, columns = np.ix_(muscles, joints)
             result[..., rows, columns] = slopes[..., muscles, : len(joints)]
         return length, result
-
-    def muscle_jacobian_difference(self, theta: Array, tension: Array, step: float = 0.01) -> Array:
-        """Return G as the paper takes it, by forward difference of ① (it does not print Δθ)."""
-        joints = len(self.joints)
-        offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])
-        postures = theta[..., None, :] + offsets  # (..., D+1, D)
-        shape = (*postures.shape[:-1], len(self.muscles))
-        lengths = self.lengths(postures, np.broadcast_to(tension[..., None, :], shape))
-        difference: Array = (lengths[..., 1:, :] - lengths[..., :1, :]) / step
-        return difference.swapaxes(-1, -2)
 
 
 def _frozen(array: Array) -> Array:

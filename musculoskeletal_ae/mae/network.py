@@ -3,26 +3,37 @@
 
     z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z),   z of size D+M
 
-(paper, section "Network Structure"). Everything is in scaled units; a masked entry is zero where it
+(paper, §III-A). Everything is in scaled units; a masked entry is zero where it
 enters the first layer.
 """
 
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from msgspec import structs
 from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.mae import Layer, Mae
-from musculoskeletal_ae.mae.units import Mask, scale_vector, visible
-from musculoskeletal_ae.presets import PRESETS, NetworkSettings
+from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
+
+
+class Layers(NamedTuple):
+    """The hidden layers of a network.
+
+    Attributes:
+        hidden: Units of the encoder's hidden layers; the decoder's are the reverse.
+        activation: After every layer but the latent and the last one, which are linear.
+    """
+
+    hidden: tuple[int, ...]
+    activation: ActivationName
 
 
 class Blocks(nn.Module):
@@ -58,18 +69,18 @@ class Network(nn.Module):
         self,
         joints: int,
         muscles: int,
-        settings: NetworkSettings,
+        layers: Layers,
         mean: Array,
         std: Array,
         blocks: Mapping[Group, tuple[int, ...]] | None = None,
     ) -> None:
         """Start from torch's random weights; (θ, T, l) are centred by mean, divided by std.
 
-        The blocks say the hidden layers of each group.
+        The blocks give the hidden layers of each group, in the place of those of `layers`.
         """
         super().__init__()
-        self.joints, self.muscles, self.settings = joints, muscles, settings
-        blocks = blocks or {Group.whole(joints, muscles): settings.hidden}
+        self.joints, self.muscles, self.activation = joints, muscles, layers.activation
+        blocks = blocks or {Group.whole(joints, muscles): layers.hidden}
         self.groups = tuple(blocks)
         values, start, encoders, decoders = joints + 2 * muscles, 0, [], []
         own, latents = [group.columns(joints, muscles) for group in blocks], []
@@ -103,7 +114,7 @@ class Network(nn.Module):
         return self.decode(self.encode(values, mask))
 
     def _stack(self, sizes: tuple[int, ...]) -> nn.Sequential:
-        activation = ACTIVATIONS[self.settings.activation]
+        activation = ACTIVATIONS[self.activation]
         layers: list[nn.Module] = []
         for into, out in pairwise(sizes):
             layers += [nn.Linear(into, out), activation()]
@@ -125,7 +136,7 @@ def to_mae(
         joints=joints,
         muscles=muscles,
         preset=preset,
-        activation=network.settings.activation,
+        activation=network.activation,
         encoder=stack(network.encoder),
         decoder=stack(network.decoder),
         mean=array(network.mean),
@@ -137,11 +148,11 @@ def to_mae(
 
 def from_mae(mae: Mae) -> Network:
     """Return a torch network with the weights of a numpy one, to go on learning from."""
-    settings = structs.replace(PRESETS[mae.preset].network, activation=mae.activation)
     hidden = [len(bias) for _, bias in mae.encoder]
     depth = len(hidden) // len(mae.groups)
     blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}
-    network = Network(len(mae.joints), len(mae.muscles), settings, mae.mean, mae.std, blocks)
+    layers = Layers(blocks[mae.groups[0]], mae.activation)
+    network = Network(len(mae.joints), len(mae.muscles), layers, mae.mean, mae.std, blocks)
     with torch.no_grad():
         for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
             for layer, (weight, bias) in zip(_linear(layers), arrays, strict=True):

@@ -2,7 +2,7 @@
 """What ② leaves of a message, and what that looks like on a healthy body.
 
     e = (T_est − T, l_est − l)                        scaled units, shape (2M,)
-    A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, section "State Estimation")
+    A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, §III-D, eq. 4)
 
 A checkpoint carries mean and covariance of e over healthy data; the detector that decides by them
 is `estimation/detectors/residual_distance.py`.

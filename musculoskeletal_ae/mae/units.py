@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What enters and leaves the network: (θ, T, l), their scaled units, and the three masks.
 
-The paper (section "Network Structure") scales (θ, T, l) to [rad], [N/200], [mm/100] so that their
+The paper (§III-A) scales (θ, T, l) to [rad], [N/200], [mm/100] so that their
 sizes align, and enters the network with two of the three: the mask says which. SI outside.
 """
 
 from enum import Enum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from musculoskeletal_ae.arrays import Array, Bools
 THETA_SCALE = 1.0  # scaled units per [rad] (or [m] of a prismatic joint)
 TENSION_SCALE = 1.0 / 200.0  # scaled units per [N]
 LENGTH_SCALE = 10.0  # scaled units per [m]; mm/100 = 10 · l[m]
+
+ActivationName = Literal['tanh', 'silu']
 
 UNITS = 'theta rad, tension N/200, length mm/100'
 
@@ -34,7 +36,7 @@ class State(NamedTuple):
 
 
 class Mask(Enum):
-    """Which of (θ, T, l) enter the network: the paper's ①, ②, ③."""
+    """Which of (θ, T, l) enter the network: ①, ②, ③ (paper, §III-A)."""
 
     THETA_TENSION = (1, 1, 0)
     TENSION_LENGTH = (0, 1, 1)

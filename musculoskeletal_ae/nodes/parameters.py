@@ -22,6 +22,7 @@ from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
+    DEVICES,
     PRESET,
     RATE,
     ROBOT,
@@ -29,7 +30,6 @@ from musculoskeletal_ae.parameters import (
     Parameter,
     parameters_of,
 )
-from musculoskeletal_ae.presets import DEVICES
 
 FRAME_PREFIX = Parameter('', 'put before every frame that is published, such as "left/"')
 SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX}

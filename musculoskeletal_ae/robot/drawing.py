@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an arm looks like: bones and muscles as lines, and a picture of them without a display.
 
-As in the paper's figures, a muscle is green at T_bias and turns red towards T_limit.
+A muscle is green at T_bias and turns red towards T_limit (paper, §IV-D).
 """
 
 from collections.abc import Sequence

@@ -3,7 +3,7 @@
 
     θ = IK(P_marker, θ_initial = θ_est):  min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R²
 
-(paper, section "Musculoskeletal Humanoids") in the joint limits, by damped least squares
+(paper, §II-A) in the joint limits, by damped least squares
 (Levenberg–Marquardt) over pinocchio's Jacobian. Nothing pulls θ towards the estimate, but where the
 pose says little about a joint (near a singular posture), a camera's noise would turn it anywhere;
 so no step is free of damping, and the search ends once a step gains less than the noise amounts to.

@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.stiffness import muscle_stiffness
 
 
 class Robot:
-    """Geometric model of D joints and M muscles (paper, section "Initial Training")."""
+    """Geometric model of D joints and M muscles (paper, §III-B)."""
 
     def __init__(self, description: RobotDescription) -> None:
         self.description = description

@@ -5,7 +5,7 @@
     f_geo(θ)     = f_geo,abs(θ) − f_geo,abs(0)
     G(θ)         = ∂f_geo/∂θ
 
-(paper, section "Initial Training": start, relay and end points linearly connected.) G follows from
+(paper, §III-B: start, relay and end points linearly connected.) G follows from
 the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines d between them. Of a
 segment that may wrap round a sphere or cylinder (`wrapping`) it is the velocity of the end points
 as seen from that object's link, projected on the directions in which the wire leaves them.

@@ -3,7 +3,7 @@
 
     L_e(l_abs, T) = ln(1 + T / force) / rate + wire_stretch · l_abs · T
 
-(paper, section "Initial Training": estimated from a testbed of one muscle). The elastic unit is the
+(paper, §III-B: estimated from a testbed of one muscle). The elastic unit is the
 exponential tendon T = force · (exp(rate · Δ) − 1); the wire is Dyneema, whose stretch grows with
 its length. The constants are chosen to be plausible for Musashi, which are not public.
 """

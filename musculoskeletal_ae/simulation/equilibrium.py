@@ -5,7 +5,7 @@
     T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     MSC, part of the simulated arm
     B θ̇ = −(g(θ) − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
-The paper descends on a sum of norms (section "Simulation"); its weights let ‖T‖ outweigh torque and
+The paper descends on a sum of norms (§III-F, eq. 13); its weights let ‖T‖ outweigh torque and
 length, so that the arm settles elsewhere. Here both are equations, and what is searched is the
 sheet z = ①(θ, T) of the latent space, where they have D+M unknowns for D+M equations. Their root is
 the posture of rest. (Solved for z itself, with decoded θ and T instead of exact ones, the root is

@@ -3,7 +3,7 @@
 
     load(θ) = g(θ) − Jᵀ F
 
-(paper, section "Simulation": the necessary torque from the geometric model). Pinocchio answers the
+(paper, §III-F: the necessary torque from the geometric model). Pinocchio answers the
 same, a test holds the two together; but it has no gradient with a push, and from Python takes as
 long as all the rest of a step. With forces f_i at points c_i, every joint k at o_k with axis a_k
 needs only sums over what it carries:

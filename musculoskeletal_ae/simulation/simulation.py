@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learned body as a simulator: joint angles and muscle tensions from commanded lengths.
 
-(Paper, section "Simulation Using Musculoskeletal AutoEncoder".) The simulated arms follow the same
+(Paper, §III-F.) The simulated arms follow the same
 muscle length command as real ones, with muscle stiffness control being part of the arm: commanding
 l_target, with its l_comp, gives the tensions it gives on the robot at rest. An arm that has had no
 command rests at T_bias. One arm or thousands are the same compiled code, on all cores; their
-network may be on a GPU. `equilibrium` has the equations of preset `default`, `paper` the printed
-descent.
+network may be on a GPU. The preset chooses the equations (`Preset.make_simulator`); those of
+preset `default` are in `equilibrium`.
 """
 
 import os
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import compress
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -22,11 +22,10 @@ from threadpoolctl import ThreadpoolController
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets import preset_named
+from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState, QuasiStatics
-from musculoskeletal_ae.simulation.paper import PaperDescent
+from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
 LONGEST_STEP = 0.01  # [s]; a longer time is cut into several
 #: arms whose arrays fit into a core's cache together
@@ -36,6 +35,26 @@ SETTLED = 1e-6  # [rad] moved in a step
 
 # Below these a stop or a module at its end does not count as a limit reached.
 STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
+
+
+class SimulatedBody(Protocol):
+    """Steps N simulated arms of one robot."""
+
+    def use(self, mae: Any, robot: Robot) -> None:
+        """Take a network, and the robot with the muscles that are isolated now."""
+
+    def step(
+        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
+    ) -> ArmState:
+        """Return the arms h [s] later.
+
+        Args:
+            state: The arms now.
+            command: l_target [m], (N, M).
+            h: Time [s].
+            wrench: On the end effectors, axes of the root link [N, N·m], (N, 6).
+            fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
+        """
 
 
 class Simulation:
@@ -57,18 +76,19 @@ class Simulation:
     ) -> None:
         """Put arms at θ = 0 (or the nearest limit) with T_bias and no command.
 
-        The network computes on a device of torch, such as `cuda` (preset `default` only).
+        The network computes on a device of torch, such as `cuda`, if the preset can.
 
         Raises:
             MusculoskeletalError: If torch computes nothing there, the preset cannot, or there are
                 no arms.
         """
         self.robot = robot
-        kind = QuasiStatics if preset_named(preset).equilibrium else PaperDescent
-        self._body, self._device = kind(self.robot), device
-        if device is not None and kind is PaperDescent:
-            told = f'preset {preset!r} simulates one arm after the other, and on no device'
-            raise MusculoskeletalError(f'{told}; given: {device!r}. Legal there: default')
+        chosen = preset_named(preset)
+        self._body, self._device = chosen.make_simulator(self.robot), device
+        if device is not None and not chosen.simulates_on_devices:
+            legal = ', '.join(name for name, each in PRESETS.items() if each.simulates_on_devices)
+            reason = f'preset {preset!r} simulates one arm after the other, and on no device'
+            raise MusculoskeletalError(f'{reason}; given: {device!r}. Legal there: {legal}')
         self.wrench = np.zeros((0, 6))  # those of the arms that start
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))

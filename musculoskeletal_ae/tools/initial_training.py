@@ -33,7 +33,7 @@ from musculoskeletal_ae.mae.training import (
 )
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.options import save_plot
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import told_of_jumps
 from musculoskeletal_ae.robot.robot import Robot
@@ -64,7 +64,7 @@ def train(args: Namespace) -> None:
     if told := told_of_jumps(robot):
         print(f'warning: {told}. Nodes may refuse this network', file=sys.stderr)
     preset = PRESETS[args.preset]
-    steps = preset.steps(robot.groups) // (10 if args.quick else 1)
+    steps = preset.initial_steps(robot.groups) // (10 if args.quick else 1)
     if args.from_bag:
         checkpoint.save(_learned(robot, args, steps).mae, args.out)
         print(f'checkpoint: {args.out}')

@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status
-from musculoskeletal_ae.presets import DEVICES
+from musculoskeletal_ae.parameters import DEVICES
 from musculoskeletal_ae.stop_signals import import_heavy
 
 

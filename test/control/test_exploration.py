@@ -10,6 +10,7 @@ from robots import write_robot
 from musculoskeletal_ae.control.exploration import Exploration, holdable_postures
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
@@ -17,8 +18,8 @@ ROBOT = Robot.load('arm26')
 BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
 
 
-def steps(seed, count, to_limits=0.0):
-    return list(islice(Exploration(ROBOT, seed, to_limits), count))
+def steps(seed, count, preset='paper'):
+    return list(islice(Exploration(ROBOT, seed, preset), count))
 
 
 def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
@@ -36,9 +37,9 @@ def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
     assert np.ptp(three.tension) > 0.0
 
 
-@pytest.mark.parametrize('to_limits', [0.0, 0.5])
-def test_every_explored_posture_can_be_held_and_lies_within_the_joint_limits(to_limits):
-    for step in steps(1, 90, to_limits)[1::3]:
+@pytest.mark.parametrize('preset', PRESETS)
+def test_every_explored_posture_can_be_held_and_lies_within_the_joint_limits(preset):
+    for step in steps(1, 90, preset)[1::3]:
         assert ((step.theta >= ROBOT.lower) & (step.theta <= ROBOT.upper)).all()
         assert ((step.tension >= BIAS - 1e-6) & (step.tension <= LIMIT + 1e-6)).all()
         held = -ROBOT.routes.muscle_jacobian(step.theta).T @ step.tension
@@ -46,7 +47,7 @@ def test_every_explored_posture_can_be_held_and_lies_within_the_joint_limits(to_
 
 
 def test_joints_are_sent_to_their_limits_at_the_given_rate_and_pressed_there():
-    asked = steps(2, 300, 0.25)[2::3]
+    asked = steps(2, 300, 'default')[2::3]
     way = np.array([(s.theta == ROBOT.upper) * 1.0 - (s.theta == ROBOT.lower) for s in asked])
     # Fewer of those at limits can be held; there are 200 targets of single joints.
     assert 0.12 < np.abs(way).mean() < 0.38

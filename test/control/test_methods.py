@@ -16,9 +16,10 @@ from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.mae.descent import Loss, descend
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.paper import control as paper
+from musculoskeletal_ae.paper.latent_descent import Loss, descend
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
@@ -92,14 +93,14 @@ def test_preset_paper_lowers_the_printed_loss(trained):
     robot, mae = Robot.load('arm26'), trained['paper']
     theta, torque, _ = holdable(robot, 0)
     tension = np.full(6, 100.0)
-    terms = methods.paper_terms(robot, mae, theta, torque, tension)
+    terms = paper.control_loss(robot, mae, theta, torque, tension)
     start = mae.encode(Mask.THETA_TENSION, theta, tension)
-    end = descend(mae, start, terms, methods.SEARCH)
+    end = descend(mae, start, terms, paper.SEARCH)
     assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
-    solution = methods.proposed_paper(robot, mae, theta, torque, tension)
+    solution = paper.proposed(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(solution.tension, mae.decode(end).tension)
     reduced = robot.without((2, 4))
-    *_, balance = methods.paper_terms(reduced, mae, theta, torque, tension)
+    *_, balance = paper.control_loss(reduced, mae, theta, torque, tension)
     pulls = balance.matrix[:, robot.joint_count :][:, : robot.muscle_count]
     np.testing.assert_array_equal(np.abs(pulls).max(axis=0) > 0.0, reduced.used)
 
@@ -111,7 +112,7 @@ def test_the_methods_agree_with_an_implementation_by_autograd(trained, seed):
     tension = np.full(6, 40.0)
     for preset, ours, theirs in (
         ('default', partial(methods.proposed, limit=200.0), eager_proposed),
-        ('paper', methods.proposed_paper, eager_proposed_paper),
+        ('paper', paper.proposed, eager_proposed_paper),
     ):
         mae = trained[preset]
         plain = theirs(robot, from_mae(mae), theta, torque, tension)

@@ -25,7 +25,7 @@ from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import Trainer, Update
 from musculoskeletal_ae.mae.training import initial_mae
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')

@@ -25,7 +25,7 @@ from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 
 
 @pytest.fixture(scope='module')

@@ -21,7 +21,7 @@ from musculoskeletal_ae.experiments.results import (
     write_report,
 )
 from musculoskeletal_ae.experiments.study import Measured, Study
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.tools import experiment
 
 

@@ -11,15 +11,12 @@ from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
 from musculoskeletal_ae.learning.synthetic import UNSURE, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Trainer
-from musculoskeletal_ae.learning.update import (
-    BodyUpdater,
-    PaperUpdater,
-    learned_steps,
-)
+from musculoskeletal_ae.learning.update import BodyUpdater, learned_steps
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import scale_vector
-from musculoskeletal_ae.presets import PAPER
+from musculoskeletal_ae.paper.constants import THRESHOLD
+from musculoskeletal_ae.paper.online_learning import OnlineLearning
 
 from .conftest import Stage, drawn_body, job
 
@@ -154,8 +151,8 @@ def test_synthetic_lengths_scatter_by_the_unknown_part_of_friction(other_body):
 
 
 def test_preset_paper_takes_100_steps_in_each_update(arm26, initial, stage):
-    updater = PaperUpdater(arm26, initial)
-    store = stage.store(PAPER.least_samples)
+    updater = OnlineLearning(arm26, initial)
+    store = stage.store(THRESHOLD + 1)
     states = stage.states(500)
     for _ in range(10):
         update = updater.update(job(store))
@@ -164,12 +161,12 @@ def test_preset_paper_takes_100_steps_in_each_update(arm26, initial, stage):
 
 
 def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26, initial, stage):
-    updater = PaperUpdater(arm26, initial)
+    updater = OnlineLearning(arm26, initial)
     store = stage.store(30)
     store.forget(1, 5)
     update = updater.update(job(store))
     np.testing.assert_array_equal(update.mae.encoder[0][0], initial.encoder[0][0])
-    for _ in range(PAPER.least_samples - 5):
+    for _ in range(THRESHOLD - 4):
         store.add(stage.sample())
     update = updater.update(job(store))
     assert (update.mae.encoder[0][0] != initial.encoder[0][0]).any()

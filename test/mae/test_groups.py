@@ -10,9 +10,9 @@ import torch
 
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae.checkpoint import from_bytes, to_bytes
+from musculoskeletal_ae.mae.default_training import LAYERS, blocks, default_steps, grown
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.presets import DEFAULT, PAPER
 from musculoskeletal_ae.robot.groups import Group, groups
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -27,7 +27,7 @@ def mae():
     mean, std = rng.normal(size=23), rng.uniform(0.5, 2.0, 23)
     torch.manual_seed(0)
     blocks = {limb: (6 + i, 4) for i, limb in enumerate(LIMBS)}
-    network = Network(JOINTS, MUSCLES, DEFAULT.network, mean, std, blocks)
+    network = Network(JOINTS, MUSCLES, LAYERS, mean, std, blocks)
     return to_mae(network, tuple('abcde'), tuple('ABCDEFGHI'), 'default', '')
 
 
@@ -69,15 +69,13 @@ def test_a_joint_without_muscles_and_a_muscle_without_joints_are_in_some_group()
     assert all(joints and muscles for joints, muscles in found)
 
 
-def test_layers_and_training_steps_grow_with_a_large_group_except_in_preset_paper():
+def test_layers_and_training_steps_grow_with_a_large_group():
     arm, small, large = (Group.whole(*sizes) for sizes in ((5, 10), (2, 6), (7, 14)))
-    blocks = DEFAULT.blocks((arm, small, large))
-    assert list(blocks.values()) == [(200, 100), (200, 100), (280, 140)]
-    assert DEFAULT.grown(3000, (arm, small)) == 3000
-    assert DEFAULT.grown(3000, (arm, large, small)) == 4200
-    assert DEFAULT.steps((arm, large, small)) == round(3000 * 1.4**1.5)
-    assert PAPER.grown(3000, (large,)) == 3000
-    assert not PAPER.blocks((arm, large))
+    layers = blocks((arm, small, large))
+    assert list(layers.values()) == [(200, 100), (200, 100), (280, 140)]
+    assert grown(3000, (arm, small)) == 3000
+    assert grown(3000, (arm, large, small)) == 4200
+    assert default_steps((arm, large, small)) == round(3000 * 1.4**1.5)
 
 
 @pytest.mark.parametrize('index', range(3))

@@ -10,7 +10,7 @@ from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.presets import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')

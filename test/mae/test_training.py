@@ -3,63 +3,18 @@
 import numpy as np
 import pytest
 import torch
-from msgspec import structs
 from robots import read_muscles, write_muscles, write_robot
 
-from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
-from musculoskeletal_ae.mae.training import (
-    POSTURE_MARGIN,
-    annealing,
-    fit,
-    initial_mae,
-    loss,
-    overload_states,
-    pair_errors,
-    random_states,
-    shuffled,
-)
+from musculoskeletal_ae.mae.default_training import POSTURE_MARGIN, annealing, overload_states
+from musculoskeletal_ae.mae.training import initial_mae, pair_errors, random_states, shuffled
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.presets import PAPER, PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
-
-
-def test_paper_preset_has_the_layers_of_the_paper():
-    arm = Robot.load('musashi_left_arm')
-    mae = initial_mae(arm, 'paper', steps=1).mae
-    assert mae.layer_sizes == (5 + 2 * 10 + 3, 200, 30, 5 + 10, 30, 200, 5 + 2 * 10)
-
-
-def test_paper_preset_trains_as_the_paper_does():
-    paper = PAPER.training
-    assert paper.weights == (1.0, 10.0, 10.0)
-    assert paper.steps * paper.batch == 30 * paper.samples == 30 * 10_000
-    assert (paper.optimiser, paper.step_size, paper.annealed) == ('adam', 1e-3, False)
-    assert not PAPER.network.standardise and not paper.standard_norms
 
 
 def test_paper_preset_enters_scaled_units_as_they_are(trained):
     np.testing.assert_array_equal(trained['paper'].mean, 0.0)
     np.testing.assert_array_equal(trained['paper'].std, 1.0)
-
-
-def test_loss_is_the_weighted_sum_of_plain_norms(robot):
-    values = random_states(robot, 5, np.random.default_rng(0), 500.0).scaled()
-    network = Network(2, 6, PAPER.network, np.zeros(14), np.ones(14))
-    tensor, mask = torch.tensor(values, dtype=torch.float32), torch.tensor([0, 1, 2, 0, 1])
-    error = network(tensor, mask).detach().numpy() - values
-    norms = [np.linalg.norm(error[:, a:b], axis=1).mean() for a, b in ((0, 2), (2, 8), (8, 14))]
-    got = loss(network, tensor, mask, PAPER.training).item()
-    assert got == pytest.approx(norms[0] + 10 * norms[1] + 10 * norms[2], rel=1e-5)
-
-
-def test_loss_has_a_finite_gradient_where_nothing_is_wrong():
-    network = Network(1, 2, PAPER.network, np.zeros(5), np.ones(5))
-    for parameter in network.parameters():
-        torch.nn.init.zeros_(parameter)
-    value = loss(network, torch.zeros(3, 5), torch.arange(3), PAPER.training)
-    value.backward()
-    gradients = [p.grad for p in network.parameters() if p.grad is not None]
-    assert gradients and all(torch.isfinite(g).all() for g in gradients)
 
 
 def test_training_samples_cover_the_geometric_model_slightly_beyond_its_limits(robot):
@@ -120,24 +75,6 @@ def test_training_leaves_the_callers_random_state_and_threads_alone(robot):
     initial_mae(robot, 'default', seed=9, steps=2)
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.rand(3), expected)
-
-
-def test_training_goes_on_from_given_weights(robot, trained):
-    rng = np.random.default_rng(2)
-    batches = shuffled(random_states(robot, 2000, rng, 200.0).scaled(), 64, rng)
-    settings = structs.replace(PAPER.training, steps=200, step_size=3e-4)
-    before = trained['paper']
-    network = from_mae(before)
-    observed: list[int] = []
-    losses = fit(network, batches, settings, progress=lambda step, *_: observed.append(step))
-    after = to_mae(network, robot.joints, robot.muscles, 'paper', 'more')
-    states = random_states(robot, 500, rng, 200.0)
-    assert observed == list(range(200)) and len(losses) == 200
-
-    def error(mae):
-        return sum(e.norm for e in pair_errors(mae, states) if e.output == 'theta')
-
-    assert error(after) < 0.85 * error(before)  # 0.60 to 0.67 over six seeds
 
 
 def test_annealing_rises_and_then_falls_to_nothing():

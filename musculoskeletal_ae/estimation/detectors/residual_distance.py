@@ -19,8 +19,7 @@ the remaining residual is most likely.
 While slack is being wound in, d waits as long as that muscle reads longer than ② restores it: a
 slack tendon is too long, and the rest of a ruptured one is too short.
 
-Preset `paper` decides by A alone, against the threshold of A in the checkpoint. So does any preset
-if the parameter `anomaly_threshold` is set.
+If the parameter `anomaly_threshold` is set, A decides against it.
 """
 
 import math
@@ -55,30 +54,32 @@ class Reading(NamedTuple):
 
 
 class ResidualDistance(Detector):
-    """Decides by d, or by A, and names the most suspect muscle.
+    """Decides by d and names the most suspect muscle.
+
+    A subclass may decide by another statistic of the residual.
 
     Attributes:
-        uses_distance: Whether d decides; otherwise A does.
+        symbol: Of the statistic that decides, for people to read.
+        threshold_name: Of its threshold among those of the checkpoint.
+        threshold: As it is in the checkpoint, if that is calibrated; ∞ otherwise.
         reading: Of the last message; None before the first.
     """
 
-    def __init__(
-        self, robot: Robot, settings: Detection, uses_distance: bool, slack: SlackTendon | None
-    ) -> None:
+    symbol, threshold_name = 'd', DISTANCE
+
+    def __init__(self, robot: Robot, settings: Detection, slack: SlackTendon | None = None) -> None:
         """Begin.
 
         Args:
             robot: The nominal body.
             settings: With the threshold of A, if the user has set one.
-            uses_distance: Whether d decides.
             slack: Says which tendons are being taken up, so that d waits; None: it never waits.
         """
         self._robot = self._complete_robot = robot
         self._settings, self._slack = settings, slack
-        self.uses_distance = uses_distance
         self._mae: Mae | None = None
         self._statistics: AnomalyStatistics | None = None
-        self._threshold = np.inf  # of d, or A, if it is calibrated
+        self.threshold = np.inf
         self._beyond = 0  # consecutive messages beyond the threshold
         self.reading: Reading | None = None
 
@@ -93,11 +94,10 @@ class ResidualDistance(Detector):
         if statistics is not None:
             self._whiten: Array = np.linalg.inv(np.linalg.cholesky(statistics.covariance))
             self._spread = np.sqrt(np.diag(statistics.covariance))
-        self._mae, self._statistics, self._threshold = mae, statistics, np.inf
+        self._mae, self._statistics, self.threshold = mae, statistics, np.inf
         self._robot = self._complete_robot.without(mae.isolated)
         if statistics is not None and statistics.calibrated:
-            name = DISTANCE if self.uses_distance else NORM
-            self._threshold = statistics.thresholds.get(name, np.inf)
+            self.threshold = statistics.thresholds.get(self.threshold_name, np.inf)
 
     def configure(self, settings: Detection) -> None:
         """Use these settings."""
@@ -156,13 +156,15 @@ class ResidualDistance(Detector):
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
     def limit(self, theta: Array, tension: Array) -> float:
-        """Return the threshold of d, or A, at θ [rad] (D,) and T [N] (M,); ∞ without one."""
-        if not self.uses_distance:
-            return self._threshold
+        """Return the threshold of d at θ [rad] (D,) and T [N] (M,); ∞ without one."""
         used = self._robot.used
         highest = float((tension[used] / self._robot.tension.limit[used]).max(initial=0.0))
         factor = np.clip(max(self.unfamiliarity(theta), highest), 1.0, WIDEST)
-        return self._threshold * float(factor)
+        return self.threshold * float(factor)
+
+    def statistic(self, observation: Observation, distance: float) -> float:  # noqa: ARG002
+        """Return what decides: d."""
+        return distance
 
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
@@ -173,9 +175,8 @@ class ResidualDistance(Detector):
         if limit <= 0.0:
             if not self.is_calibrated:
                 return ''
-            limit = self._threshold
-            if self.uses_distance:
-                value, name = distance, 'd'
+            limit = self.threshold
+            value, name = self.statistic(observation, distance), self.symbol
             if value > limit and not has_slack:
                 theta, tension = observation.estimate.state.theta, observation.sample.motor_tension
                 wider = self.limit(theta, tension)

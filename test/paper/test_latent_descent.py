@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from musculoskeletal_ae.mae.descent import Loss, Term
+from musculoskeletal_ae.paper.latent_descent import Loss, Term
 
 RNG = np.random.default_rng(0)
 TERMS = (

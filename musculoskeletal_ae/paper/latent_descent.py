@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's descent in the latent space, which control and simulation share.
+"""The descent in the latent space (§III-E), which control and simulation share.
 
-    L(z)  = Σ_k w_k ‖A_k y − b_k‖₂,   y = f_decode(z) in scaled units
-    z     ← z − γ g/‖g‖₂,             g = dL/dz
+    g = dL/dz                                                                               (10)
+    z ← z − γ g/‖g‖₂                                                                        (11)
 
-with the best of N step sizes γ in [0, γ_max], C times (paper, section "Control Using
-Musculoskeletal AutoEncoder"). A task is data: how to enter, a list of terms, what to read.
+with the best of N step sizes γ in [0, γ_max], C times. The losses (9), (13) and (14) are sums of
+norms of affine maps of the decoded state:
+
+    L(z) = Σ_k w_k ‖A_k y − b_k‖₂,   y = f_decode(z) in scaled units
 """
 
 from collections.abc import Sequence
@@ -32,8 +34,8 @@ class StepSearch(NamedTuple):
     """Constants of the descent."""
 
     largest_step: float  # γ_max
-    candidates: int  # N, the paper's C_batch
-    epochs: int  # C, its C_epoch
+    candidates: int  # N, called C_batch in the list of constants
+    epochs: int  # C_epoch
 
 
 class Loss:
@@ -67,7 +69,7 @@ class Loss:
 
 
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
-    """Return z after the paper's descent, from z of shape (D+M,)."""
+    """Return z after the descent, from z of shape (D+M,)."""
     loss = Loss(terms)
     # γ = 0 is a candidate, so that the loss never rises.
     steps = np.linspace(0.0, search.largest_step, search.candidates + 1)[:, None]

@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of N simulated arms, preset `paper`: descent as printed (section "Simulation").
+"""Both simulations (§III-F): one descent of each of N simulated arms.
 
-    z = ②(T_sim, l_sim),  L_sim,1 = w₄‖T‖ + w₅‖l − l_sim‖ + w₆‖τ_target + Gᵀ(θ_sim, T_sim) T‖
-    z = ③(θ_sim, l_sim),  L_sim,2 = w₄‖T‖ + w₅‖l − l_sim‖ + w₇‖θ − θ_fix‖   where joints are forced
-    (θ_sim, T_sim) ← f_decode(z) after the descent
+    z = f_encode,2(T_sim, l_sim)
+    L_sim,1 = w₄‖T‖₂ + w₅‖l − l_sim‖₂ + w₆‖τ_target + Gᵀ(θ_sim, T_sim) T‖₂                   (13)
+
+and, where joints are forced to θ_fix,
+
+    z = f_encode,3(θ_sim, l_sim)
+    L_sim,2 = w₄‖T‖₂ + w₅‖l − l_sim‖₂ + w₇‖θ − θ_fix‖₂                                       (14)
+
+    (θ_sim, T_sim) ← f_decode(z) after the descent (`latent_descent`)
 
 l_sim is the length sent, l_target (in the Japanese text: the muscle length sent to the robot);
 only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle that was sent nothing gives
@@ -17,19 +23,28 @@ would be 85 N, and 0.34 rad instead of 0.49.)
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae.descent import StepSearch, Term, descend
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
+from musculoskeletal_ae.paper.constants import (
+    LENGTH_WEIGHT,
+    POSTURE_WEIGHT,
+    SIMULATION_CANDIDATES,
+    SIMULATION_EPOCHS,
+    SIMULATION_LARGEST_STEP,
+    TENSION_WEIGHT,
+    TORQUE_WEIGHT,
+)
+from musculoskeletal_ae.paper.control import muscle_jacobian
+from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 from musculoskeletal_ae.simulation.load import Load
 
-TENSION_WEIGHT, LENGTH_WEIGHT, TORQUE_WEIGHT, POSTURE_WEIGHT = 0.1, 1.0, 0.001, 1.0  # w₄ … w₇
-SEARCH = StepSearch(largest_step=0.2, candidates=10, epochs=3)
+SEARCH = StepSearch(SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_EPOCHS)
 
 
-class PaperDescent:
-    """The descent above for one robot; networks and arguments as for `QuasiStatics`."""
+class LatentSimulation:
+    """Simulates arms of one robot; networks and arguments as for `QuasiStatics`."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._load = robot, Load(robot.kinematics)
@@ -70,7 +85,7 @@ class PaperDescent:
         ]
         given = np.flatnonzero(np.isfinite(fixed))
         if not len(given):
-            jacobian = mae.muscle_jacobian_difference(theta, tension)
+            jacobian = muscle_jacobian(mae, theta, tension)
             terms.append(Term(TORQUE_WEIGHT, jacobian.T @ pull / TENSION_SCALE, -torque))
             z = mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length)
         else:

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all ways of learning online have in common: samples go in, a network comes out.
+
+An updater keeps its network and optimiser from update to update. `update.py` is the way of preset
+`default`; presets/ lists the others.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
+from musculoskeletal_ae.learning.covariance import estimate_covariance, observed_theta
+from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.learning.trainer import Job, Update
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.network import Network, to_mae
+from musculoskeletal_ae.mae.residuals import TouchStatistics
+from musculoskeletal_ae.robot.robot import Robot
+
+#: between how the network was made and what it learned since, in `Mae.training`
+LEARNED = '; learned online: '
+NEWEST = 20  # samples that tell how good the estimates are
+
+
+class Updater(ABC):
+    """A way of learning online; keeps network and optimiser from update to update."""
+
+    def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
+        """Go on from a network; `seed` draws what is random."""
+        self._robot, self._origin, self._mae, self._seed = robot, mae, mae, seed
+
+    @property
+    def body(self) -> CalibratedBody | None:
+        """The body as it was fitted last; None where none is."""
+        return None
+
+    def update(self, job: Job) -> Update:
+        """Learn a little; bounded time for a bounded store."""
+        begun, newest = time.perf_counter(), job.observed[-NEWEST:]
+        mae = self._mae.without(job.isolated)
+        estimate = observed_theta(mae, newest)
+        observed = np.isfinite(newest.theta)
+        away = np.where(observed, estimate - newest.theta, 0.0)[observed.any(axis=1)]
+        error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
+        update = self._learn(job)
+        seconds, device = time.perf_counter() - begun, str(torch.get_default_device())
+        return update._replace(error=error, seconds=seconds, device=device)
+
+    @abstractmethod
+    def _learn(self, job: Job) -> Update: ...
+
+    def _published(
+        self, network: Network, preset: str, steps: int, job: Job, fit: Fit | None = None
+    ) -> Mae:
+        """Return the network that runs, with its statistics, and with what it has learned."""
+        origin, samples = self._origin, len(job.observed)
+        history = (
+            f'{origin.training.split(LEARNED)[0]}{LEARNED}'
+            f'{samples} samples at rest, preset {preset}, {steps} steps'
+        )
+        mae = to_mae(network, origin.joints, origin.muscles, origin.preset, history)
+        mae = mae.without(job.isolated)
+        before = self._mae.without(job.isolated)
+        before = before if job.statistics_hold else uncalibrated(before)
+        if self.body is not None:
+            touch = TouchStatistics(self.body.frictions(), np.ones(self._robot.joint_count))
+            mae = replace(mae, touch=touch)
+        mae = recalibrated(mae, before.anomaly, job.healthy, samples)
+        if fit is not None and self.body is not None:
+            tension, judging = job.observed.end_tension(mae.friction), job.healthy.judging
+            covariance = estimate_covariance(mae, self.body, fit, tension, self._seed, judging)
+            mae = replace(mae, covariance=covariance)
+        self._mae = mae
+        return mae

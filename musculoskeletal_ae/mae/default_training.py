@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial training of preset `default` on the geometric model of a robot.
+
+    L = ‖θ − θ_calc‖ + ‖T − T_calc‖ + ‖l − l_calc‖ + ‖G − G_calc‖
+
+Each norm is in units of the spread of the data, so that none of them outweighs the others. The last
+one is of the slope ∂l/∂θ through ①, which control needs; it is taken between each sample and a
+close neighbour, its twin. Every sample is entered by all three masks. Muon steps the matrices, with
+a step size that rises and then falls to zero.
+
+The numbers are those of an arm of 5 joints and 10 muscles. A body of several groups of joints and
+muscles that share nothing gets a block of the network for each. In proportion to the D + M of a
+larger group its layers grow (by the root of it the error of θ does, from 0.0030 to 0.0045 rad a
+joint at 17 × 40), and by its power of 1.5 in the largest group of a body the mini-batches of
+initial training (in proportion, ② is worse at 17 × 40 than at 5 × 10; so it is a tenth better).
+"""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.network import Layers, Network
+from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.training import (
+    TINY,
+    Progress,
+    TrainedNetwork,
+    one_thread,
+    random_states,
+    shuffled,
+)
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
+from musculoskeletal_ae.robot.groups import Group
+from musculoskeletal_ae.robot.robot import Robot
+
+LAYERS = Layers((200, 100), 'silu')
+STEPS, BATCH, SAMPLES = 3000, 128, 200_000
+STEP_SIZE = 0.004  # of the biases; see `optimiser` for that of the matrices
+REFERENCE = 5 + 10  # D + M of the arm that these numbers are for
+
+# Share of samples with tensions beyond what is planned: a payload pulls muscles there, and an
+# estimator that has seen a few such states degrades gently.
+OVERLOAD_SHARE = 0.2
+# Reach of θ beyond each joint limit, as a share of the range: a network is least accurate at the
+# edge of what it saw, and arms do rest at their limits.
+POSTURE_MARGIN = 0.05
+# Between twins, in units of the spread of θ: small against the bends of a route, and large enough
+# that float32 resolves the difference.
+TWIN_DISTANCE = 0.1
+# A joint or muscle that hardly varies is not blown up beyond this, in scaled units.
+LEAST_SPREAD = 1e-4
+RISE = 0.05  # share of the training in which the step size rises
+
+# -- size --------------------------------------------------------------------------------------
+
+
+def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
+    """Return a number of units of a group's layer, or of steps, as it is for given groups."""
+    times = max(1.0, max(sum(map(len, group)) for group in groups) / REFERENCE)
+    return round(number * times**power)
+
+
+def default_steps(groups: Iterable[Group]) -> int:
+    """Return the mini-batches of initial training for given groups."""
+    return grown(STEPS, groups, 1.5)
+
+
+def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
+    """Return the hidden layers of the block of each group."""
+    return {group: tuple(grown(units, [group]) for units in LAYERS.hidden) for group in groups}
+
+
+# -- samples -----------------------------------------------------------------------------------
+
+
+def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
+    """Return random states mostly within tension.limit, some beyond it, up to tension.max."""
+    highest = highest_tensions(robot, count, rng)
+    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+
+
+def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Return tension.limit (count, M) [N], or in some rows more, up to tension.max."""
+    limit, most = robot.tension.limit, robot.tension.max
+    overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
+    return np.where(overloaded, limit + (most - limit) * rng.uniform(size=(count, 1)), limit)
+
+
+def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:
+    """Return samples, scaled (θ, T, l) (N, D+2M), with a neighbour each, (N, 2, D+2M).
+
+    It has the same T, and a θ that is off by TWIN_DISTANCE in units of the spread, std (D+2M,).
+    """
+    joints, muscles = robot.joint_count, robot.muscle_count
+    direction = rng.normal(size=(len(samples), joints))
+    direction *= TWIN_DISTANCE / np.linalg.norm(direction, axis=1, keepdims=True)
+    twin = samples.copy()
+    twin[:, :joints] += direction * std[:joints]
+    theta, tension, _ = np.split(twin / scale_vector(joints, muscles), [joints, -muscles], axis=1)
+    twin[:, -muscles:] = LENGTH_SCALE * robot.muscle_lengths(theta, tension)
+    return np.stack([samples, twin], axis=1)
+
+
+# -- descent -----------------------------------------------------------------------------------
+
+
+def loss(network: Network, samples: Tensor) -> Tensor:
+    """Return L, the mean over scaled (θ, T, l) of samples and their twins, (N, 2, D+2M)."""
+    joints, muscles = network.joints, network.muscles
+    rows, twins = samples[:, 0], samples[:, 1]  # (N, D+2M) each
+    count = len(twins)
+    # The samples by ①, ②, ③, then the twins by ①.
+    mask = torch.arange(3).repeat_interleave(count)
+    mask = torch.cat([mask, mask.new_zeros(count)])
+    values = torch.cat([rows.repeat(3, 1), twins])  # (4N, D+2M)
+    error = network.decoder(network.encode(values, mask))
+    error = error - (values - network.mean) / network.std
+    # The slope of the error between neighbours is the error of the slope.
+    between = (error[-count:] - error[:count])[:, -muscles:] / TWIN_DISTANCE
+    slope = (between.square().sum(dim=1) + TINY).sqrt().mean()
+    parts = error[:-count].square().split([joints, muscles, muscles], dim=1)
+    norms = torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts])  # (3,)
+    return slope + norms @ torch.ones_like(norms)
+
+
+def train(
+    robot: Robot, seed: int = 0, steps: int = STEPS, progress: Progress | None = None
+) -> TrainedNetwork:
+    """Train a new network.
+
+    Args:
+        robot: The geometric model.
+        seed: Draws states, weights and the order of the samples.
+        steps: Mini-batches in all.
+        progress: Called after every mini-batch.
+    """
+    rng = np.random.default_rng(seed)
+    samples = overload_states(robot, min(SAMPLES, steps * BATCH), rng).scaled()
+    mean, std = samples.mean(axis=0), np.maximum(samples.std(axis=0), LEAST_SPREAD)
+    samples = with_twins(robot, samples, std, rng)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        sizes = robot.joint_count, robot.muscle_count
+        network = Network(*sizes, LAYERS, mean, std, blocks(robot.groups))
+    optimiser = Optimiser(network, STEP_SIZE, muon=True)
+    losses = []
+    with one_thread():
+        for step, batch in zip(range(steps), shuffled(samples, BATCH, rng)):
+            value = loss(network, torch.as_tensor(batch, dtype=torch.float32))
+            value.backward()
+            optimiser.step(annealing(step / steps))
+            losses.append(value.item())
+            if progress is not None:
+                progress(step, losses[-1], network, batch)
+    return TrainedNetwork(network, losses, f'{BATCH} by muon')
+
+
+def annealing(progress: float) -> float:
+    """Return the factor of the step size at a share of the training in [0, 1)."""
+    if progress < RISE:
+        return progress / RISE
+    return 0.5 * (1.0 + math.cos(math.pi * (progress - RISE) / (1.0 - RISE)))

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The control methods by muscle lengths (§III-E).
+
+    muscle stiffness control   T_target = T_bias + max(0, K_stiff (l − l_target))            (5)
+                               l_comp(T) = −(T − T_bias)/K_stiff                             (6)
+
+    geometric   l_target = f_geo(θ_target) − L_e(f_geo,abs(θ_target), T_bias)
+    first       l_target = f_dec,l(f_enc,1(θ_target, T_const)) + l_comp(T_const)             (7)
+    second      l_target = f_dec,l(f_enc,1(θ_target, T_current)) + l_comp(T_current)         (8)
+
+    proposed    z = f_enc,1(θ_target, T_current), then descend (`latent_descent`) on
+                L_control = w₁‖T‖₂ + w₂‖θ − θ_target‖₂
+                            + w₃‖τ_target + Gᵀ(θ_target, T_current) T‖₂                      (9)
+                l_target = l_calc + l_comp(T_calc)                                           (12)
+
+(5) runs in the muscle modules. Not printed, and chosen here: T_current is read once, when a method
+starts; τ in (9) is in N·m and T in the network's units; G is a forward difference by Δθ = 0.01 rad.
+
+Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command,
+where T is T_const or T_current.
+"""
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.control.methods import LengthMethod, Solution
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
+from musculoskeletal_ae.paper.constants import (
+    CONTROL_CANDIDATES,
+    CONTROL_EPOCHS,
+    CONTROL_LARGEST_STEP,
+    CONTROL_WEIGHTS,
+    JOINT_STEP,
+)
+from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
+from musculoskeletal_ae.robot.robot import Robot
+
+SEARCH = StepSearch(CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS)
+
+
+def geometric(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
+    """Return the command by the geometric model, without the network."""
+    bias = np.full(robot.muscle_count, robot.tension.bias)
+    return Solution(robot.muscle_lengths(theta, bias), bias, np.zeros(robot.joint_count))
+
+
+def first(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
+    """Return the command (7) for T_const."""
+    length = mae.lengths(theta, tension) + msc_compensation(robot, tension)
+    return Solution(length, tension, np.zeros(robot.joint_count))
+
+
+def second(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
+    """Return the command (8) for T_current; it follows on `first`."""
+    return first(robot, mae, theta, torque, tension)
+
+
+def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
+    """Return the command (12) for T_current.
+
+    It knows no limits of tension, and what it leaves of the torque is not reported as missing.
+    """
+    terms = control_loss(robot, mae, theta, torque, tension)
+    z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
+    calculated = mae.decode(z)
+    length = calculated.length + msc_compensation(robot, calculated.tension)
+    return Solution(length, calculated.tension, np.zeros(robot.joint_count))
+
+
+def control_loss(
+    robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array
+) -> tuple[Term, ...]:
+    """Return the three terms of L_control (9)."""
+    joints, muscles = robot.joint_count, robot.muscle_count
+    jacobian = muscle_jacobian(mae, theta, tension)
+    jacobian[list(robot.isolated)] = 0.0
+    rows = np.eye(joints + 2 * muscles)
+    pull = rows[joints : joints + muscles]
+    tension_weight, posture_weight, torque_weight = CONTROL_WEIGHTS
+    return (
+        Term(tension_weight, pull, np.zeros(muscles)),
+        Term(posture_weight, rows[:joints], theta),
+        Term(torque_weight, jacobian.T @ pull / TENSION_SCALE, -torque),
+    )
+
+
+def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_STEP) -> Array:
+    """Return G(θ, T) [m/rad] (..., M, D): the difference of ① at θ and at θ + Δθ."""
+    joints = theta.shape[-1]
+    offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])
+    postures = theta[..., None, :] + offsets  # (..., D+1, D)
+    shape = (*postures.shape[:-1], tension.shape[-1])
+    lengths = mae.lengths(postures, np.broadcast_to(tension[..., None, :], shape))
+    difference: Array = (lengths[..., 1:, :] - lengths[..., :1, :]) / step
+    return difference.swapaxes(-1, -2)
+
+
+METHODS = {
+    'geometric': LengthMethod(geometric),
+    'first': LengthMethod(first, takes_tension=True),
+    'second': LengthMethod(second, takes_tension=True, follows_first=True),
+    'proposed': LengthMethod(proposed),
+}

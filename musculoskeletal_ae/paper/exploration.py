@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random motion that collects data (§IV-A): three steps, repeated.
+
+1. 5 s: first (7) with a random θ_target and T_const = T_bias,
+2. 2 s: second (8), the same θ_target with the tension of the moment,
+3. 3 s: first (7) again with a random T_const in [T_bias, T_limit].
+
+Not printed, and chosen here: targets are drawn among the postures that the arm can hold with
+tensions in [T_bias, T_limit], and each step ramps the command and then rests, since the body is
+learned at rest (`control/ramps.py`).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import TRIES, Step, holdable_postures
+from musculoskeletal_ae.paper.constants import DURATIONS
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def random_posture(robot: Robot, rng: np.random.Generator) -> Array:
+    """Return a random θ_target within the joint limits [rad], (D,)."""
+    return robot.random_postures(1, rng)[0]
+
+
+def random_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:  # noqa: ARG001
+    """Return a random T_const in [T_bias, T_limit] [N], (M,)."""
+    return rng.uniform(robot.tension.bias, robot.tension.limit, robot.muscle_count)
+
+
+def three_steps(
+    robot: Robot,
+    rng: np.random.Generator,
+    posture: Callable[[Robot, np.random.Generator], Array] = random_posture,
+    constant_tension: Callable[[Robot, Array, np.random.Generator], Array] = random_tension,
+) -> tuple[Step, Step, Step]:
+    """Return the three steps at one random posture.
+
+    Args:
+        robot: The body, whose isolated muscles pull nothing.
+        rng: Draws what is random.
+        posture: Draws θ_target.
+        constant_tension: Draws T_const of the third step.
+
+    Raises:
+        RobotDescriptionError: If the arm can hold too few postures.
+    """
+    bias = np.full(robot.muscle_count, robot.tension.bias)
+    postures = (posture(robot, rng) for _ in range(TRIES))
+    ((theta, holding),) = holdable_postures(robot, postures, 1)
+    constant = constant_tension(robot, theta, rng)
+    return (
+        Step('first', theta, bias, DURATIONS[0]),
+        Step('second', theta, holding, DURATIONS[1]),
+        Step('first', theta, constant, DURATIONS[2]),
+    )

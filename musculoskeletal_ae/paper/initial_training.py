@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial training on the geometric model (§III-B).
+
+    (θ, T, l) = (θ_r, T_r, f_geo(θ_r) − L_e(f_geo,abs(θ_r), T_r))                            (2)
+    L_initial = w_θ ‖θ − θ_calc‖₂ + w_T ‖T − T_calc‖₂ + w_l ‖l − l_calc‖₂                    (3)
+
+Not printed, and chosen here: θ_r is uniform within the joint limits, and T_r of each muscle is
+uniform in [0, T_max].
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.network import Network
+from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.training import TINY, Progress, TrainedNetwork, one_thread, shuffled
+from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.paper.constants import (
+    INITIAL_BATCH,
+    INITIAL_SAMPLES,
+    INITIAL_STEPS,
+    STEP_SIZE,
+    WEIGHTS,
+)
+from musculoskeletal_ae.paper.network import new_network
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def random_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
+    """Return random states of the geometric model (2)."""
+    theta = robot.random_postures(count, rng)
+    tension = rng.uniform(0.0, robot.tension.max, (count, robot.muscle_count))
+    absolute = robot.routes.absolute_lengths(theta)  # f_geo,abs
+    relative = absolute - robot.routes.length_at_zero  # f_geo
+    length = relative - robot.series_elastic.elongation(absolute, tension)
+    return State(theta, tension, length)
+
+
+def loss(network: Network, values: Tensor, mask: Tensor) -> Tensor:
+    """Return L_initial (3), the mean over scaled (θ, T, l).
+
+    Args:
+        network: The network.
+        values: (N, D+2M).
+        mask: Which of ①, ②, ③ each of them enters by, 0 to 2, (N,).
+    """
+    error = network(values, mask) - values
+    parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
+    # TINY keeps the gradient of a norm finite where nothing is wrong.
+    norms = torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts])  # (3,)
+    return norms @ norms.new_tensor(WEIGHTS)
+
+
+def train(
+    robot: Robot, seed: int = 0, steps: int = INITIAL_STEPS, progress: Progress | None = None
+) -> TrainedNetwork:
+    """Train a new network by Adam, entering each sample by ①, ② or ③ at random.
+
+    Args:
+        robot: The geometric model.
+        seed: Draws states, weights, masks and the order of the samples.
+        steps: Mini-batches in all.
+        progress: Called after every mini-batch.
+    """
+    rng = np.random.default_rng(seed)
+    count = min(INITIAL_SAMPLES, steps * INITIAL_BATCH)
+    samples: Array = random_states(robot, count, rng).scaled()
+    network = new_network(robot.joint_count, robot.muscle_count, seed)
+    optimiser = Optimiser(network, STEP_SIZE, muon=False)
+    generator = torch.Generator(torch.get_default_device()).manual_seed(seed)
+    losses = []
+    with one_thread():
+        for step, batch in zip(range(steps), shuffled(samples, INITIAL_BATCH, rng)):
+            values = torch.as_tensor(batch, dtype=torch.float32)
+            mask = torch.randint(3, (len(values),), generator=generator)
+            value = loss(network, values, mask)
+            value.backward()
+            optimiser.step()
+            losses.append(value.item())
+            if progress is not None:
+                progress(step, losses[-1], network, batch)
+    return TrainedNetwork(network, losses, f'{INITIAL_BATCH} by adam')

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network (§III-A).
+
+    z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z)
+    layers (D+2M+3, 200, 30, D+M, 30, 200, D+2M)
+
+    ① f_encode,1(θ, T) = f_encode(θ, T, 0, (1, 1, 0))
+    ② f_encode,2(T, l) = f_encode(0, T, l, (0, 1, 1))
+    ③ f_encode,3(θ, l) = f_encode(θ, 0, l, (1, 0, 1))
+
+θ, T and l enter in [rad], [N/200] and [mm/100] (`mae/units.py`), without any other scaling. The
+latent layer and the output are linear.
+"""
+
+import numpy as np
+import torch
+
+from musculoskeletal_ae.mae.network import Layers, Network
+from musculoskeletal_ae.paper.constants import ACTIVATION, HIDDEN
+
+LAYERS = Layers(HIDDEN, ACTIVATION)
+
+
+def new_network(joints: int, muscles: int, seed: int = 0) -> Network:
+    """Return a network of D joints and M muscles with random weights."""
+    values = joints + 2 * muscles
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Network(joints, muscles, LAYERS, np.zeros(values), np.ones(values))

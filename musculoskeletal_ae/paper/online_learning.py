@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Online learning (§III-C).
+
+    batch = {newest, (0, 0, 0), C_data random stored ones} × {①, ②, ③},   3 (C_data + 2) entries
+
+The network is updated as soon as more than C_thre samples are stored. A sample is stored where θ
+or T deviates from all stored ones by a threshold while the robot is at rest; both presets share
+that rule (`learning/samples.py`, `learning/rest.py`).
+
+"The number of batches C_batch = 10" can be read as ten such batches, each with its own random
+samples, gone through ten times: 100 steps of 36 entries. Or as mini-batches of ten within one batch
+of 36: 4 × 10 steps. The first is chosen: the text calls the 36 entries "a batch", so their number
+counts such batches; and with the second an update would see only ten stored samples.
+
+Not printed, and chosen here: the loss is L_initial (3) with its weights, the optimiser is Adam with
+the step size of initial training, and its moments are kept from update to update.
+"""
+
+import numpy as np
+import torch
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.learning.trainer import Job, Update
+from musculoskeletal_ae.learning.updater import Updater
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.network import from_mae
+from musculoskeletal_ae.mae.optimiser import Optimiser
+from musculoskeletal_ae.mae.training import one_thread
+from musculoskeletal_ae.paper.constants import (
+    DATA,
+    ONLINE_BATCHES,
+    ONLINE_EPOCHS,
+    STEP_SIZE,
+    THRESHOLD,
+)
+from musculoskeletal_ae.paper.initial_training import loss
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def draw_batch(values: Array, rng: np.random.Generator) -> Array:
+    """Return the rows of a batch, which each of ①, ②, ③ enters once, (3 (C_data + 2), D+2M).
+
+    Args:
+        values: Stored samples, scaled (θ, T, l), the newest last, (N, D+2M).
+        rng: Draws C_data of them.
+    """
+    stored = rng.choice(len(values) - 1, DATA, replace=False)
+    nothing = np.zeros(values.shape[1])
+    return np.tile(np.vstack([values[-1], nothing, values[stored]]), (3, 1))
+
+
+class OnlineLearning(Updater):
+    """Updates the whole network after every new sample."""
+
+    def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
+        super().__init__(robot, mae, seed)
+        self._network = from_mae(mae)
+        self._optimiser = Optimiser(self._network, STEP_SIZE, muon=False)
+        self._rng = np.random.default_rng([seed, 0x9A])
+        self._steps = 0
+
+    def _learn(self, job: Job) -> Update:
+        # The print knows no changed muscle: a sample that says nothing about one is none.
+        observed = job.observed.with_all_angles()
+        values = observed[np.flatnonzero(observed.known.all(axis=1))].state().scaled()
+        count = ONLINE_BATCHES if len(values) > THRESHOLD else 0
+        batches = [
+            torch.as_tensor(draw_batch(values, self._rng), dtype=torch.float32)
+            for _ in range(count)
+        ]
+        mask = torch.arange(3).repeat_interleave(DATA + 2)
+        losses = []
+        with one_thread():
+            for batch in ONLINE_EPOCHS * batches:
+                value = loss(self._network, batch, mask)
+                value.backward()
+                self._optimiser.step()
+                losses.append(value.item())
+        self._steps += len(losses)
+        last = float(np.mean(losses[-ONLINE_BATCHES:])) if losses else np.nan
+        return Update(self._published(self._network, 'paper', self._steps, job), last)

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""State estimation and anomaly detection (§III-D).
+
+    (θ_est, T_est, l_est) = f_decode(f_encode,2(T, l))
+    A = ‖T_est − T‖₂ + ‖l_est − l‖₂                                                          (4)
+
+The estimate is the same in both presets (`estimation/state_estimator.py`). Not printed, and chosen
+here: A is in scaled units, its threshold is that of the checkpoint, and a finding takes five
+messages running.
+"""
+
+import math
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.detectors.residual_distance import NORM, ResidualDistance
+from musculoskeletal_ae.estimation.finding import Observation
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import Mask, State
+
+
+def estimate(mae: Mae, tension: Array, length: Array) -> State:
+    """Return (θ_est, T_est, l_est) from T [N] and l [m], (..., M)."""
+    return mae.decode(mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
+
+
+class AnomalyNorm(ResidualDistance):
+    """Decides by A alone."""
+
+    symbol, threshold_name = 'A', NORM
+
+    def statistic(self, observation: Observation, distance: float) -> float:  # noqa: ARG002
+        """Return A (4)."""
+        count = len(observation.sample.length)
+        tension, length = (
+            observation.estimate.residual[:count],
+            observation.estimate.residual[count:],
+        )
+        return math.sqrt(tension @ tension) + math.sqrt(length @ length)
+
+    def limit(self, theta: Array, tension: Array) -> float:  # noqa: ARG002
+        """Return the threshold of A, the same everywhere; ∞ without one."""
+        return self.threshold

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Preset `default`: the best that this project can measure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from musculoskeletal_ae.control.exploration import Step
+    from musculoskeletal_ae.control.methods import LengthMethod
+    from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
+    from musculoskeletal_ae.estimation.finding import Detector
+    from musculoskeletal_ae.estimation.settings import Detection
+    from musculoskeletal_ae.learning.updater import Updater
+    from musculoskeletal_ae.mae.mae import Mae
+    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.units import State
+    from musculoskeletal_ae.robot.groups import Group
+    from musculoskeletal_ae.robot.robot import Robot
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+
+
+class DefaultPreset:
+    """See `Preset` for what each part means."""
+
+    name = 'default'
+    least_samples = 2
+    validates_updates = True
+    simulates_on_devices = True
+
+    def initial_steps(self, groups: Iterable[Group]) -> int:
+        """Return more for a larger body."""
+        from musculoskeletal_ae.mae.default_training import default_steps
+
+        return default_steps(groups)
+
+    def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
+        """Return states some of which are beyond the tension limit."""
+        from musculoskeletal_ae.mae.default_training import overload_states
+
+        return overload_states(robot, count, rng)
+
+    def train_initial(
+        self, robot: Robot, seed: int, steps: int, progress: Progress | None
+    ) -> TrainedNetwork:
+        """Train on lengths and slopes, by all masks, with Muon."""
+        from musculoskeletal_ae.mae.default_training import train
+
+        return train(robot, seed, steps, progress)
+
+    def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
+        """Learn by fitting the calibrated body model."""
+        from musculoskeletal_ae.learning.update import BodyUpdater
+
+        return BodyUpdater(robot, mae, seed)
+
+    def residual_detectors(
+        self, robot: Robot, settings: Detection
+    ) -> tuple[ResidualDistance, list[Detector]]:
+        """Decide by d, and by the physics of tendons and modules."""
+        from musculoskeletal_ae.estimation.detectors.jammed_module import JammedModule
+        from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
+        from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
+
+        slack = SlackTendon(robot, settings)
+        return ResidualDistance(robot, settings, slack), [slack, JammedModule(robot)]
+
+    def length_methods(self) -> Mapping[str, LengthMethod]:
+        """Return those that are not solved as a trajectory: the paper's, but `proposed`."""
+        from musculoskeletal_ae.paper.control import METHODS
+
+        return {name: method for name, method in METHODS.items() if name != 'proposed'}
+
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
+        """Take the paper's three steps, with some joints at their limits."""
+        from musculoskeletal_ae.control.exploration import posture_at_limits, pressing_tension
+        from musculoskeletal_ae.paper.exploration import three_steps
+
+        return partial(three_steps, posture=posture_at_limits, constant_tension=pressing_tension)
+
+    def make_simulator(self, robot: Robot) -> SimulatedBody:
+        """Solve the balance of torques."""
+        from musculoskeletal_ae.simulation.equilibrium import QuasiStatics
+
+        return QuasiStatics(robot)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Preset `paper`: what the paper prints, of the folder `paper/`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from musculoskeletal_ae.paper.constants import INITIAL_STEPS, THRESHOLD
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from musculoskeletal_ae.control.exploration import Step
+    from musculoskeletal_ae.control.methods import LengthMethod
+    from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
+    from musculoskeletal_ae.estimation.finding import Detector
+    from musculoskeletal_ae.estimation.settings import Detection
+    from musculoskeletal_ae.learning.updater import Updater
+    from musculoskeletal_ae.mae.mae import Mae
+    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.units import State
+    from musculoskeletal_ae.robot.groups import Group
+    from musculoskeletal_ae.robot.robot import Robot
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+
+
+class PaperPreset:
+    """See `Preset` for what each part means."""
+
+    name = 'paper'
+    least_samples = THRESHOLD + 1
+    validates_updates = False
+    simulates_on_devices = False
+
+    def initial_steps(self, groups: Iterable[Group]) -> int:  # noqa: ARG002
+        """Return the same for any body (§III-B)."""
+        return INITIAL_STEPS
+
+    def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
+        """Return states up to the greatest tension (§III-B)."""
+        from musculoskeletal_ae.paper.initial_training import random_states
+
+        return random_states(robot, count, rng)
+
+    def train_initial(
+        self, robot: Robot, seed: int, steps: int, progress: Progress | None
+    ) -> TrainedNetwork:
+        """Train on L_initial with Adam (§III-B)."""
+        from musculoskeletal_ae.paper.initial_training import train
+
+        return train(robot, seed, steps, progress)
+
+    def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
+        """Learn on the samples alone (§III-C)."""
+        from musculoskeletal_ae.paper.online_learning import OnlineLearning
+
+        return OnlineLearning(robot, mae, seed)
+
+    def residual_detectors(
+        self, robot: Robot, settings: Detection
+    ) -> tuple[ResidualDistance, list[Detector]]:
+        """Decide by A alone (§III-D)."""
+        from musculoskeletal_ae.paper.state_estimation import AnomalyNorm
+
+        return AnomalyNorm(robot, settings), []
+
+    def length_methods(self) -> Mapping[str, LengthMethod]:
+        """Return all four (§III-E)."""
+        from musculoskeletal_ae.paper.control import METHODS
+
+        return METHODS
+
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
+        """Take the three steps (§IV-A)."""
+        from musculoskeletal_ae.paper.exploration import three_steps
+
+        return three_steps
+
+    def make_simulator(self, robot: Robot) -> SimulatedBody:
+        """Descend in the latent space (§III-F)."""
+        from musculoskeletal_ae.paper.simulation import LatentSimulation
+
+        return LatentSimulation(robot)
