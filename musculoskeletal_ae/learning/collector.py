@@ -12,6 +12,7 @@ version of the body state and the isolated muscles under which it was taken.
 import math
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -112,6 +113,19 @@ class SampleCollector:
         measured[first : first + len(values)] = values
         self._pairing.joints(time, measured)
 
+    def take(self, time: float, message: Any) -> Paired[MuscleSample] | None:
+        """Take a message of muscle_states that came at `time` [s].
+
+        Returns the message before, with the θ that belongs to it, or None. A RejectionError says
+        why a message cannot be used; it is counted in `rejected`.
+        """
+        try:
+            sample = self._stream.take(message, time)
+        except RejectionError as error:
+            self._note_rejected(error)
+            raise
+        return self._paired(time, sample)
+
     def muscles(self, time: float, states: Array) -> Paired[MuscleSample] | None:
         """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s].
 
@@ -121,9 +135,15 @@ class SampleCollector:
         try:
             sample = self._stream.take_states(states, time)
         except RejectionError as error:
-            self.rejected[error.reason] += 1
-            self.obstacle = f'muscle_states are rejected: {error}'
+            self._note_rejected(error)
             return None
+        return self._paired(time, sample)
+
+    def _note_rejected(self, error: RejectionError) -> None:
+        self.rejected[error.reason] += 1
+        self.obstacle = f'muscle_states are rejected: {error}'
+
+    def _paired(self, time: float, sample: MuscleSample) -> Paired[MuscleSample] | None:
         if self.body.isolated:
             used = sample.usable
             sample = replace(

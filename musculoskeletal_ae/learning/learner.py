@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.pairing import Paired
 
 
 class Learner:
@@ -125,9 +128,18 @@ class Learner:
         """Take what an accelerometer read in the axes of a link at `time` [s], [m/s²] (3,)."""
         self.collector.imu(time, link, acceleration)
 
+    def take(self, message: Any, time: float) -> None:
+        """Take a message of muscle_states that came at `time` [s].
+
+        A RejectionError says why it cannot be used.
+        """
+        self._learn_from(self.collector.take(time, message))
+
     def muscles(self, states: Array, time: float) -> None:
         """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s]."""
-        paired = self.collector.muscles(time, states)
+        self._learn_from(self.collector.muscles(time, states))
+
+    def _learn_from(self, paired: Paired[MuscleSample] | None) -> None:
         if paired is None or not (self.enabled and self.body.offsets.known):
             return
         self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly)

@@ -71,7 +71,7 @@ class Controller(Shell):
             self.core.use, lambda reason: self.core.stop(StopCause.UNFIT_CHECKPOINT, reason)
         )
         self.needed += ['muscle_states', 'estimated_joint_states']
-        self.follow_zeros(self._use_offsets)
+        self.follow_offsets(self._use_body)
         self.sources.watch(*AUTHORS)
         self.follow_muscle_messages(self._muscles)
         self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
@@ -89,7 +89,7 @@ class Controller(Shell):
                 self, kind, self.core, self._trajectory, refuse
             )
         self.follow_anomaly(self._anomaly)
-        self.follow_isolated(self._isolate)
+        self.follow_isolated(self._use_body)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
@@ -124,11 +124,8 @@ class Controller(Shell):
             raise MusculoskeletalError(f'{told}; or let it follow muscle_tension_command, too')
         return value
 
-    def _use_offsets(self) -> None:
-        self.core.use_body(self.core.stream.body.with_offsets(self.zeros))
-
-    def _isolate(self, muscles: tuple[int, ...]) -> None:
-        self.core.use_body(self.core.stream.body.with_isolated(muscles))
+    def _use_body(self) -> None:
+        self.core.use_body(self.body)
 
     def _muscles(self, message: Float64MultiArray) -> None:
         self.core.take(message, time.monotonic())
@@ -223,7 +220,8 @@ class Controller(Shell):
     def _step(self) -> None:
         command = self.core.step(time.monotonic(), self.now())
         if command is not None:
-            value = command.value + self.zeros.offset if command.kind == LENGTH else command.value
+            value, offset = command.value, self.body.offsets.offset
+            value = value + offset if command.kind == LENGTH else value
             message = serialize_message(array_message(value, 'muscle'))
             self.publishers_of[command.kind].publish(message)
             self.core.sent_at = time.monotonic()

@@ -255,12 +255,13 @@ class Estimator(Shell):
         isolated = self.core.body.isolated
         if isolated != self.published_isolated:
             self.published_isolated = self.candidates.validator.isolated = isolated
+            self.body = self.core.body
             self.isolated.publish(String(data=self.robot.names(isolated)))
 
     def _publish_offsets(self) -> None:
         offsets = self.core.body.offsets
         if offsets is not self.published_offsets:
-            self.published_offsets = self.zeros = offsets
+            self.published_offsets, self.body = offsets, self.core.body
             self.candidates.validator.forget()
             rows = np.stack([offsets.offset, offsets.deviation])
             self.offsets.publish(array_message(rows, 'quantity', 'muscle'))

@@ -27,7 +27,7 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.kinematics import body_frames
-from musculoskeletal_ae.validity import read_imu, read_muscle_states
+from musculoskeletal_ae.validity import read_imu
 
 POLL = 0.05  # [s] between looks at the training process
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
@@ -69,7 +69,7 @@ class Learner(Shell):
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.listen(Imu, 'imu', self._take_imu, SENSOR)
-        self.follow_zeros(self._use_offsets)
+        self.follow_offsets(self._use_offsets)
         self.follow_muscle_messages(self._take_muscle_states)
         self.follow_anomaly(core.anomaly)
         self.has_heard_isolated = False
@@ -115,17 +115,16 @@ class Learner(Shell):
         self.core.imu(self.now(), *read_imu(message, self.links, prefix))
 
     def _take_muscle_states(self, message: Float64MultiArray) -> None:
-        states = read_muscle_states(message, self.robot.muscle_count, self.left_out)
-        self.core.muscles(states, self.now())
+        self.core.take(message, self.now())
 
     def _use_offsets(self) -> None:
-        body = self.core.body
-        self.core.use_body(body.with_offsets(self.zeros))
+        self.core.use_body(self.core.body.with_offsets(self.body.offsets))
 
-    def _isolate(self, muscles: tuple[int, ...]) -> None:
+    def _isolate(self) -> None:
         # An estimator that has just started knows of none before it has our network.
         number = self._reception.numbers['isolated_muscles']
         knows = number > 1 or (number == 0 and self.has_heard_isolated)
+        muscles = self.body.isolated
         if muscles or knows or not self.core.isolated:
             self.core.isolate(muscles)
         self.has_heard_isolated = True

@@ -51,7 +51,7 @@ from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.validity import (
     joints_not_finite,
     read_array,
@@ -107,9 +107,8 @@ class Shell(Node):
         self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}  # how to subscribe anew
         self.sources = Sources(self, self._reception.turns, self._subscribe_anew)
         self.rejected = self._reception.rejected  # messages, by topic and reason
-        #: by which readings of l are too long
-        self.zeros = LengthOffsets.none(self.robot.muscle_count)
-        self.left_out: tuple[int, ...] = ()  # isolated muscles, of which nothing counts
+        #: as the estimator publishes it
+        self.body = BodyState.healthy(self.robot.muscle_count)
         self.add_on_set_parameters_callback(self._set_parameters)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
@@ -439,8 +438,8 @@ class Shell(Node):
         """Give `follow` the messages of muscle_states as they are."""
         self.listen(Float64MultiArray, 'muscle_states', follow, SENSOR)
 
-    def follow_zeros(self, changed: Callable[[], object]) -> None:
-        """Keep the estimator's length offsets in `zeros`, and call `changed` when they are others.
+    def follow_offsets(self, changed: Callable[[], object]) -> None:
+        """Keep the estimator's length offsets in `body`, and call `changed` when they are others.
 
         Known offsets that differ from the known ones before come from an estimator that was
         started again and has not heard of those. They count as unknown until it has found them.
@@ -457,17 +456,18 @@ class Shell(Node):
                 if (zeros.offset == before.offset).all():
                     return
                 zeros = replace(LengthOffsets.unknown(len(zeros.offset)), offset=zeros.offset)
-            self.zeros = zeros
+            self.body = self.body.with_offsets(zeros)
             changed()
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 
-    def follow_isolated(self, isolate: Callable[[tuple[int, ...]], object]) -> None:
-        """Tell which muscles the estimator has isolated, places in T and l, when that changes."""
+    def follow_isolated(self, changed: Callable[[], object]) -> None:
+        """Keep in `body` which muscles the estimator has isolated, and call `changed` then."""
 
         def take(message: String) -> None:
-            self.left_out = tuple(sorted({*self.robot.muscle_indices(read_names(message))}))
-            isolate(self.left_out)
+            muscles = self.robot.muscle_indices(read_names(message))
+            self.body = self.body.with_isolated(muscles)
+            changed()
 
         self.listen(String, 'isolated_muscles', take, LATCHED)
 

@@ -44,7 +44,7 @@ class Sim(Arm):
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
         if not self.as_robot:  # which is the modules themselves
-            self.follow_zeros(lambda: None)  # `_command` reads `zeros`
+            self.follow_offsets(lambda: None)  # `_command` reads them
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
@@ -54,18 +54,18 @@ class Sim(Arm):
         if self.arm is None:
             arm = Simulation(self.robot, mae, self.parameter('preset'))
             if not self.as_robot:
-                arm.isolate(self.left_out)
+                arm.isolate(self.body.isolated)
             arm.settle()
             self.arm = arm
         else:
             self.arm.use(mae)
 
-    def _isolate(self, muscles: tuple[int, ...]) -> None:
+    def _isolate(self) -> None:
         if self.arm is not None and not self.as_robot:  # whose modules pull whatever is suspected
-            self.arm.isolate(muscles)
+            self.arm.isolate(self.body.isolated)
 
     def _command(self, length: Array) -> None:
-        self.command = length - self.zeros.offset
+        self.command = length - self.body.offsets.offset
 
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)

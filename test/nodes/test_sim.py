@@ -193,7 +193,7 @@ def test_the_simulator_as_robot_keeps_tension_in_isolated_muscles(graph, arm26, 
     graph.listen(Float64MultiArray, 'muscle_states')
     shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True, rate=2.0)
     graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=arm26.muscles[1]))
-    graph.wait(lambda: shell.left_out == (1,), 'the isolation')
+    graph.wait(lambda: shell.body.isolated == (1,), 'the isolation')
     graph.next('muscle_states', 2)
     _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)

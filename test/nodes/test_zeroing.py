@@ -33,12 +33,15 @@ def test_length_offsets_are_found_and_reach_every_node(
     if not stands:
         assert graph.call(SetBool, 'controller/explore', SetBool.Request(data=True)).success
     nodes = [node, controller, learner]
-    graph.wait(lambda: all(n.zeros.known and n.zeros.offset.any() for n in nodes), 'the zeros')
+    graph.wait(
+        lambda: all(n.body.offsets.known and n.body.offsets.offset.any() for n in nodes),
+        'the zeros',
+    )
     offset = hardware.arm.faults.zero
     assert np.abs(offset).min() > 0.05
     for other in nodes:
         # The network knows the geometric model alone.
-        np.testing.assert_allclose(other.zeros.offset, offset, atol=0.03)
+        np.testing.assert_allclose(other.body.offsets.offset, offset, atol=0.03)
         assert not any('length' in reason for reason in other.rejected)
     assert controller.core.stream.body.offsets.known and controller.core.supervisor.is_running
     assert not node.core.cause
@@ -56,19 +59,23 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
 
     def known(expected):
         graph.wait(
-            lambda: controller.zeros.known == controller.core.stream.body.offsets.known == expected,
+            lambda: (
+                controller.body.offsets.known
+                == controller.core.stream.body.offsets.known
+                == expected
+            ),
             'the zeros',
         )
 
     reported(0.05, 0.0)
-    graph.wait(lambda: controller.zeros.offset.all(), 'the zeros')
+    graph.wait(lambda: controller.body.offsets.offset.all(), 'the zeros')
     reported(0.0, 0.0)  # as a new one says
     known(False)
     reported(0.0, 0.0)
     graph.spin(0.3)
     known(False)
     reported(0.01, 1.0)
-    graph.wait(lambda: controller.zeros.offset.all(), 'a guess')
+    graph.wait(lambda: controller.body.offsets.offset.all(), 'a guess')
     reported(0.05, 0.001)
     known(True)
 
@@ -77,5 +84,5 @@ def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, train
     common = {'robot': 'arm26', 'checkpoint': trained_file}
     controller = graph.host(Controller, **common)
     estimator = graph.host(Estimator, **common, zero_at_start=True)
-    graph.wait(lambda: not controller.zeros.known, 'the controller to know of it')
+    graph.wait(lambda: not controller.body.offsets.known, 'the controller to know of it')
     assert not estimator.core.body.offsets.known
