@@ -143,7 +143,7 @@ class EmulatedArm(modules.Arm):
         """Build an individual of a robot at rest, modules safe; `seed` is of its noise, too."""
         self.individual = individual or Individual(robot, seed)
         super().__init__(robot, seed, self.individual.length_bias)
-        self._order = robot.kinematics.order
+        self._order = robot.kinematics.tree.order
         self._model = pin.Model(robot.kinematics.model)
         self._gear = modules.joint_gear(robot.kinematics)[1:]
         self._model.armature = ARMATURE * self._gear
@@ -194,7 +194,7 @@ class EmulatedArm(modules.Arm):
     def _stand(self, theta: Array) -> None:
         for state in (self._joint.velocity, self._joint.sticking, self._joint.torque):
             state[:] = 0.0
-        self._joint.q[:] = self.robot.kinematics.tree_angles(theta)
+        self._joint.q[:] = self.robot.kinematics.tree.angles(theta)
 
     def set_payload(self, mass: float) -> None:
         """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
@@ -204,7 +204,7 @@ class EmulatedArm(modules.Arm):
 
     def _step(self) -> None:
         model, data, joint = self._model, self._data, self._joint
-        gear = self.robot.kinematics.transmission
+        gear = self.robot.kinematics.tree.transmission
         if gear is None:
             acceleration = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
         else:  # of coupled joints, q̈ = A (Aᵀ M A)⁻¹ Aᵀ (τ − h); M holds the armature already

@@ -56,7 +56,7 @@ class ForeignBody:
 
     def look(self, data: Any, theta: Array) -> Any:
         """Return some MjData with bones at θ [rad] (D,), lengths and moment arms."""
-        data.qpos[self.tree] = self._robot.kinematics.tree_angles(theta)
+        data.qpos[self.tree] = self._robot.kinematics.tree.angles(theta)
         mujoco.mj_fwdPosition(self._model, data)
         return data
 
@@ -71,7 +71,7 @@ class ForeignBody:
         rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
         for dense, angles in zip(jacobian, theta, strict=True):
             mujoco.mju_sparse2dense(dense, self.look(self._data, angles).ten_J, *rows)
-        return self._robot.kinematics.of_theta(jacobian[:, self.tendons][:, :, self.tree])
+        return self._robot.kinematics.tree.of_theta(jacobian[:, self.tendons][:, :, self.tree])
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l [m] without friction, loops, give and sensor errors, θ (N, D), T (N, M)."""

@@ -52,8 +52,13 @@ class Individual:
         muscles, kin, nominal = robot.muscle_count, robot.kinematics, robot.routes
         self._kinematics, self._muscles = kin, muscles
         # In one order of memory: code is compiled for each.
-        placements = np.ascontiguousarray(kin.placement_rotation), kin.placement_translation
-        tree = Tree(kin.parent.astype(np.int64), *placements, kin.local_axis, kin.prismatic)
+        placements = (
+            np.ascontiguousarray(kin.tree.placement_rotation),
+            kin.tree.placement_translation,
+        )
+        tree = Tree(
+            kin.tree.parent.astype(np.int64), *placements, kin.tree.local_axis, kin.tree.prismatic
+        )
         off = rng.normal(0.0, spread.attachment, nominal.point.shape)
         thickness = rng.uniform(0.8, 1.2, len(nominal.first))
 
@@ -105,7 +110,7 @@ class Individual:
             self.routes = routes(off)
 
     def _evaluate(self, theta: Array) -> tuple[Array, Array]:
-        q = np.ascontiguousarray(self._kinematics.tree_angles(theta))
+        q = np.ascontiguousarray(self._kinematics.tree.angles(theta))
         return wrapped_lengths(self.routes, q, Placed.empty(self.routes, self._muscles))
 
     def absolute_lengths(self, theta: Array) -> Array:
@@ -114,7 +119,7 @@ class Individual:
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return the true G [m/rad], θ (N, D) gives (N, M, D)."""
-        return self._kinematics.of_theta(self._evaluate(theta)[1])
+        return self._kinematics.tree.of_theta(self._evaluate(theta)[1])
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return the true l [m] without friction and sensor error, θ (N, D), T (N, M)."""
@@ -142,7 +147,7 @@ def _objects(
             whole[routes.wrapping] = part
     if quantile <= 0.0:
         return objects
-    poses = kin.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
+    poses = kin.tree.joint_poses(robot.random_postures(300, np.random.default_rng(0)))
     points, true = routes.placed(poses), routes.placed(poses, point)
     described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
     for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
@@ -156,9 +161,11 @@ def _objects(
             objects.radius[s] *= scale
             objects.side[s] *= scale  # a ring stays one
             continue
-        between = kin.hangs_on[routes.joint[ends[0]]] ^ kin.hangs_on[routes.joint[ends[1]]]
+        between = (
+            kin.tree.hangs_on[routes.joint[ends[0]]] ^ kin.tree.hangs_on[routes.joint[ends[1]]]
+        )
         best = np.inf
-        for joint in np.flatnonzero(between & ~kin.prismatic):
+        for joint in np.flatnonzero(between & ~kin.tree.prismatic):
             start, end = (points[:, e] - poses.translation[:, joint] for e in ends)
             line = end - start
             share = -np.sum(start * line, axis=1) / np.sum(line * line, axis=1)

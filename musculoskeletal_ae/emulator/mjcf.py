@@ -22,7 +22,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints
 from musculoskeletal_ae.importing.source import names_of_all, safe_name
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
+from musculoskeletal_ae.robot.joint_tree import JointPoses
+from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
@@ -69,9 +70,9 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
         body.ipos = inertia.lever + CENTRE_SPREAD * off[i, 2]
         about = scale * inertia.inertia + 1e-9 * np.eye(3)
         body.fullinertia = [*np.diag(about), about[0, 1], about[0, 2], about[1, 2]]
-        axis = pin.exp3(TURN_SPREAD * off[i, 3]) @ kin.local_axis[i]
+        axis = pin.exp3(TURN_SPREAD * off[i, 3]) @ kin.tree.local_axis[i]
         kinds = mujoco.mjtJoint
-        kind = kinds.mjJNT_SLIDE if kin.prismatic[i] else kinds.mjJNT_HINGE
+        kind = kinds.mjJNT_SLIDE if kin.tree.prismatic[i] else kinds.mjJNT_HINGE
         module = {'armature': gear[i] * ARMATURE, 'damping': gear[i] * DAMPING}
         joint = body.add_joint(name=name, type=kind, axis=axis, **module)
         if name in robot.joints:
@@ -93,7 +94,7 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
 def _add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
     """Add the wires: route points that are off, what is described to wrap round, and heads."""
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
-    poses = kin.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
+    poses = kin.tree.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
     bellies = _bellies(robot)
     for muscle, route, times in zip(robot.muscles, robot.description.routes, again):
         tendon, before = spec.add_tendon(name=muscle), list[Place]()
@@ -134,7 +135,7 @@ def _add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[A
 def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
     """Return the middle of each run of each muscle and how it lies, where joints are mid-range."""
     kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
-    poses = kin.joint_poses(0.5 * (robot.lower + robot.upper)[None])
+    poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
     for muscle, route in zip(robot.muscles, robot.description.routes):
         placed = [kin.attach(item.link, item.xyz) for item in route]
@@ -159,9 +160,9 @@ def _obstacle(
     way longer by `kink` [m] in one of the postures, or by most. A wire may slip over it to its
     other side.
     """
-    between = kin.hangs_on[ends[0][0]] ^ kin.hangs_on[ends[1][0]]
-    joints = np.flatnonzero(between & ~kin.prismatic)
-    heads = [(int(joint), np.zeros(3), kin.local_axis[joint]) for joint in joints]
+    between = kin.tree.hangs_on[ends[0][0]] ^ kin.tree.hangs_on[ends[1][0]]
+    joints = np.flatnonzero(between & ~kin.tree.prismatic)
+    heads = [(int(joint), np.zeros(3), kin.tree.local_axis[joint]) for joint in joints]
     best, most = (0, np.zeros(3), np.zeros(3), 0.0), 0.0
     for carrier, middle, axis in [*heads, *others] if heads else ():
         turn, origin = poses.rotation[:, carrier], poses.translation[:, carrier]
@@ -247,7 +248,7 @@ def from_file(robot: Robot, file: Path) -> Any:
             told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
             raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
     given_kinds = {joint.name: joint.type for joint in spec.joints}
-    for name, slides in zip(followers, robot.kinematics.prismatic[1:], strict=True):
+    for name, slides in zip(followers, robot.kinematics.tree.prismatic[1:], strict=True):
         due, given = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE, given_kinds[name]
         if given != due:
             what, legal = (each.name.removeprefix('mjJNT_').lower() for each in (given, due))

@@ -54,7 +54,7 @@ def joint_gear(kinematics: Kinematics) -> Array:
 
     It is 1 where they turn a joint, and that of the pinion [1/m²] where they slide it.
     """
-    gear: Array = np.where(kinematics.prismatic, RACK**-2, 1.0)
+    gear: Array = np.where(kinematics.tree.prismatic, RACK**-2, 1.0)
     return gear
 
 

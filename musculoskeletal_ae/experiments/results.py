@@ -269,7 +269,9 @@ def readme_table(results: Results) -> str:
     for name in filter(ROWS.get, results):
         text += f'\n| **`experiment {name}`** | | | | | |'
         for each in table({name: results[name]}):
-            text += f'\n| {each.quantity} | {each.printed} | {each.as_printed} | **{each.default}** | '
+            text += (
+                f'\n| {each.quantity} | {each.printed} | {each.as_printed} | **{each.default}** | '
+            )
             text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
     return ''.join([text, *(f'\n\nFailed: {line}' for line in failures(results)), '\n\n'])
 

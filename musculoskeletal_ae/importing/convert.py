@@ -15,7 +15,7 @@ from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_ske
 from musculoskeletal_ae.importing.mjcf import read_mjcf
 from musculoskeletal_ae.importing.source import POSTURES, Source, compare, cut, refuse, write
 from musculoskeletal_ae.robot.checks import RobotCheck, check_robot
-from musculoskeletal_ae.robot.kinematics import resolved
+from musculoskeletal_ae.robot.joint_tree import resolved
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 

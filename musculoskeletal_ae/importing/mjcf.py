@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.importing.source import Source, distinct, names_of_all, refuse, safe_name
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
-from musculoskeletal_ae.robot.kinematics import resolved
+from musculoskeletal_ae.robot.joint_tree import resolved
 
 #: where a model says how many it has of each kind that has names here
 COUNTS = {

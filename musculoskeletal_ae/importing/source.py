@@ -16,14 +16,8 @@ import yaml
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.robot.description import Route, RoutePoint, written
-from musculoskeletal_ae.robot.kinematics import (
-    PRISMATIC,
-    REVOLUTE,
-    Coupling,
-    joint_axis,
-    link_placement,
-    reduced,
-)
+from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, joint_axis
+from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
@@ -363,5 +357,5 @@ def compare(source: Source, robot: Robot) -> dict[str, float] | None:
         return None
     theta, kin = robot.random_postures(POSTURES, np.random.default_rng(0)), robot.kinematics
     ours = dict(zip(robot.muscles, robot.routes.absolute_lengths(theta).T))
-    theirs = source.lengths(dict(zip(kin.model.names[1:], kin.tree_angles(theta).T)))
+    theirs = source.lengths(dict(zip(kin.model.names[1:], kin.tree.angles(theta).T)))
     return {name: float(np.abs(ours[name] - theirs[name]).max()) for name in ours if name in theirs}

@@ -167,7 +167,7 @@ class CalibratedBody:
     def poses(self, theta: Array) -> Poses:
         """Return the joint poses of θ (N, D) and, in the last place, of θ = 0."""
         theta, robot = np.vstack([theta, np.zeros(theta.shape[1])]), self.robot
-        at = robot.kinematics.joint_poses(theta)
+        at = robot.kinematics.tree.joint_poses(theta)
         return Poses(at.rotation, at.translation, robot.routes.detours(theta))
 
     def _world(self, poses: Poses, m: int) -> tuple[Array, Array]:

@@ -78,7 +78,9 @@ class SampleCollector:
         self._margin = AnomalyMargin()
         self._spread = SPREAD * radian if joint_source == MARKER else NOTHING
         # θ and the directions of gravity (see `Sample`) are paired as one array.
-        self._unmeasured = np.full(robot.joint_count + 3 * len(robot.kinematics.parent), np.nan)
+        self._unmeasured = np.full(
+            robot.joint_count + 3 * len(robot.kinematics.tree.parent), np.nan
+        )
         self._longest_pause = max(LIMITS.pause, settings.rest_time)
         self._skipped = 0.0  # time of the messages that were not used since the last [s]
 

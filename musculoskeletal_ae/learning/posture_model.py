@@ -156,7 +156,7 @@ class PostureModel:
         gravity = self._kinematics.model.gravity.linear
         turned = theta + DIFFERENCE * np.eye(theta.shape[1])[self.joints, None]
         flat = np.concatenate([theta[None], turned]).reshape(-1, theta.shape[1])
-        rotation = self._kinematics.joint_poses(flat).rotation
+        rotation = self._kinematics.tree.joint_poses(flat).rotation
         down = np.einsum('njba,b->nja', rotation, gravity / max(np.linalg.norm(gravity), SMALL))
         return down.reshape(-1, *self._tilt.shape)
 

@@ -107,7 +107,7 @@ def _checksum(content: bytes) -> bytes:
 
 
 def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
-    joint_count, gravity_size = robot.joint_count, 3 * len(robot.kinematics.parent)
+    joint_count, gravity_size = robot.joint_count, 3 * len(robot.kinematics.tree.parent)
     of_muscles = sample.tension, sample.length, sample.direction, sample.known
     return (
         len(sample.theta) == joint_count

@@ -90,7 +90,7 @@ class Frames:
     def publish(self, theta: Array) -> None:
         """Publish the poses at θ [rad] (D,)."""
         robot, stamp = self._node.robot, self._node.get_clock().now().to_msg()
-        joints, transforms = robot.kinematics.transforms(theta[None])[0], []
+        joints, transforms = robot.kinematics.tree.transforms(theta[None])[0], []
         for frame in body_frames(robot.kinematics.model):
             if frame.name != robot.root_link:
                 transform = TransformStamped(child_frame_id=self._prefix + frame.name)

@@ -20,9 +20,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.report import distinct
-from musculoskeletal_ae.robot import kinematics, series_elastic
+from musculoskeletal_ae.robot import series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
-from musculoskeletal_ae.robot.kinematics import Coupling, body_frames, resolved
+from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, resolved
+from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.muscle_file import (
     MuscleEntry,
     MuscleFile,
@@ -218,7 +219,7 @@ def _joint_problem(name: str, model: pin.Model) -> str:
     if name not in movable:
         return f'unknown joint {name!r}; movable joints of robot.urdf: {", ".join(movable)}'
     joint = model.joints[model.getJointId(name)]
-    if joint.shortname() in kinematics.REVOLUTE + kinematics.PRISMATIC:
+    if joint.shortname() in REVOLUTE + PRISMATIC:
         return ''
     kind = OTHER_JOINTS.get(joint.nv, joint.shortname())
     legal = 'revolute or prismatic joints with one degree of freedom and limits'

@@ -43,8 +43,8 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
     Route points [m] (P, 3) are those of the geometric model by default.
     """
     kin = robot.kinematics
-    origins = kin.joint_poses(theta[None]).translation[0]
-    bones = [np.stack([origins[kin.parent[i]], origins[i]]) for i in range(1, len(origins))]
+    origins = kin.tree.joint_poses(theta[None]).translation[0]
+    bones = [np.stack([origins[kin.tree.parent[i]], origins[i]]) for i in range(1, len(origins))]
     for link in robot.description.end_effectors:
         tip = kin.link_pose(theta, link).translation
         bones.append(np.stack([origins[kin.placement(link)[0]], tip]))

@@ -22,7 +22,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
-from musculoskeletal_ae.robot.kinematics import JointPoses, Kinematics
+from musculoskeletal_ae.robot.joint_tree import JointPoses
+from musculoskeletal_ae.robot.kinematics import Kinematics
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.robot.wrapping import WrapObjects
@@ -52,10 +53,10 @@ class Routes:
         """Attach the routes of a description to the tree."""
         self._kinematics = kinematics
         links = ([kinematics.placement(item.link)[0] for item in route] for route in routes)
-        hangs = [kinematics.hangs_on[joints, 1:] for joints in links]
+        hangs = [kinematics.tree.hangs_on[joints, 1:] for joints in links]
         # Joints of the tree: where two that turn together carry all of a route, it still changes.
         parted = np.array([some.any(axis=0) & ~some.all(axis=0) for some in hangs])
-        of_theta = np.eye(len(kinematics.lower), dtype=bool)[kinematics.theta_index[1:]]
+        of_theta = np.eye(len(kinematics.lower), dtype=bool)[kinematics.tree.theta_index[1:]]
         #: joints that each muscle crosses: they or what follows them move some of it, (M, D)
         self.crossed: Bools = parted @ of_theta
         pieces = [[item for item in route if isinstance(item, RoutePoint)] for route in routes]
@@ -75,14 +76,14 @@ class Routes:
         #: they are: (Q, J−1), (M, Q), and joints of the tree that move θ, (J−1, D)
         ends = self.first[self.wrapping], self.second[self.wrapping]
         self._pulled = np.concatenate([self.first, *ends])
-        carried, moved = 1.0 * kinematics.hangs_on[:, 1:], self.joint
+        carried, moved = 1.0 * kinematics.tree.hangs_on[:, 1:], self.joint
         self._share = carried[moved[self.second]] - carried[moved[self.first]]
         if self.objects is not None:
             apart = [carried[self.objects.joint] - carried[moved[end]] for end in ends]
             self._share = np.concatenate([self._share, *apart])
         own = self._sum[:, self.wrapping]
         self._gather = np.concatenate([self._sum, own, own], axis=1)
-        self._of_theta = kinematics.ratio[1:, None] * of_theta
+        self._of_theta = kinematics.tree.ratio[1:, None] * of_theta
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
 
     def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
@@ -108,7 +109,7 @@ class Routes:
 
     def drawn(self, theta: Array, points: Array | None = None) -> list[Array]:
         """Return each muscle at θ (D,) as a polyline with its arcs, (K, 3) [m]; see `points`."""
-        poses = self._kinematics.joint_poses(theta[None])
+        poses = self._kinematics.tree.joint_poses(theta[None])
         points = self.placed(poses)[0] if points is None else points
         arcs = {}
         if self.objects is not None:
@@ -129,7 +130,7 @@ class Routes:
 
     def points(self, theta: Array) -> Array:
         """Return all route points in the root link's frame [m], shape (N, P, 3), θ (N, D)."""
-        return self.placed(self._kinematics.joint_poses(theta))
+        return self.placed(self._kinematics.tree.joint_poses(theta))
 
     def placed(self, poses: JointPoses, point: Array | None = None) -> Array:
         """Return route points, or other ones (P, 3) on the same links, for poses, (N, P, 3)."""
@@ -139,7 +140,7 @@ class Routes:
 
     def _segments(self, theta: Array) -> tuple[Array, Array]:
         """Return lengths (N, S) of the segments, and of the straight lines between their ends."""
-        poses = self._kinematics.joint_poses(theta)
+        poses = self._kinematics.tree.joint_poses(theta)
         points = self.placed(poses)
         straight = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
         if self.objects is None:
@@ -173,7 +174,7 @@ class Routes:
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return G(θ) [m/rad]: θ (..., D) gives (..., M, D)."""
         kin = self._kinematics
-        poses = kin.joint_poses(theta)
+        poses = kin.tree.joint_poses(theta)
         points = self.placed(poses)
         line = points[:, self.second] - points[:, self.first]
         norm = np.linalg.norm(line, axis=-1, keepdims=True)
@@ -185,7 +186,7 @@ class Routes:
             pull = np.concatenate([pull, leave, arrive], axis=1)
         # d · (a × (p − o)) = a · (p × d) + (o × a) · d
         axis, origin = poses.axis[:, 1:], poses.translation[:, 1:]
-        slides = kin.prismatic[1:, None]
+        slides = kin.tree.prismatic[1:, None]
         turn, shift = np.where(slides, 0.0, axis), np.where(slides, axis, np.cross(origin, axis))
         screw = np.concatenate([turn, shift], axis=-1).swapaxes(-1, -2)
         longer = np.concatenate([np.cross(at, pull), pull], axis=-1) @ screw

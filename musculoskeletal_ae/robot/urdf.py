@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
-from musculoskeletal_ae.robot.kinematics import Coupling
+from musculoskeletal_ae.robot.joint_tree import Coupling
 
 # A body of a hundred links is large; parsers that recurse overflow their stack at thousands.
 # MuJoCo's and pinocchio's parser goes down 500 levels.

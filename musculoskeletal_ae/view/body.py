@@ -105,7 +105,7 @@ def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
 def _capsules(robot: Robot) -> list[Solid]:
     """Return a capsule from every joint to the next, and one to each end effector."""
     kin, solids = robot.kinematics, []
-    bones = [*zip(kin.parent[1:], kin.placement_translation[1:])]
+    bones = [*zip(kin.tree.parent[1:], kin.tree.placement_translation[1:])]
     tips = [kin.placement(link) for link in robot.description.end_effectors]
     for joint, end in [*bones, *((joint, tip.translation) for joint, tip in tips)]:
         length = float(np.linalg.norm(end))
@@ -129,7 +129,7 @@ def space(robot: Robot, solids: list[Solid]) -> tuple[Array, float, float]:
     kin, points = robot.kinematics, []
     for theta in [middle, *others]:
         points.append(robot.routes.points(theta[None])[0])
-        places = kin.transforms(theta[None])[0]
+        places = kin.tree.transforms(theta[None])[0]
         for joint, mesh in solids:
             corners = trimesh.bounds.corners(mesh.bounds)
             at = places[joint]

@@ -124,9 +124,9 @@ class Page:
         self._arms: dict[str, list[Any]] = {}  # its frame, then those of its joints
         for arm, colour in ARMS.items():
             frames = self._arms[arm] = [scene.add_frame(f'/{arm}', show_axes=False, visible=False)]
-            for i, parent in enumerate(kin.parent[1:], 1):
+            for i, parent in enumerate(kin.tree.parent[1:], 1):
                 name = f'{frames[parent].name}/{kin.model.names[i]}'
-                at = kin.placement_translation[i]
+                at = kin.tree.placement_translation[i]
                 frames.append(scene.add_frame(name, show_axes=False, position=at))
             opacity = None if arm == 'measured' else 0.4
             for number, (joint, mesh) in enumerate(solids):
@@ -181,11 +181,11 @@ class Page:
                 root.visible = arm in posture and self._wanted[arm].value
                 if not root.visible:
                     continue
-                poses = kin.in_parents(posture[arm][None])[0]
+                poses = kin.tree.in_parents(posture[arm][None])[0]
                 turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
                 for i, joint in enumerate(joints, 1):
                     joint.wxyz = turns[i]
-                    if kin.prismatic[i]:
+                    if kin.tree.prismatic[i]:
                         joint.position = poses[i, :3, 3]
             theta = posture.get('measured', posture.get('estimated'))
             self._tubes.visible = theta is not None and tension is not None

@@ -358,7 +358,7 @@ def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_recei
         reported = min(
             learner.samples.samples, key=lambda s: np.abs(s.length - sample.length).max()
         )
-        expected = np.full((len(arm26.kinematics.parent) * bool(heard), 3), np.nan)
+        expected = np.full((len(arm26.kinematics.tree.parent) * bool(heard), 3), np.nan)
         for joint, placement in map(arm26.kinematics.placement, heard):
             expected[joint] = placement.rotation @ [0.0, 0.0, -1.0]
         np.testing.assert_allclose(reported.gravity, expected.ravel(), atol=1e-9)

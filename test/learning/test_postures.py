@@ -109,8 +109,8 @@ def test_each_additional_sensor_improves_the_postures(arm26, observed):
     partly.theta[:, 1] = truth[:, 1]
     assert errors(arm26, partly, truth)[1] < nothing
     kinematics = arm26.kinematics
-    turn = kinematics.joint_poses(truth).rotation
-    gravity = np.full((len(truth), len(kinematics.parent), 3), np.nan)
+    turn = kinematics.tree.joint_poses(truth).rotation
+    gravity = np.full((len(truth), len(kinematics.tree.parent), 3), np.nan)
     down = kinematics.model.gravity.linear / np.linalg.norm(kinematics.model.gravity.linear)
     gravity[:, -1] = turn[:, -1].swapaxes(1, 2) @ down
     tilted = replace(blind(observed), gravity=gravity.reshape(len(truth), -1))

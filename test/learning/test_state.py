@@ -83,7 +83,7 @@ def full_disk():
 
 
 def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
-    gravity = np.full(3 * len(arm26.kinematics.parent), np.nan)
+    gravity = np.full(3 * len(arm26.kinematics.tree.parent), np.nan)
     gravity[3:6] = 0.0, 0.6, -0.8
     plain = Sample(np.array([0.1, np.nan]), np.full(6, 50.0), np.zeros(6), np.ones(6))
     store = SampleStore()

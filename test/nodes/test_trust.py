@@ -107,7 +107,7 @@ def test_impossible_length_offsets_are_refused(graph, trained_file):
     latched = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
     latched.publish(array_message(zeros, 'quantity', 'muscle'))
     graph.wait(lambda: controller.rejected['muscle_length_zeros: impossible zeros'], 'the refusal')
-    assert not controller.zeros.offset.any()
+    assert not controller.body.offsets.offset.any()
 
 
 def test_a_second_publisher_of_muscle_states_stops_the_arm_until_it_is_gone(arm):

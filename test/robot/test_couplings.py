@@ -33,14 +33,14 @@ def robot(tmp_path_factory):
 
 def energy(robot, theta):
     kin = robot.kinematics
-    return pin.computePotentialEnergy(kin.model, kin.data, kin.tree_angles(theta))
+    return pin.computePotentialEnergy(kin.model, kin.data, kin.tree.angles(theta))
 
 
 def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
     kin = robot.kinematics
     assert robot.joints == ('bend', 'lift', 'swing')
     for theta in robot.random_postures(4, np.random.default_rng(0)):
-        assert kin.tree_angles(theta).shape == (4,)
+        assert kin.tree.angles(theta).shape == (4,)
         gravity = slopes(lambda t: energy(robot, t), theta)
         np.testing.assert_allclose(kin.holding_torque(theta), gravity, atol=1e-6)
         gradient = slopes(kin.holding_torque, theta)
@@ -50,8 +50,12 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         np.testing.assert_allclose(load_slope[0], gradient, atol=1e-5)
         lengths = slopes(robot.routes.absolute_lengths, theta)
         np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), lengths, atol=1e-7)
-        inertia = pin.crba(kin.model, kin.data, kin.tree_angles(theta))
-        whole = kin.transmission.T @ (np.triu(inertia) + np.triu(inertia, 1).T) @ kin.transmission
+        inertia = pin.crba(kin.model, kin.data, kin.tree.angles(theta))
+        whole = (
+            kin.tree.transmission.T
+            @ (np.triu(inertia) + np.triu(inertia, 1).T)
+            @ kin.tree.transmission
+        )
         np.testing.assert_allclose(kin.joint_inertia(theta), np.diag(whole))
 
 
@@ -135,7 +139,7 @@ def test_a_continuous_joint_may_mimic_a_listed_one_since_it_needs_no_limits(tmp_
     urdf.write_text(f'{joint}<joint name="finger" {mimic}{rest}')
     robot = Robot.load(tmp_path)
     assert robot.description.joint_notes == ['finger = 2 · bend']
-    angles = dict(zip(robot.kinematics.model.names[1:], robot.kinematics.tree_angles(ANGLES)))
+    angles = dict(zip(robot.kinematics.model.names[1:], robot.kinematics.tree.angles(ANGLES)))
     assert angles['finger'] == 2.0 * angles['bend']
 
 

@@ -100,7 +100,7 @@ def test_links_are_drawn_by_the_meshes_of_the_urdf_or_else_by_capsules(tmp_path)
     shutil.copytree(Robot.load('arm26').description.directory, folder)
     solids, notes = link_solids(Robot.load(folder))
     assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down from the joints
-    elbow = Robot.load('arm26').kinematics.placement_translation[2, 2]
+    elbow = Robot.load('arm26').kinematics.tree.placement_translation[2, 2]
     low, high = solids[0][1].bounds[:, 2]
     assert low < elbow < low + 0.03 and high - 0.03 < 0.0 < high
     box = trimesh.creation.box((1.0, 1.0, 1.0))
