@@ -35,6 +35,14 @@ def test_only_nodes_imports_ros() -> None:
     assert not {file: names for file, names in speaking.items() if names}
 
 
+def test_only_the_presets_import_the_paper() -> None:
+    chosen = 'paper', 'presets'
+    for file in sources(PACKAGE):
+        if file.parent.name not in chosen:
+            taken = [name for name in imported(file) if name.startswith(f'{PACKAGE.name}.paper')]
+            assert not taken, f'{file}: choose it through presets.registry instead'
+
+
 def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
     for file in sources(PACKAGE):
         if file.parent.name not in ('nodes', 'tools') and file.name != 'executables.py':
