@@ -125,6 +125,71 @@ def _other_limits(robot: Robot, file: Path, model: Any) -> Iterator[str]:
             )
 
 
+class LateSensors:
+    """What is wrong with joint sensors and messages: offset, bend, backlash, and delay."""
+
+    def __init__(self, robot: Robot, draw: Draw) -> None:
+        joints, radian = robot.joint_count, robot.kinematics.radian
+        self._joint_count, self._span = joints, robot.upper - robot.lower
+        self._zero = radian * draw.normal('joint_zero', joints)
+        self._bend = draw.about('joint_bend', joints, signed=True)
+        self._backlash = radian * draw.about('backlash', joints)
+        self._delays = draw.about('delay', 2)  # of joint sensors and of muscle modules [s]
+        self._history = np.zeros((HISTORY, joints + 3 * robot.muscle_count))
+        self._steps = 0
+
+    def stand(self, theta: Array) -> None:
+        """Let the joints stand at θ, in the middle of their backlash."""
+        self._play = theta + self._zero
+
+    def start(self, now: Array) -> None:
+        """Let everything have been as it is now for as long as sensors are late."""
+        self._history[:] = now
+
+    def note(self, now: Array) -> None:
+        """Take what is to be sensed after one more step."""
+        self._steps += 1
+        self._history[self._steps % HISTORY] = now
+
+    def read(self, jitter: float) -> tuple[Array, Array, Array, Array]:
+        """Return θ, l, T and heat as they are read; the jitter of the delay is in seconds."""
+        late = np.maximum(self._delays + jitter, 0.0) / STEP
+        seen = [self._history[(self._steps - round(steps)) % HISTORY] for steps in late]
+        half, span = 0.5 * self._backlash, self._span
+        theta = seen[0][: self._joint_count] + self._zero
+        theta = theta + self._bend * span * np.sin(2.0 * np.pi * theta / span)
+        self._play = np.clip(self._play, theta - half, theta + half)
+        return self._play, *seen[1][self._joint_count :].reshape(3, -1)
+
+
+class Ageing:
+    """What changes over hours: wires bed in, a knot slips, spools slip, length sensors drift.
+
+    Attributes:
+        drift: Of the length sensors [m/s], (M,).
+    """
+
+    def __init__(self, robot: Robot, draw: Draw, spool_slip: float) -> None:
+        muscles = robot.muscle_count
+        self._time, self._spool_slip = 0.0, spool_slip
+        self.drift: Array = draw.normal('length_drift', muscles) / HOUR
+        self._bedding = draw.about('bedding', muscles)
+        rng, knot = draw.rng('slips'), np.zeros(muscles)
+        self._knot_time, knot[rng.integers(muscles)] = rng.uniform(0.0, HOUR), 1.0
+        self._knot = knot * draw.about('knot', 1)
+        self._slips, self._slipped = rng, np.zeros(muscles)
+
+    def longer(self, duration: float) -> Array:
+        """Return by how much wires are longer [m] (M,) in a time that begins now [s]."""
+        age = self._time / BEDDING_TIME
+        longer = self._bedding * -np.expm1(-age) + self._knot * (self._time > self._knot_time)
+        slipping = self._slips.uniform(size=len(longer)) < duration / SLIP_TIME
+        self._slipped = self._slipped + slipping * self._slips.choice([-1.0, 1.0], len(longer))
+        self._time += duration
+        result: Array = longer + self._spool_slip * self._slipped
+        return result
+
+
 class ForeignArm(Arm):
     """An arm of MuJoCo."""
 
@@ -176,11 +241,11 @@ class ForeignArm(Arm):
         self._wired = wires.handed(
             wires.WireParts(self.wires, self._wound, self._muscle, self._memory, self._command)
         )
-        self._draw_sensors()
-        self._time, self._steps = 0.0, 0
+        self._sensors = LateSensors(robot, draw)
+        self._ageing = Ageing(robot, draw, self.effects.spool_slip)
+        self._steps = 0
         self._pull = np.zeros(muscles)
         self._control = np.array([model.actuator(name).id for name in robot.muscles])
-        self._history = np.zeros((HISTORY, robot.joint_count + 3 * muscles))
         self.reset()
 
     def _rub(self) -> None:
@@ -219,26 +284,11 @@ class ForeignArm(Arm):
         site = np.concatenate(sites), model.site_bodyid, data.xmat.reshape(-1, 9)
         return wires.Guides(tendons, *runs, data.ten_wrapnum, *site, place, place.copy(), give)
 
-    def _draw_sensors(self) -> None:
-        """Draw what is wrong with joint sensors and messages, and when wires slip."""
-        draw, joints, muscles = self._draw, self.robot.joint_count, self.robot.muscle_count
-        radian = self.robot.kinematics.radian
-        self._joint_zero = radian * draw.normal('joint_zero', joints)
-        self._joint_bend = draw.about('joint_bend', joints, signed=True)
-        self._backlash = radian * draw.about('backlash', joints)
-        self._delays = draw.about('delay', 2)
-        self._drift = draw.normal('length_drift', muscles) / HOUR
-        self._bedding = draw.about('bedding', muscles)
-        rng, knot = draw.rng('slips'), np.zeros(muscles)
-        self._knot_time, knot[rng.integers(muscles)] = rng.uniform(0.0, HOUR), 1.0
-        self._knot = knot * draw.about('knot', 1)
-        self._slips, self._slipped = rng, np.zeros(muscles)
-
     def _stand(self, theta: Array) -> None:
         mujoco.mj_resetData(self._model, self._data)
         self._guides.place[:] = self._guides.rest
         self.individual.look(self._data, theta)
-        self._play = theta + self._joint_zero
+        self._sensors.stand(theta)
 
     def reset(self, theta: Array | None = None) -> None:
         """Put the arm at rest at θ, as `Arm.reset`; it gets no younger by that."""
@@ -246,7 +296,7 @@ class ForeignArm(Arm):
         self._memory.rest[:] = 1.0
         for m in range(self.robot.muscle_count):
             wires.read(self.wires, self._muscle, self._memory, self._command, m)
-        self._history[:] = self._now()
+        self._sensors.start(self._now())
         self._last: Readings | None = None
 
     def _attach(self, which: Bools) -> None:
@@ -264,15 +314,10 @@ class ForeignArm(Arm):
 
     def step(self, duration: float) -> None:
         """Let time pass [s], in whole steps of `STEP`."""
-        age = self._time / BEDDING_TIME
-        longer = self._bedding * -np.expm1(-age) + self._knot * (self._time > self._knot_time)
-        slipping = self._slips.uniform(size=len(longer)) < duration / SLIP_TIME
-        self._slipped = self._slipped + slipping * self._slips.choice([-1.0, 1.0], len(longer))
-        self._memory.longer[:] = longer + self.effects.spool_slip * self._slipped
+        self._memory.longer[:] = self._ageing.longer(duration)
         # The sensors drift until somebody zeroes them, as `set_length_offset` does.
-        self._command.length_error[:] += self._drift * duration
+        self._command.length_error[:] += self._ageing.drift * duration
         super().step(duration)
-        self._time += duration
 
     def _step(self) -> None:
         model, data = self._model, self._data
@@ -296,7 +341,7 @@ class ForeignArm(Arm):
             at = data.xpos[self._hand]
             mujoco.mj_applyFT(model, data, push, twist, at, self._hand, data.qfrc_applied)
         mujoco.mj_step2(model, data)
-        self._history[self._steps % HISTORY] = self._now()
+        self._sensors.note(self._now())
 
     def _now(self) -> Array:
         """Return what is to be sensed: θ, l and T as the modules' sensors have them, heat."""
@@ -304,14 +349,7 @@ class ForeignArm(Arm):
         return np.concatenate([self.theta, memory.reading, memory.cell, muscle.housing])
 
     def _sensed(self) -> tuple[Array, Array, Array, Array]:
-        joints, jitter = self.robot.joint_count, self.effects.jitter * self._rng.uniform(-0.5, 0.5)
-        late = np.maximum(self._delays + jitter, 0.0) / STEP
-        seen = [self._history[(self._steps - round(steps)) % HISTORY] for steps in late]
-        half, span = 0.5 * self._backlash, self.robot.upper - self.robot.lower
-        theta = seen[0][:joints] + self._joint_zero
-        theta = theta + self._joint_bend * span * np.sin(2.0 * np.pi * theta / span)
-        self._play = np.clip(self._play, theta - half, theta + half)
-        return self._play, *seen[1][joints:].reshape(3, -1)
+        return self._sensors.read(self.effects.jitter * self._rng.uniform(-0.5, 0.5))
 
     def sense(self) -> Readings:
         """Read all sensors once, late, with their noise, errors, resolution and faults."""
