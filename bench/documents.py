@@ -144,15 +144,16 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
     if not clone.exists() and folder == clone:
         subprocess.run(['git', 'clone', '-q', repository, clone], check=True)
     patience = str(START_PATIENCE + COMMAND_PATIENCE)
-    done = subprocess.run(
+    with subprocess.Popen(
         ['timeout', patience, 'bash', '-c', script(ROOT / page, str(repository))],
-        cwd=folder, env=environment, text=True, check=False,
+        cwd=folder, env=environment, text=True,
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    print(done.stdout.replace(str(clone), '…').replace(str(home), '~'), flush=True)
+    ) as shell:  # fmt: skip
+        for line in shell.stdout or ():
+            print(line.replace(str(clone), '…').replace(str(home), '~'), end='', flush=True)
     # The next page finds a clean clone, with what is installed.
     subprocess.run(['git', 'clean', '-fdq'], cwd=clone, check=True)
-    return done.returncode == 0
+    return shell.returncode == 0
 
 
 def _parse(argv: list[str]) -> Namespace:
