@@ -91,6 +91,27 @@ print(*joint_angles(np.array({tension.tolist()}), np.array({length.tolist()})))
     assert np.linalg.norm(estimated - theta) < 0.3
 
 
+def test_commands_of_a_page_are_read_as_a_reader_would_run_them(tmp_path):
+    page = tmp_path / 'page.md'
+    page.write_text(
+        '```sh\n'
+        './bringup.sh --view      # look; Ctrl-C ends it\n'
+        '# a comment\n'
+        'ros2 topic pub "{a: 1,\n  b: 2}"   # both\n'
+        '```\n'
+        '1. Item\n\n'
+        '   <!-- bench: skip needs hardware -->\n'
+        '   ```sh\n   one \\\n      two\n   ```\n'
+        '```python\nnot_a_command()\n```\n',
+        encoding='utf-8',
+    )
+    assert commands(page) == [
+        ('./bringup.sh --view', True, ''),
+        ('ros2 topic pub "{a: 1, b: 2}"', False, ''),
+        ('one  two', False, 'needs hardware'),
+    ]
+
+
 def test_options_and_executables_that_the_documents_name_exist():
     bringup = (ROOT / 'bringup.sh').read_text('utf-8')
     setup = (ROOT / 'setup.py').read_text('utf-8')
