@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+import musculoskeletal_ae  # noqa: F401  # chooses the pinocchio that tests import
+
 # Each of pytest-xdist's processes has a ROS graph of its own.
 if worker := os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw'):
     os.environ['ROS_DOMAIN_ID'] = str(int(os.environ.get('ROS_DOMAIN_ID', '1')) + int(worker))

@@ -27,7 +27,7 @@ def test_eliminating_the_samples_gives_the_step_of_the_whole_system():
         whole[rows, places * n : places * (n + 1)] = by_sample[n]
         whole[rows, -size:] = by_common[n]
     left = rng.standard_normal(count * 8)
-    expected = np.linalg.lstsq(whole, left)[0]
+    expected = np.linalg.lstsq(whole, left, rcond=None)[0]
     equations = Equations(
         np.einsum('nri,nrj->nij', by_sample, by_sample),
         np.einsum('nri,nrp->nip', by_sample, by_common),
@@ -94,7 +94,7 @@ def test_outliers_hardly_move_a_robust_fit():
     fit = LineFit(x, y)
     end = minimise(fit, fit.point(np.zeros(2)), 50, 1e-9)
     np.testing.assert_allclose(end.point.values, [2.0, 1.0], atol=0.005)
-    plain = np.linalg.lstsq(fit.jacobian, y)[0]
+    plain = np.linalg.lstsq(fit.jacobian, y, rcond=None)[0]
     assert abs(plain[1] - 1.0) > 0.4
 
 

@@ -104,7 +104,7 @@ class CheckpointValidator:
         """The share of each joint's angle that may be left, by what muscles determine of it."""
         theta, *told = self._states(2 * AFFINE)
         given = np.hstack([np.ones((2 * AFFINE, 1)), *(part / part.std() for part in told)])
-        affine = np.linalg.lstsq(given[:AFFINE], theta[:AFFINE])[0]
+        affine = np.linalg.lstsq(given[:AFFINE], theta[:AFFINE], rcond=None)[0]
         left: Array = _size((given @ affine - theta)[AFFINE:]) / theta.std(axis=0)
         return UNDETERMINED * left
 
