@@ -21,6 +21,7 @@ from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints
 from musculoskeletal_ae.importing.source import names_of_all, safe_name
+from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.kinematics import Kinematics
@@ -44,6 +45,7 @@ OF_MOTORS = (
 Place = tuple[int, Array]  # joint, and where in its frame [m]
 Obstacle = tuple[int, Array, Array]  # the same of its middle, and its axis
 
+check_mujoco()
 mujoco.set_mju_user_warning(lambda _: None)  # by default it writes a file where it was started
 
 
@@ -79,7 +81,7 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
             k = robot.joints.index(name)
             joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
         else:
-            coupling, data = robot.description.couplings[name], np.zeros(11)
+            coupling, data = robot.description.couplings[name], np.zeros(mujoco.mjNEQDATA)
             data[:2] = coupling.offset, coupling.ratio
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}
             link |= {'data': data, 'solimp': STIFF}

@@ -18,8 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.importing.source import Source, distinct, names_of_all, refuse, safe_name
+from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
 from musculoskeletal_ae.robot.joint_tree import resolved
+
+check_mujoco()
 
 #: where a model says how many it has of each kind that has names here
 COUNTS = {

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action `follow_joint_trajectory` of the controller, where control_msgs is installed.
-
-control_msgs is not among the wheels that this package is developed with: it is tested with a
-stand-in of its interface.
-"""
+"""The action `follow_joint_trajectory` of the controller, where control_msgs is installed."""
 
 from collections.abc import Callable
 from contextlib import suppress

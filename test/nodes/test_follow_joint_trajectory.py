@@ -1,129 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action, with a stand-in of control_msgs and of rclpy's server; actions are served at once."""
+"""The action, by a client of control_msgs where that is installed; actions are served at once."""
 
 import sys
 import threading
 import time
 from contextlib import suppress
-from types import ModuleType, SimpleNamespace
 
 import pytest
 import rclpy
-from builtin_interfaces.msg import Duration
+from action_msgs.msg import GoalStatus
 from controlled_arm import ControlledArm
-from rclpy.action import CancelResponse, GoalResponse
+from rclpy.action import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import NumberOfEntities, Waitable
 from trajectory_msgs.msg import JointTrajectory
 
-from musculoskeletal_ae.nodes import executor, follow_joint_trajectory
+from musculoskeletal_ae.nodes import executor
 
 from .test_motion import HERE, THERE, trajectory
 
 
-class Goal(SimpleNamespace):
-    """What a client of control_msgs sends."""
+class SentGoal:
+    """A goal that a client has sent, and what it receives about it."""
 
-    def __init__(self, message, **given):
-        nothing = {'path_tolerance': [], 'goal_tolerance': [], 'goal_time_tolerance': Duration()}
-        super().__init__(trajectory=message, **{**nothing, **given})
+    def __init__(self, graph, client, goal):
+        self._graph = graph
+        self.feedback = []
+        sent = client.send_goal_async(goal, lambda message: self.feedback.append(message.feedback))
+        graph.wait(sent.done, 'an answer to the goal')
+        self.handle = sent.result()
+        self.is_accepted = self.handle.accepted
+        self._ended = self.handle.get_result_async() if self.is_accepted else None
 
+    def cancel(self):
+        response = self.handle.cancel_goal_async()
+        self._graph.wait(response.done, 'an answer to the cancellation')
 
-class Handle:
-    """The server's side of a goal, as rclpy has it."""
-
-    def __init__(self):
-        self.told, self.status, self.result = [], 'accepted', None
-        self.is_cancel_requested = False
-
-    def execute(self):
-        self.status = 'executing'
-
-    publish_feedback = property(lambda self: self.told.append)
-
-    def _end(self, status):
-        assert self.status == 'executing'
-        self.status = status
-
-    def succeed(self):
-        self._end('succeeded')
-
-    def abort(self):
-        self._end('aborted')
-
-    def canceled(self):
-        assert self.is_cancel_requested
-        self._end('canceled')
-
-
-class Server:
-    """Keeps the callbacks, which the test calls in the client's place."""
-
-    def __init__(self, _node, _kind, name, _execute, **callbacks):
-        self.name, self.callbacks = name, callbacks
-
-    def notify_execute(self, handle, callback):
-        if callback is not None:
-            handle.result = callback(handle)
-
-    def send(self, goal):
-        """Return the handle of a goal, None if it is refused."""
-        if self.callbacks['goal_callback'](goal) == GoalResponse.REJECT:
-            return None
-        handle = Handle()
-        self.callbacks['handle_accepted_callback'](handle)
-        return handle
-
-    def cancel(self, handle):
-        assert self.callbacks['cancel_callback'](handle) == CancelResponse.ACCEPT
-        handle.is_cancel_requested = True
+    def ended(self):
+        """Return the status and the result at the end."""
+        self._graph.wait(self._ended.done, 'the end of the goal')
+        return self._ended.result().status, self._ended.result().result
 
 
 @pytest.fixture
-def arm(graph, arm26, trained_file, monkeypatch):
-    package, module = ModuleType('control_msgs'), ModuleType('control_msgs.action')
-    kind = SimpleNamespace(Goal=Goal, Result=SimpleNamespace, Feedback=SimpleNamespace)
-    module.FollowJointTrajectory = kind
-    monkeypatch.setitem(sys.modules, 'control_msgs', package)
-    monkeypatch.setitem(sys.modules, 'control_msgs.action', module)
-    monkeypatch.setattr(follow_joint_trajectory, 'LateServer', Server)
+def arm(graph, arm26, trained_file):
     return ControlledArm(graph, arm26, trained_file)
 
 
 def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
-    server = arm.controller.action._server
-    assert server.name == 'follow_joint_trajectory'
-    first = server.send(Goal(trajectory(arm, HERE)))
-    arm.graph.wait(lambda: first.status == 'succeeded', 'the end of the first goal')
-    assert first.result.error_code == 0
-    assert tuple(first.told[0].joint_names) == arm.robot.joints
-    assert first.told[-1].desired.positions.tolist() == pytest.approx(HERE.tolist(), abs=0.02)
+    action = pytest.importorskip('control_msgs.action', reason='control_msgs is not installed')
+    from control_msgs.msg import JointTolerance
+
+    kind = action.FollowJointTrajectory
+    client = ActionClient(arm.graph.node, kind, 'follow_joint_trajectory')
+    arm.graph.wait(client.server_is_ready, 'the action')
+
+    def send(message, **tolerances):
+        return SentGoal(arm.graph, client, kind.Goal(trajectory=message, **tolerances))
+
+    first = send(trajectory(arm, HERE))
+    status, result = first.ended()
+    assert (status, result.error_code) == (GoalStatus.STATUS_SUCCEEDED, kind.Result.SUCCESSFUL)
+    assert tuple(first.feedback[0].joint_names) == arm.robot.joints
+    assert first.feedback[-1].desired.positions.tolist() == pytest.approx(HERE.tolist(), abs=0.02)
     # A new one replaces it.
-    second = server.send(Goal(trajectory(arm, THERE, 20)))
-    arm.graph.wait(lambda: second.told, 'feedback')
-    third = server.send(Goal(trajectory(arm, THERE, 20)))
-    assert second.status == 'aborted'
-    assert 'replaced' in second.result.error_string
-    server.cancel(third)
-    arm.graph.wait(lambda: third.status == 'canceled', 'the end of the cancelled goal')
+    second = send(trajectory(arm, THERE, 20))
+    arm.graph.wait(lambda: second.feedback, 'feedback')
+    third = send(trajectory(arm, THERE, 20))
+    status, result = second.ended()
+    assert status == GoalStatus.STATUS_ABORTED and 'replaced' in result.error_string
+    third.cancel()
+    assert third.ended()[0] == GoalStatus.STATUS_CANCELED
     arm.says('holding')
     # One that cannot be kept to.
-    tolerance = SimpleNamespace(name=arm.robot.joints[0], position=1e-6)
-    fourth = server.send(Goal(trajectory(arm, THERE), path_tolerance=[tolerance]))
-    arm.graph.wait(lambda: fourth.status == 'aborted', 'the end of the goal')
-    assert fourth.result.error_code == -4
+    tolerance = JointTolerance(name=arm.robot.joints[0], position=1e-6)
+    fourth = send(trajectory(arm, THERE), path_tolerance=[tolerance])
+    status, result = fourth.ended()
+    assert status == GoalStatus.STATUS_ABORTED
+    assert result.error_code == kind.Result.PATH_TOLERANCE_VIOLATED
     arm.says('holding')
     before = arm.controller.core.activities.follower.trajectory
-    assert server.send(Goal(trajectory(arm, arm.robot.upper + 0.5))) is None
-    assert server.send(Goal(JointTrajectory())) is None
+    assert not send(trajectory(arm, arm.robot.upper + 0.5)).is_accepted
+    assert not send(JointTrajectory()).is_accepted
     assert arm.controller.core.activities.follower.trajectory is before
     rejected = arm.controller.rejected
     assert rejected['follow_joint_trajectory: beyond the joint limits'] == 1
     assert rejected['follow_joint_trajectory: empty'] == 1
+    client.destroy()
 
 
-def test_without_control_msgs_there_is_no_action(graph, arm26, trained_file):
+def test_without_control_msgs_there_is_no_action(graph, arm26, trained_file, monkeypatch):
+    for module in ('control_msgs', 'control_msgs.action'):
+        monkeypatch.setitem(sys.modules, module, None)
     assert ControlledArm(graph, arm26, trained_file).controller.action is None
 
 

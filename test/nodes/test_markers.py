@@ -3,13 +3,12 @@
 
 import json
 import sys
-import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from geometry_msgs.msg import Point, TransformStamped
+from geometry_msgs.msg import Point
 from graph import Process, executable
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -85,24 +84,28 @@ def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
     assert (status, out.exists()) == (0, True) and 'estimated/markers' in output
 
 
-def test_poses_of_all_links_go_to_tf_where_tf2_msgs_is(graph, monkeypatch):
-    shell = graph.host(lambda **options: Shell('estimator', **options), frame_prefix='a/')
-    monkeypatch.setitem(sys.modules, 'tf2_msgs', None)
+def test_without_tf2_msgs_the_parameter_publish_tf_is_refused(graph, monkeypatch):
+    shell = graph.host(lambda **options: Shell('estimator', **options))
+    for module in ('tf2_msgs', 'tf2_msgs.msg'):
+        monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MusculoskeletalError, match='tf2_msgs is not installed'):
         Frames(shell)
-    # The wheels have no tf2_msgs: what would be published is looked at.
-    sent: list[TransformStamped] = []
-    message = types.SimpleNamespace(TFMessage=lambda transforms: transforms)
-    monkeypatch.setitem(sys.modules, 'tf2_msgs', types.ModuleType('tf2_msgs'))
-    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', message)
-    monkeypatch.setattr(
-        shell, 'create_publisher', lambda *_: types.SimpleNamespace(publish=sent.extend)
-    )
-    theta = 0.5 * (shell.robot.lower + shell.robot.upper)
-    Frames(shell).publish(theta)
-    robot = shell.robot
-    assert {t.header.frame_id for t in sent} == {f'a/{robot.root_link}'}
-    poses = {t.child_frame_id: t.transform.translation for t in sent}
+
+
+def test_poses_of_all_links_go_to_tf(graph):
+    message = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed')
+    shell = graph.host(lambda **options: Shell('estimator', **options), frame_prefix='a/')
+    received = graph.listen(message.TFMessage, '/tf')
+    robot, frames = shell.robot, Frames(shell)
+    theta = 0.5 * (robot.lower + robot.upper)
+
+    def is_received():
+        frames.publish(theta)
+        return received
+
+    transforms = graph.wait(is_received, 'poses')[0].transforms
+    assert {t.header.frame_id for t in transforms} == {f'a/{robot.root_link}'}
+    poses = {t.child_frame_id: t.transform.translation for t in transforms}
     hand = robot.kinematics.end_effector_pose(theta).translation
     end = poses[f'a/{robot.description.end_effector}']
     np.testing.assert_allclose([end.x, end.y, end.z], hand)

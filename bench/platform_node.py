@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One node on the interpreter at hand: the estimator answers over ROS what the core computes.
+
+`python -m bench.platform_node CHECKPOINT`, from the root of the repository. It needs neither torch
+nor the built package: `python -m bench platforms` and the tests run it with other interpreters.
+"""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from bench.processes import end_processes
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.nodes.messages import array_message
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = 'arm26'
+PATIENCE = 120.0  # [s] on a busy machine
+LARGEST_DIFFERENCE = 1e-9  # [rad]
+START = 'from musculoskeletal_ae.executables import estimator; raise SystemExit(estimator())'
+
+
+def check(file: Path) -> str:
+    """Return one line about what was checked.
+
+    Raises:
+        RuntimeError: If the node does not answer, answers something else, or does not end well.
+    """
+    robot = Robot.load(ROBOT)
+    mae = checkpoint.load(file)
+    theta = 0.5 * (robot.lower + robot.upper)
+    tension = np.full(robot.muscle_count, 60.0)
+    length = robot.muscle_lengths(theta, tension)
+    expected = mae.estimate(tension, length).theta
+    rows = np.stack([length, tension, np.full(robot.muscle_count, 25.0)])
+    message = array_message(rows, 'quantity', 'muscle')
+
+    received: list[JointState] = []
+    rclpy.init()
+    node = rclpy.create_node('platform_node')
+    node.create_subscription(
+        JointState, 'estimated_joint_states', received.append, qos_profile_sensor_data
+    )
+    publisher = node.create_publisher(Float64MultiArray, 'muscle_states', qos_profile_sensor_data)
+    parameters = ['-p', f'robot:={ROBOT}', '-p', f'checkpoint:={file}']
+    process = subprocess.Popen([sys.executable, '-c', START, '--ros-args', *parameters])
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not received:
+            if process.poll() is not None:
+                raise RuntimeError(f'the estimator ended with status {process.returncode}')
+            if time.monotonic() > deadline:
+                raise RuntimeError(f'no estimate within {PATIENCE:g} s')
+            publisher.publish(message)
+            rclpy.spin_once(node, timeout_sec=0.05)
+    finally:
+        end_processes([process], signal.SIGTERM)
+        node.destroy_node()
+        rclpy.try_shutdown()
+    difference = float(np.max(np.abs(np.array(received[0].position) - expected)))
+    if not difference < LARGEST_DIFFERENCE:
+        raise RuntimeError(f'the node estimates {difference:g} rad beside the core')
+    if process.returncode != 0:
+        raise RuntimeError(f'on SIGTERM the estimator ended with status {process.returncode}')
+    version = '.'.join(map(str, sys.version_info[:3]))
+    return f'Python {version}, NumPy {np.__version__}: node and core estimate the same'
+
+
+if __name__ == '__main__':
+    print(check(Path(sys.argv[1])))

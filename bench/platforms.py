@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The platforms of doc/installation.md: makes each one, brings the system up there, runs tests.
+
+python -m bench platforms                          # all of them
+python -m bench platforms wheels-3.13 sourced      # some
+python -m bench platforms --node wheels-3.12       # without torch: the core and one node
+
+Each platform is a clean clone in a folder of its own, in which ./bringup.sh installs what is
+missing. Only what is committed is cloned. The clone is deleted when its platform has passed.
+"""
+
+import argparse
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.options import Parser
+
+ROOT = Path(__file__).resolve().parents[1]
+ROS_REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt'
+#: what the core and the estimator import, without which --node does
+NODE_REQUIREMENTS = ('numpy', 'pin', 'safetensors', 'msgspec', 'PyYAML')
+#: versions of Ubuntu 24.04
+UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1', 'lark==1.1.9')
+#: a pinocchio that is compiled for NumPy 1, as that of apt is
+APT_PINOCCHIO = ('pin==2.7.0', 'numpy==1.26.4')
+DEBIAN_PACKAGES = 'python3,ca-certificates,procps,util-linux'
+BRINGUP = ('--robot', 'arm26', '--duration', '10')
+#: Tests of the parts that depend on the platform: numbers, libraries, processes, and rclpy.
+TESTS = (
+    'test/robot',
+    'test/signals',
+    'test/mae/test_checkpoint.py',
+    'test/emulator/test_arm.py',
+    'test/emulator/test_foreign.py',
+    'test/bags/test_record_and_replay.py',
+    'test/nodes/test_executor.py',
+    'test/nodes/test_parameters.py',
+    'test/nodes/test_hardware_emulator.py',
+    'test/nodes/test_markers.py',
+    'test/nodes/test_follow_joint_trajectory.py',
+    'test/test_pinocchio_wheel.py',
+)
+KEPT = ('LANG', 'PATH', 'ROS_DOMAIN_ID', 'TERM', 'TMPDIR')
+KEPT_PREFIXES = ('PIP_', 'SSL_', 'http', 'https', 'no_proxy', 'GIT_CONFIG')
+
+
+@dataclass
+class Site:
+    """Where one platform is made: a clone, a log, and what its commands begin with."""
+
+    folder: Path
+    setup: list[str] = field(default_factory=list)  # shell lines before every command
+    inside: list[str] = field(default_factory=list)  # command that runs a shell on the platform
+    clone_inside: str = ''  # path of the clone there, if it is another one
+
+    @property
+    def clone(self) -> Path:
+        """The clone of the repository."""
+        return self.folder / 'clone'
+
+    @property
+    def log(self) -> Path:
+        """Everything that the commands have printed."""
+        return self.folder / 'log.txt'
+
+    def run(self, title: str, *lines: str, on_platform: bool = False) -> str:
+        """Run shell lines, on the platform itself or beside it; return what they print.
+
+        Raises:
+            MusculoskeletalError: If they fail; with the end of the output.
+        """
+        print(f'   {title}', flush=True)
+        script, command = ['set -e', *lines], ['bash', '-c']
+        if on_platform:
+            clone = shlex.quote(self.clone_inside or str(self.clone))
+            script = ['set -e', *self.setup, f'cd {clone}', *lines]
+            command = [*self.inside, *command]
+        ended = subprocess.run(
+            [*command, '\n'.join(script)],
+            cwd=self.folder, env=_environment(self.folder), text=True, errors='replace',
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        with self.log.open('a', encoding='utf-8') as log:
+            log.write(f'\n== {title}\n{ended.stdout}')
+        if ended.returncode != 0:
+            end = '\n'.join(ended.stdout.splitlines()[-25:])
+            raise MusculoskeletalError(
+                f'{title}: status {ended.returncode}; {self.log} ends with\n{end}'
+            )
+        return ended.stdout
+
+
+def _environment(home: Path) -> dict[str, str]:
+    """Return the variables of a login shell without ROS and without this virtual environment."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name in KEPT or name.startswith(KEPT_PREFIXES)
+    }
+    paths = kept.get('PATH', '').split(os.pathsep)
+    kept['PATH'] = os.pathsep.join(path for path in paths if not path.startswith(sys.prefix))
+    return {**kept, 'HOME': str(home)}
+
+
+def interpreter(version: str) -> Path | None:
+    """Return the Python of a version, such as 3.12, of PATH or of pyenv."""
+    pyenv = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv')) / 'versions'
+    candidates = [shutil.which(f'python{version}'), *sorted(pyenv.glob(f'{version}.*/bin/python'))]
+    for candidate in filter(None, candidates):
+        # Those that pyenv puts on PATH may only say that no version is chosen.
+        script = 'import sys, venv; print("%d.%d" % sys.version_info[:2])'
+        run = subprocess.run([candidate, '-c', script], capture_output=True, text=True)
+        if run.stdout.strip() == version:
+            return Path(candidate)
+    return None
+
+
+def _needed(version: str) -> Path:
+    python = interpreter(version)
+    if python is None:
+        raise MusculoskeletalError(f'there is no python{version}, on PATH or of pyenv')
+    return python
+
+
+# --- the platforms -------------------------------------------------------------------------------
+
+
+def _wheels(version: str) -> Callable[[Site], None]:
+    def make(site: Site) -> None:
+        site.setup = [f'export PYTHON={shlex.quote(str(_needed(version)))}']
+
+    return make
+
+
+def _sourced(site: Site) -> None:
+    """Emulate Ubuntu 24.04 with /opt/ros/jazzy sourced, from the wheels.
+
+    The system's Python is a copy with the packages of Ubuntu. The wheels are unpacked into a
+    prefix, which a setup.bash like that of ROS puts on the paths.
+    """
+    python, system, jazzy = _needed('3.12'), site.folder / 'system', site.folder / 'jazzy'
+    base = Path(
+        subprocess.run(
+            [python, '-c', 'import sys; print(sys.base_prefix)'],
+            capture_output=True, text=True, check=True,
+        ).stdout.strip()
+    )  # fmt: skip
+    if base == Path('/usr'):
+        raise MusculoskeletalError('a copy of Python is needed, and /usr cannot be copied: pyenv')
+    packages = 'lib/python3.12/site-packages'
+    system_python = system / 'bin' / 'python3.12'
+    site.run(
+        "Ubuntu's Python and packages",
+        f'cp -a {base} {system}',
+        f'ln -sf python3.12 {system}/bin/python3',
+        f'{system_python} -m pip install --no-compile {" ".join(UBUNTU)}',
+    )
+    site.run(
+        'the prefix of ROS',
+        f'{system_python} -m venv {jazzy}',
+        f'{jazzy}/bin/python -m pip install --no-compile -r {ROS_REQUIREMENTS}',
+        # What is the system's there.
+        f'{jazzy}/bin/python -m pip uninstall -y numpy PyYAML lark-parser empy setuptools',
+        f'rm {jazzy}/bin/python* {jazzy}/pyvenv.cfg',
+    )
+    libraries = [jazzy / 'lib', *sorted((jazzy / packages).glob('ros_*.libs'))]
+    (jazzy / 'setup.bash').write_text(
+        '\n'.join(
+            f'export {line}'
+            for line in (
+                'ROS_VERSION=2 ROS_PYTHON_VERSION=3 ROS_DISTRO=jazzy',
+                'ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET',
+                f'AMENT_PREFIX_PATH={jazzy}',
+                f'PYTHONPATH={jazzy / packages}',
+                f'LD_LIBRARY_PATH={os.pathsep.join(map(str, libraries))}',
+                f'PATH={jazzy}/bin:$PATH',
+            )
+        )
+        + '\n'
+    )
+    site.setup = [f'export PATH={system}/bin:$PATH', f'. {jazzy}/setup.bash']
+
+
+def _sourced_with_pinocchio(site: Site) -> None:
+    _sourced(site)
+    jazzy, wheels = site.folder / 'jazzy', site.folder / 'pinocchio'
+    site.run(
+        'a pinocchio for NumPy 1 in the prefix of ROS',
+        f'{site.folder}/system/bin/python3.12 -m pip install --no-compile --target {wheels}'
+        f' {" ".join(APT_PINOCCHIO)}',
+        f'cp -a {wheels}/cmeel.prefix/lib/. {jazzy}/lib/',
+        f'[ -e {jazzy}/lib/python3.12/site-packages/pinocchio ]',
+    )
+
+
+def _debian_13(site: Site) -> None:
+    """Make a minimal Debian 13 (Python 3.13, no compiler, no libgomp, no venv) and move into it."""
+    root = site.folder / 'debian'
+    if os.getuid() != 0 or shutil.which('debootstrap') is None:
+        raise MusculoskeletalError('a Debian 13 is made by root, with debootstrap')
+    site.run(
+        'Debian 13',
+        f'debootstrap --variant=minbase --include={DEBIAN_PACKAGES} trixie {root}',
+        f'cp /etc/resolv.conf {root}/etc/',
+        # Where registries are reached through a certificate of one's own.
+        f'[ -z "${{PIP_CERT-}}" ] || cp -L "$PIP_CERT" {root}/"$PIP_CERT"',
+        f'[ ! -e /etc/pip.conf ] || cp /etc/pip.conf {root}/etc/',
+        f'cp -a {site.clone} {root}/root/clone',
+    )
+    mounts = f'mount -t proc proc {root}/proc; mount --rbind /dev {root}/dev'
+    site.clone_inside = '/root/clone'
+    site.inside = [
+        'unshare', '--mount', 'bash', '-c', f'{mounts}; HOME=/root exec chroot {root} "$@"', 'bash',
+    ]  # fmt: skip
+    site.setup = ['export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin']
+
+
+PLATFORMS: dict[str, Callable[[Site], None]] = {
+    **{f'wheels-{version}': _wheels(version) for version in ('3.10', '3.11', '3.12', '3.13')},
+    'sourced': _sourced,
+    'sourced-pinocchio': _sourced_with_pinocchio,
+    'debian-13': _debian_13,
+}
+
+
+# --- what is checked there -----------------------------------------------------------------------
+
+
+def check_system(name: str, folder: Path, tests: tuple[str, ...] = TESTS) -> str:
+    """Make a platform in an empty folder; return one line about bring-up and tests there."""
+    site = Site(folder)
+    site.run('cloning', f'git clone -q {shlex.quote(str(ROOT))} clone')
+    PLATFORMS[name](site)
+    output = site.run('bringup.sh', f'./bringup.sh {" ".join(BRINGUP)}', on_platform=True)
+    errors = re.findall(r' s  error ([\d.]+) rad', output)
+    if not errors:
+        raise MusculoskeletalError(f'bringup.sh printed no estimate; see {site.log}')
+    output = site.run(
+        'tests',
+        'repository=$PWD',
+        '. .ci/environment.sh',
+        'environment_setup test',
+        'use_udp',
+        'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST OMP_NUM_THREADS=1',
+        f'"$python" -m pytest -q -p no:cacheprovider {" ".join(tests)}',
+        on_platform=True,
+    )
+    return f'bring-up: error {errors[-1]} rad; tests: {output.splitlines()[-1].strip("= ")}'
+
+
+def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
+    """Return the lines of a requirements file that hold for a Python; of these names, if any."""
+    lines = []
+    for line in file.read_text('utf-8').splitlines():
+        requirement, _, condition = line.partition(';')
+        found = re.match(r'([\w-]+)==', requirement)
+        if found and (not names or found[1] in names):
+            is_old = version == '3.10'
+            if not condition or ('<' in condition) == is_old:
+                lines.append(requirement.strip())
+    return lines
+
+
+def check_node(name: str, folder: Path, checkpoint: Path) -> str:
+    """Check the core and one node in a virtual environment; return one line about it."""
+    version = name.removeprefix('wheels-')
+    site = Site(folder)
+    packages = pinned(ROOT / 'requirements.txt', version, NODE_REQUIREMENTS)
+    packages += pinned(ROS_REQUIREMENTS, version)
+    venv = folder / 'venv'
+    site.run(
+        f'Python {version} with {len(packages)} packages and what they need',
+        f'{shlex.quote(str(_needed(version)))} -m venv {venv}',
+        f'{venv}/bin/python -m pip install --no-compile {" ".join(packages)}',
+    )
+    output = site.run(
+        'a node',
+        f'cd {shlex.quote(str(ROOT))}',
+        f'export AMENT_PREFIX_PATH={venv} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
+        f'{venv}/bin/python -m bench.platform_node {shlex.quote(str(checkpoint))}',
+    )
+    return output.splitlines()[-1]
+
+
+def _options(argv: list[str]) -> argparse.Namespace:
+    parser = Parser('platforms', 'Make platforms, bring the system up there, and run tests.')
+    parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(PLATFORMS))
+    parser.add_argument(
+        '--node', type=Path, metavar='CHECKPOINT',
+        help='check only the core and one node with this checkpoint of arm26, without torch',
+    )  # fmt: skip
+    parser.add_argument('--folder', type=Path, help='where, instead of a temporary folder')
+    parser.add_argument('--tests', nargs='+', default=TESTS, metavar='TEST', help='of pytest')
+    options = parser.parse_args(argv)
+    for name in options.names:
+        if name not in PLATFORMS:
+            parser.error(f'platform {name!r}: expected one of {", ".join(PLATFORMS)}')
+        if options.node and not name.startswith('wheels-'):
+            parser.error(f'platform {name!r}: --node is for the wheels')
+    return options
+
+
+def main(argv: list[str]) -> int:
+    """Check platforms one after another; exit status 1 if one fails."""
+    options = _options(argv)
+    names = options.names or [n for n in PLATFORMS if not options.node or n.startswith('wheels-')]
+    rows, failed = [], 0
+    for name in names:
+        print(f'-- {name}', flush=True)
+        folder = Path(tempfile.mkdtemp(prefix=f'{name}-', dir=options.folder))
+        started = time.monotonic()
+        try:
+            if options.node:
+                outcome = check_node(name, folder, options.node.resolve())
+            else:
+                outcome = check_system(name, folder, tuple(options.tests))
+        except MusculoskeletalError as error:
+            print(error, file=sys.stderr)
+            failed += 1
+            outcome = f'FAILED, see {folder}'
+        else:
+            shutil.rmtree(folder)
+        minutes = (time.monotonic() - started) / 60.0
+        rows.append(f'| {name} | {outcome} | {time.strftime("%Y-%m-%d")} | {minutes:.1f} min |')
+        print(rows[-1], flush=True)
+    print('\n| platform | outcome | date | time |\n|---|---|---|---|')
+    print('\n'.join(rows))
+    return 1 if failed else 0
