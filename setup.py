@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Install the package, its robots and its executables (see setup.cfg for where the latter go)."""
+"""Install the package, its robots and its executables (see setup.cfg for where the latter go).
+
+setup.cfg also states what the package needs of pip, in ranges.
+"""
 
 from collections import defaultdict
 from pathlib import Path
@@ -32,9 +35,6 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         *config_files(),
     ],
-    # What it needs is in package.xml (rosdep) and requirements.txt (pip, pinned). Listing it here
-    # too would make every console script check versions at start.
-    install_requires=['setuptools'],
     # colcon test looks here for the kind of tests there are.
     extras_require={'test': ['pytest']},
     zip_safe=False,
