@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The platforms of doc/installation.md: makes each one, brings the system up there, runs tests.
+"""The platforms of doc/howto/install.md: makes each one, brings the system up there, runs tests.
 
 python -m bench platforms                          # all of them
 python -m bench platforms wheels-3.13 sourced      # some
