@@ -53,6 +53,11 @@ stop() {{ # SCRIPT: ends what runs in the background
   unset "running[$1]"
 }}
 trap 'for script in "${{!running[@]}}"; do stop "$script"; done' EXIT
+ask() {{ # COMMAND: fails if the command does, or if its answer is a refusal
+  eval "$1" | tee answer.log
+  [ "${{PIPESTATUS[0]}}" = 0 ] &&
+    ! grep -qE 'success(ful)?=False|[Ss]etting parameter failed' answer.log
+}}
 background() {{ # SCRIPT COMMAND
   stop "$1"
   local log
@@ -129,6 +134,8 @@ def script(page: Path, repository: str) -> str:
             continue
         if command.is_background:
             line = f'background {shlex.quote(line.split()[0])} {shlex.quote(line)}'
+        if command.line.startswith('ros2 '):
+            line = f'ask {shlex.quote(line)}'
         lines += [line, 'status=$?; [ $status = 0 ] || { echo "exit status $status"; exit 1; }']
     return '\n'.join(lines)
 
