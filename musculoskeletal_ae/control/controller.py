@@ -184,6 +184,7 @@ class Controller:
         self.stopping = SafeStop(robot, self.settings, self.limiter)
         self.sent_at = 0.0  # when the last command went out; its user says so
         self._estimate_problem = Persistence()
+        self._jumped_at = math.inf  # when lengths jumped [s]
         self._suspicion = Suspicion()
         if self.settings.method == 'float':
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
@@ -228,6 +229,8 @@ class Controller:
 
     def _use_sample(self, sample: MuscleSample, now: float) -> None:
         self.sample = sample
+        if sample.jumped:
+            self._jumped_at = now
         self.watchdog.take_sample(sample, now)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
@@ -398,10 +401,26 @@ class Controller:
         present = self.watchdog.conditions(now)
         if why := self.stream.implausible(now):
             present.append(Condition(StopCause.IMPLAUSIBLE_MUSCLE_STATES, why))
+        if why := self._revoked_lengths(now):
+            present.append(Condition(StopCause.LENGTH_OFFSETS_REVOKED, why))
         if why := self._estimate_problem.lasting(now):
             present.append(Condition(StopCause.IMPLAUSIBLE_ESTIMATE, why))
         order = list(StopCause)
         return sorted(present, key=lambda condition: order.index(condition.cause))
+
+    def _revoked_lengths(self, now: float) -> str:
+        """Return why the lengths cannot be relied on, or ''.
+
+        The estimator decides that. Only if it takes no notice of a jump, as one that was started
+        meanwhile, does the controller itself.
+        """
+        stream = self.stream
+        if stream.body.offsets.is_suspect:
+            return 'the estimator has revoked their offsets'
+        has_jumped = stream.displaced and not stream.has_displaced_unseen
+        if has_jumped and stream.body.offsets.known and now - self._jumped_at > AT_ONCE:
+            return f'they jumped: {self.robot.names(sorted(stream.displaced))}'
+        return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:
         """Return the command of this moment, or None while nothing was ever commanded.

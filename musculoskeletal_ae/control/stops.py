@@ -114,6 +114,16 @@ class StopCause(Enum):
             f'{REPAIR}; {RESET}',
         ),
     )
+    LENGTH_OFFSETS_REVOKED = (
+        'length_offsets_revoked',
+        Declaration(
+            'lengths jumped or disagree with joint sensors; their offsets are not found yet',
+            Action.RELEASE,
+            Clears.RESET,
+            'the lengths cannot be relied on',
+            f'call estimator/zero; {RESET}; {EXPLORE}, gently until the offsets are found',
+        ),
+    )
     SECOND_PUBLISHER = (
         'second_publisher',
         Declaration(
@@ -132,7 +142,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.VERIFICATION,
             'muscle_states are implausible',
-            f'check the sensor that is named; {RESET}',
+            f'check the sensor that is named, or call estimator/zero if lengths are off; {RESET}',
         ),
     )
     IMPLAUSIBLE_ESTIMATE = (

@@ -24,7 +24,8 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
-from musculoskeletal_ae.estimation.finding import Finding, Observation
+from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
+from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.length_calibration import (
     LengthCalibration,
@@ -104,6 +105,9 @@ class Estimator:
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.stepped_at = -math.inf
+        self._stated_posture: tuple[float, ...] = ()  # of the last length calibration
+        self._jumps = 0  # of lengths, that were handled
+        self._valid_offsets = self.body.offsets  # the last ones that were known
         self._commands = ModuleCommands()
         self._measured: tuple[float, Array | None] = -math.inf, None  # θ, and when it came
         #: whether the network says which muscles are isolated: until this estimator decides
@@ -180,6 +184,7 @@ class Estimator:
         if self.mae is None:
             raise MusculoskeletalError('no checkpoint, and length offsets are found with a network')
         check_stated_posture(self.robot, posture)
+        self._stated_posture = posture
         stated = np.array(posture) if posture else None
         self.calibration = LengthCalibration(self.robot, self.mae, stated)
         self.forget_offsets()
@@ -187,6 +192,7 @@ class Estimator:
         self.output = None
         self.contact.reset()
         self.reset()
+        self.health.joints.forget()
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
@@ -199,7 +205,16 @@ class Estimator:
         self._measured = now, theta
 
     def reset(self) -> None:
-        """Clear the anomaly: the body is considered healthy as it is."""
+        """Clear the anomaly: the body is considered healthy as it is.
+
+        Raises:
+            MusculoskeletalError: If the length offsets have been revoked, and joint sensors do not
+                agree with the lengths.
+        """
+        if self.body.offsets.is_suspect:
+            if not self.health.joints.agrees:
+                raise MusculoskeletalError(self.cause)
+            self._use_body(self.body.with_offsets(self._valid_offsets))
         self.health.accept(range(self.robot.muscle_count))
         self._clear(self.suspects.clear(self.body.isolated))
 
@@ -255,6 +270,7 @@ class Estimator:
                 self._handle(self.health.read(error.states, self.body.used, now), now)
             raise
         self._handle(self.health.read(sample.newest, self.body.used, now), now)
+        self._handle_jump(now)
         before, self.sample = self.sample, sample
         elapsed = 0.0 if before is None else max(sample.time - before.time, 0.0)
         temperature = np.where(self.body.used, sample.temperature, np.nan)
@@ -280,7 +296,8 @@ class Estimator:
             self._verify(sample, estimate, dt, now)
         demand = self._commands.demand(self.robot, sample.length, now)
         known = self.body.offsets.known
-        finding = self.health.step(Observation(sample, estimate, demand, dt, known))
+        measured = self._measured_theta(now)
+        finding = self.health.step(Observation(sample, estimate, demand, dt, known, measured))
         detected = self._handle(finding, now)
         contact = None
         if known:
@@ -294,8 +311,26 @@ class Estimator:
     # -- what follows ---------------------------------------------------------------------------
 
     def _use_body(self, body: BodyState) -> None:
+        if body.offsets.known:
+            self._valid_offsets = body.offsets
         self.body = body
         self.stream.use_body(body)
+
+    def _measured_theta(self, now: float) -> Array | None:
+        """Return θ [rad] (D,) by joint sensors, if they have reported it with this message."""
+        came, theta = self._measured
+        return theta if now - came < JOINTS_AGE else None
+
+    def _handle_jump(self, now: float) -> None:
+        """Take that lengths have jumped, where detectors do not see it."""
+        if self.stream.jumps == self._jumps:
+            return
+        self._jumps = self.stream.jumps
+        jumped = tuple(sorted(self.stream.displaced))
+        if self.calibration is not None:  # what it has collected is of other offsets
+            self.calibrate_lengths(self._stated_posture)
+        elif self.mae is None and self.body.offsets.known and jumped:
+            self._handle(finding_of(jumped), now)
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Take what detectors found, if anything; return whether it is latched now, and new."""
@@ -305,6 +340,9 @@ class Estimator:
         isolated = self.suspects.take(finding, self.body.isolated, now)
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
+        revokes = finding.kind in REVOKING and finding.muscle not in self.body.isolated
+        if revokes and self.body.offsets.known:
+            self._use_body(self.body.with_offsets(self.body.offsets.revoked()))
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:
             self._follows_network = False
@@ -336,8 +374,7 @@ class Estimator:
         self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
         """Go on with the length calibration; return the newest guess of the offsets, if any."""
-        came, theta = self._measured
-        measured = theta if now - came < JOINTS_AGE else None
+        measured = self._measured_theta(now)
         calibration.step(sample.motor_tension, sample.length_read, dt, measured)
         guess = calibration.offsets
         if guess is None or (calibration.is_standing and not calibration.is_done):

@@ -26,8 +26,16 @@ class Kind(Enum):
     JAMMED_MODULE = 'jammed_module'
     SENSOR_FROZEN = 'sensor_frozen'
     LENGTH_JUMP = 'length_jump'
+    LENGTHS_JUMPED = 'lengths_jumped'
+    LENGTHS_DISAGREE = 'lengths_disagree'
+    JOINT_SENSORS_DISAGREE = 'joint_sensors_disagree'
     THERMAL_DRIFT = 'thermal_drift'
     VALUES_MISSING = 'values_missing'
+
+
+#: findings of lengths that cannot be relied on: unless their muscle is isolated, the length offsets
+#: are not known any more
+REVOKING = frozenset({Kind.LENGTH_JUMP, Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE})
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,7 @@ class Observation:
         demand: T that the modules are commanded [N], (M,); None where nothing is commanded.
         dt: Time since the message before [s], at most a short pause.
         lengths_known: Whether the length offsets are known.
+        measured: θ by joint sensors [rad], (D,); None where not all of them are measured.
     """
 
     sample: MuscleSample
@@ -62,6 +71,7 @@ class Observation:
     demand: Array | None
     dt: float
     lengths_known: bool = True
+    measured: Array | None = None
 
 
 def observe(

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
+from musculoskeletal_ae.estimation.detectors.joint_disagreement import JointDisagreement
 from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
@@ -25,6 +26,7 @@ class HealthMonitor:
 
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
+        joints: The detector of lengths that disagree with joint sensors.
         settings: What the user may choose.
     """
 
@@ -46,11 +48,13 @@ class HealthMonitor:
         self.settings = settings or Detection()
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot, self.settings)
+        self.joints = JointDisagreement(robot)
         self._detectors: list[Detector] = [
             LengthJump(),
             MissingValues(),
             *by_physics,
             self.residual,
+            self.joints,
             FrozenSensor(robot),
             ThermalDrift(heat or Heat(robot)),
         ]

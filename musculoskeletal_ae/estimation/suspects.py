@@ -14,21 +14,38 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
 
 With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
 `estimator/reset`. The same holds after ACQUITTALS suspects were healthy within WITHIN seconds:
-something is wrong that a verification does not show. Two kinds of findings differ:
+something is wrong that a verification does not show. Some kinds of findings differ:
 
-    length_jump      ignored with `on_anomaly: stop`: the new level of the length counts
-    values_missing   never latched; with `on_anomaly: isolate` the muscle is isolated without a
-                     verification, since a sensor without numbers is broken
+    values_missing          never latched; with `on_anomaly: isolate` the muscle is isolated without
+                            a verification, since a sensor without numbers is broken
+    lengths_jumped          of several muscles: none is isolated. The length offsets are revoked,
+    lengths_disagree        and the finding stays latched until they have been found anew. So it
+                            is with a `length_jump` whose muscle is not isolated.
+    joint_sensors_disagree  of no muscle: none is isolated
 """
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Kind
 from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
 from musculoskeletal_ae.estimation.verification import Outcome, Verdict, Verification
 from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS, WITHIN = 2, 60.0  # suspects that were healthy, [s]
+#: findings of which no single muscle can be the cause
+OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
+
+
+FIND_OFFSETS = 'call estimator/zero, which finds the length offsets anew'
+#: what to do about findings that are not of one muscle, for people
+REMEDIES = {
+    Kind.LENGTH_JUMP: FIND_OFFSETS,
+    Kind.LENGTHS_JUMPED: FIND_OFFSETS,
+    Kind.LENGTHS_DISAGREE: FIND_OFFSETS,
+    Kind.JOINT_SENSORS_DISAGREE: (
+        'check the joint sensor and call estimator/reset; if it is right, call estimator/zero'
+    ),
+}
 
 
 class SuspectHandling:
@@ -54,7 +71,9 @@ class SuspectHandling:
         """The latched finding, for people, or ''."""
         if self.finding is None:
             return ''
-        return f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
+        remedy = REMEDIES.get(self.finding.kind, '')
+        what = f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
+        return f'{what}; {remedy}' if remedy else what
 
     @property
     def last_verification(self) -> str:
@@ -79,11 +98,14 @@ class SuspectHandling:
                 return isolated
             self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
             return (*isolated, muscle)
-        if self.finding is not None or (finding.kind is Kind.LENGTH_JUMP and not isolates):
+        if self.finding is not None:
+            if finding.kind in REVOKING and self.finding.kind not in REVOKING:
+                isolated = self.clear(isolated)  # whatever was found, it rests on wrong lengths
+                self.finding = finding
             return isolated
         self.finding = finding
         recent = [time for time in self._acquitted if now - time < WITHIN]
-        if not isolates or len(recent) >= ACQUITTALS:
+        if not isolates or finding.kind in OF_SEVERAL or len(recent) >= ACQUITTALS:
             return isolated
         bias, stiffness = self._robot.description.tension.bias, self._robot.stiffness
         self.verification = Verification(muscle, float(bias[muscle]), float(stiffness[muscle]))

@@ -105,6 +105,10 @@ class Reservoir:
         if self._missing - frozenset(isolated):
             self.clear()
 
+    def forget_newest(self, seconds: float) -> None:
+        """Forget the messages of the last seconds."""
+        self._kept = [row for row in self._kept if row[-1] <= self.time - seconds]
+
     def clear(self) -> None:
         """Forget all, as when the body has changed."""
         self._missing = frozenset()

@@ -90,6 +90,16 @@ class SampleCollector:
         return self._stream.body
 
     @property
+    def has_jumped(self) -> bool:
+        """Whether lengths have jumped before its eyes, and their offsets are those from before."""
+        return bool(self._stream.displaced) and not self._stream.has_displaced_unseen
+
+    @property
+    def jumps(self) -> int:
+        """How often lengths have jumped."""
+        return self._stream.jumps
+
+    @property
     def is_anomaly(self) -> bool:
         """Whether an anomaly is present."""
         return self._margin.is_anomaly

@@ -26,6 +26,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import SENSOR, SampleCollector
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
+from musculoskeletal_ae.learning.offset_check import OffsetCheck
+from musculoskeletal_ae.learning.offset_history import HELD, OffsetHistory
 from musculoskeletal_ae.learning.report import learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, UpdateScheduler
@@ -35,6 +37,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 from musculoskeletal_ae.signals.pairing import Paired
 
@@ -99,6 +102,9 @@ class Learner:
         )
         self.keeper = CheckpointKeeper(robot, samples, directory, way.validates_updates)
         saved = self.keeper.load()
+        self.offset_check = OffsetCheck(self.body.offsets)
+        self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
+        self._time, self._jumps = -math.inf, 0  # of the last message [s]; jumps of lengths so far
         if self.samples:
             # They keep the versions of the body state that they were taken under: count on.
             self._use_body(replace(self.body, version=self.samples.body_version + 1))
@@ -133,18 +139,45 @@ class Learner:
 
         A RejectionError says why it cannot be used.
         """
-        self._learn_from(self.collector.take(time, message))
+        self._learn_from(self.collector.take(time, message), time)
 
     def muscles(self, states: Array, time: float) -> None:
         """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s]."""
-        self._learn_from(self.collector.muscles(time, states))
+        self._learn_from(self.collector.muscles(time, states), time)
 
-    def _learn_from(self, paired: Paired[MuscleSample] | None) -> None:
+    def _learn_from(self, paired: Paired[MuscleSample] | None, time: float) -> None:
+        jumps = self.collector.jumps
+        if not 0.0 <= time - self._time <= LIMITS.pause or jumps != self._jumps:
+            self.offset_history.interrupt()
+        self._time, self._jumps = time, jumps
         if paired is None or not (self.enabled and self.body.offsets.known):
             return
+        if not self._believes_offsets(paired):
+            return
         self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly)
-        if self.collector.collect(paired):
+        for _ in self.collector.collect(paired):
+            self.offset_history.accepted(time)
             self._note_new_samples()
+
+    def _believes_offsets(self, paired: Paired[MuscleSample]) -> bool:
+        """Return whether the lengths of a message can be relied on."""
+        check, measured = self.offset_check, paired.theta
+        was_believed = check.is_believed
+        theta = None if measured is None else measured[: self.robot.joint_count]
+        if not self.collector.has_jumped and not self.collector.is_anomaly:
+            check.step(self.keeper.mae, paired.message, theta, paired.dt)
+        if check.is_believed and not was_believed:
+            self._believe_offsets()
+        return check.is_believed and not self.collector.has_jumped
+
+    def _believe_offsets(self) -> None:
+        """Go by length offsets that the messages agree with."""
+        before = self.offset_history.corrected
+        self.offset_history.use(self.body.offsets.offset)
+        if self.offset_history.corrected != before:
+            self.collector.healthy.clear()
+            self.scheduler.note_news()
+        self.keeper.store()
 
     def accept(self, sample: Sample) -> None:
         """Keep a new sample, on disk too, and learn from it soon."""
@@ -185,9 +218,18 @@ class Learner:
             self._publish_isolation()
 
     def _use_body(self, body: BodyState) -> None:
-        if body.offsets is not self.body.offsets:
+        offsets, has_changed = body.offsets, body.offsets is not self.body.offsets
+        if has_changed:
             self.keeper.reset()
         self.collector.use_body(body)
+        if has_changed:
+            self.offset_check.use(offsets)
+            if offsets.is_suspect:
+                # They stay on disk until it is known which of them are wrong.
+                self.offset_history.revoke(self._time)
+                self.collector.healthy.forget_newest(HELD)
+            elif self.offset_check.is_believed:
+                self._believe_offsets()
         self.keeper.isolate(body.isolated)
         self.keeper.forget_messages()
 
@@ -354,7 +396,11 @@ class Learner:
     @property
     def trouble(self) -> str:
         """Why nothing is learned, or what is learned is not on disk; or ''."""
-        return '; '.join(filter(None, (self.trainer.trouble, self.keeper.trouble)))
+        jumped = ''
+        if self.collector.has_jumped and self.body.offsets.known:
+            jumped = 'lengths have jumped: nothing is learned until estimator/zero'
+        troubles = self.trainer.trouble, self.keeper.trouble, self.offset_check.problem, jumped
+        return '; '.join(filter(None, troubles))
 
     @property
     def idle_time(self) -> float:

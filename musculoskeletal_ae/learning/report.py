@@ -27,6 +27,8 @@ def learner_report(learner: Learner) -> Report:
         message = 'stopped by learner/enable'
     elif not learner.body.offsets.known:
         message = 'waiting until the estimator has found the length zeros'
+    elif not learner.offset_check.is_believed:
+        message = 'comparing new length zeros with the messages'
     elif learner.collector.is_anomaly:
         message = 'stopped by an anomaly until estimator/reset'
     elif (idle_time := learner.idle_time) > LONGEST_IDLE:
@@ -47,6 +49,10 @@ def _values(learner: Learner) -> dict[str, str]:
         'healthy time': f'{collector.healthy.time:.0f} s',
         **learner.trainer.values(),
     }
+    history = learner.offset_history
+    if history.dropped or history.corrected:
+        values['samples dropped with wrong length zeros'] = str(history.dropped)
+        values['samples corrected for wrong length zeros'] = str(history.corrected)
     if learner.isolated:
         values['isolated muscles'] = learner.robot.names(learner.isolated)
     values |= keeper.values()

@@ -9,7 +9,8 @@ stays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -43,6 +44,14 @@ class Sample(NamedTuple):
     #: version of the `BodyState` under which it was taken, and the muscles that were isolated then
     body_version: int = 0
     isolated: tuple[int, ...] = ()
+
+
+class StoredSample(NamedTuple):
+    """A sample with what its store knows about it."""
+
+    sample: Sample
+    known: Bools  # which muscles it says something about, (M,)
+    number: int  # its place among all that were ever accepted, from 1
 
 
 @dataclass(frozen=True)
@@ -133,6 +142,31 @@ class SampleStore:
         """Let all samples but the newest ones say nothing about a muscle any more."""
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
+
+    def take_out(self, numbers: Set[int]) -> list[StoredSample]:
+        """Remove the samples of these numbers; return them."""
+        stored = [*map(StoredSample, self.samples, self.known, self.numbers)]
+        for place in reversed(range(len(stored))):
+            if stored[place].number in numbers:
+                del self.samples[place], self.known[place], self.numbers[place]
+        return [each for each in stored if each.number in numbers]
+
+    def put_back(self, stored: Iterable[StoredSample]) -> None:
+        """Add samples that were taken out, each at its place."""
+        for each in stored:
+            place = bisect(self.numbers, each.number)
+            self.samples.insert(place, each.sample)
+            self.known.insert(place, each.known)
+            self.numbers.insert(place, each.number)
+
+    def lengthen(self, by: Array, first: int) -> int:
+        """Let the lengths of samples from a number on be more by so much [m] (M,); say how many."""
+        places = [i for i, number in enumerate(self.numbers) if number >= first]
+        for i in places:
+            sample = self.samples[i]
+            used = ~np.isin(np.arange(len(by)), sample.isolated)
+            self.samples[i] = sample._replace(length=sample.length + by * used)
+        return len(places)
 
     @property
     def body_version(self) -> int:

@@ -156,6 +156,7 @@ class Estimator(Shell):
     def _reset(self, _: Trigger.Request) -> str:
         cause = self.core.cause
         self.core.reset()
+        self._publish_offsets()
         self.published_anomaly = False
         self.candidates.on_anomaly(False)
         self.detected.publish(Bool(data=False))

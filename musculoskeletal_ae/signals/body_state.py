@@ -17,6 +17,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 
 UNKNOWN = 1.0  # [m] standard deviation of a length offset that is being searched for
+SUSPECT = 2.0  # [m] the same of an offset that was known, and that a finding has revoked
 KNOWN = 0.05  # [m] largest standard deviation of an offset that counts as known
 
 
@@ -41,6 +42,15 @@ class LengthOffsets:
     def known(self) -> bool:
         """Whether the lengths of all muscles can be relied on."""
         return bool((self.deviation < KNOWN).all())
+
+    @cached_property
+    def is_suspect(self) -> bool:
+        """Whether a finding has revoked offsets that were known."""
+        return bool((self.deviation >= SUSPECT).any())
+
+    def revoked(self) -> LengthOffsets:
+        """Return the same offsets, which are not relied on until they are found anew."""
+        return LengthOffsets(self.offset, np.full(len(self.offset), SUSPECT))
 
 
 @dataclass(frozen=True)

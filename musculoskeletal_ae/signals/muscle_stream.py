@@ -64,7 +64,8 @@ class MuscleSample:
         usable: Which muscles count; isolated ones do not.
         newest: l (offset removed), T and temperature of the last message alone, before the median
             against glitches, (3, M).
-        jumped: The one muscle whose length has settled at another level, or None.
+        jumped: The muscles whose lengths have jumped and settled at another level with this
+            message; usually none.
     """
 
     time: float
@@ -76,7 +77,7 @@ class MuscleSample:
     temperature: Array
     usable: Bools
     newest: Array
-    jumped: int | None = None
+    jumped: tuple[int, ...] = ()
 
     def shifted(self, offset: Array) -> MuscleSample:
         """Return the same sample, with lengths that are less by `offset` [m], (M,)."""
@@ -125,24 +126,29 @@ class LevelCheck:
 
 
 class StepCheck:
-    """Checks that no length changes faster than a muscle can; accepts a level that lasts."""
+    """Checks that no length changes faster than a muscle can; accepts a level that lasts.
+
+    It takes lengths as they were read, so that new length offsets do not interrupt it.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._accepted: Array | None = None  # the last lengths that were believed [m], (M,)
         self._last: Array = np.zeros(robot.muscle_count)  # the last lengths, believed or not
         self._last_at, self._settled_since = -math.inf, math.inf
-        self._alone: int | None = None  # the only muscle that jumped, if it is one
-        self.jumped: int | None = None  # the same, once its new level is accepted
+        self._far: Bools = np.zeros(robot.muscle_count, dtype=bool)  # which lengths jumped
+        self._after_pause = False  # whether they did so in a pause of the messages
+        self.jumped: tuple[int, ...] = ()  # the same muscles, once their level is accepted
+        self.jumped_in_pause = False
 
     def problem(self, length: Array, used: Bools, now: float) -> tuple[str, str] | None:
         """Return the reason and the detail if a length jumped, or None.
 
-        `jumped` names the muscle in the one message with which its new level is accepted.
+        `jumped` names the muscles in the one message with which their new level is accepted.
         """
-        self.jumped = None
-        elapsed = min(max(now - self._last_at, 0.0), LIMITS.longest_step)
-        allowed = LIMITS.step + LIMITS.speed * elapsed
+        self.jumped = ()
+        pause = max(now - self._last_at, 0.0)
+        allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
         last, self._last, self._last_at = self._last, length, now
         if self._accepted is None:
             self._accept(length)
@@ -151,14 +157,18 @@ class StepCheck:
         if change.max() <= allowed:
             self._accept(length)
             return None
-        if self._settled_since == math.inf:  # later, others may have moved as far
-            (far,) = np.nonzero(change > allowed)
-            self._alone = int(far[0]) if len(far) == 1 else None
-        if (np.abs(length - last) * used).max() > allowed:
+        if self._settled_since == math.inf:
+            self._far[:] = False
+            self._after_pause = pause > LIMITS.pause
+        jumps = (np.abs(length - last) > allowed) & used
+        if jumps.any():
+            self._far |= jumps
             self._settled_since = now
         self._settled_since = min(self._settled_since, now)
         if now - self._settled_since > LIMITS.settled:
-            self.jumped = self._alone
+            # Others may have moved as far meanwhile, and some may have come back.
+            self.jumped = tuple(np.flatnonzero(self._far & (change > allowed)).tolist())
+            self.jumped_in_pause = self._after_pause
             self._accept(length)
             return None
         muscle = int(change.argmax())
@@ -170,7 +180,16 @@ class StepCheck:
 
 
 class MuscleStream:
-    """Turns the messages of one arm's muscle modules into samples."""
+    """Turns the messages of one arm's muscle modules into samples.
+
+    Attributes:
+        body: Length offsets and isolated muscles.
+        displaced: Muscles whose lengths have jumped and settled at another level, although their
+            offset has not been found anew since. Their lengths cannot be relied on.
+        jumps: How often lengths have jumped and settled at another level.
+        has_displaced_unseen: Whether that happened in a pause of the messages, in which the arm
+            may have moved.
+    """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
         """Expect messages of this robot.
@@ -186,6 +205,9 @@ class MuscleStream:
         self._levels = LevelCheck(robot)
         self._readings: deque[Array] = deque(maxlen=window)  # (3, M) each, l as it was read
         self._implausible = Persistence()
+        self.displaced: frozenset[int] = frozenset()
+        self.has_displaced_unseen = False
+        self.jumps = 0
         self.reset()
 
     def reset(self) -> None:
@@ -201,11 +223,12 @@ class MuscleStream:
 
     def use_body(self, body: BodyState) -> None:
         """Go by another body state from now on."""
-        moved = body.offsets is not self.body.offsets
-        self.body = body
-        if moved:  # the same muscles, measured from other offsets
-            self._steps = StepCheck(self._robot)
+        if body.offsets is not self.body.offsets:  # the same muscles, measured from other offsets
             self._direction = FrictionDirection()
+            if not body.offsets.is_suspect:
+                self.displaced = frozenset()
+        self.displaced -= set(body.isolated)
+        self.body = body
 
     def implausible(self, now: float) -> str:
         """Return why messages have been implausible for longer than a glitch, or ''."""
@@ -237,7 +260,7 @@ class MuscleStream:
         offsets = self.body.offsets
         newest = states.copy()
         newest[0] -= offsets.offset
-        problem = self._problem(newest, now)
+        problem = self._problem(states, newest, now)
         self._implausible.note('' if problem is None else ': '.join(problem), now)
         if problem is not None:
             raise RejectionError(*problem, states)
@@ -261,9 +284,14 @@ class MuscleStream:
             jumped=self._steps.jumped,
         )
 
-    def _problem(self, states: Array, now: float) -> tuple[str, str] | None:
-        known = self.body.offsets.known
+    def _problem(self, read: Array, states: Array, now: float) -> tuple[str, str] | None:
+        known, steps = self.body.offsets.known, self._steps
         problem = self._levels.problem(states, self.body.used, known)
-        if problem is None and known:
-            problem = self._steps.problem(states[0], self.body.used, now)
-        return problem
+        if problem is not None:
+            return problem
+        problem = steps.problem(read[0], self.body.used, now)
+        if steps.jumped:
+            self.has_displaced_unseen = steps.jumped_in_pause
+            self.displaced |= set(steps.jumped)
+            self.jumps += 1
+        return problem if known else None

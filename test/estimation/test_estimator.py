@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 
-from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,7 +14,6 @@ from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.status import SILENCE
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 DT = 0.01
@@ -41,12 +39,12 @@ class Stepped:
             estimates.append(self.core.step(states(message), self.now, self.now))
         return estimates
 
-    def settle(self, message):
-        """Let a message come until its lengths, which jumped, are accepted."""
-        for _ in range(round(LIMITS.settled / DT) + 2):
-            self.now += DT
-            with suppress(RejectionError):
-                self.core.step(states(message), self.now, self.now)
+    def move(self, message):
+        """Let the lengths become those of a message, as fast as a muscle can."""
+        before = self.core.sample.length_read
+        for share in np.linspace(0.0, 1.0, 21):
+            length = before + share * (message.length - before)
+            self.step(message._replace(length=length))
 
     def report(self):
         return self.core.report(self.now)
@@ -100,14 +98,14 @@ def test_an_anomaly_is_detected_once_and_latched_with_its_first_suspect(
     assert reported.index(True) == 4 and sum(reported) == 1
     suspect = robot.muscles[1]
     assert stepped.core.cause.startswith(f'{suspect}: ')
-    stepped.settle(healthy)
+    stepped.move(healthy)
     stepped.step(healthy, 10)
     report = stepped.report()
     assert report.level == 'error' and suspect in report.message
     assert report.values['suspect muscle'] == suspect
     stepped.core.reset()
     assert stepped.report().level == 'ok'
-    stepped.settle(wound)
+    stepped.move(wound)
     stepped.core.reset()
     assert any(estimate.detected for estimate in stepped.step(wound, 5))
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What becomes of a message of the muscle modules."""
 
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,9 +96,45 @@ def test_a_jump_of_one_length_is_rejected_until_it_has_lasted_and_names_its_musc
         except RejectionError as rejection:
             rejected += rejection.reason == 'length jumped'
         else:
-            jumped += [sample.jumped] * (sample.jumped is not None)
+            jumped += sample.jumped
     assert jumped == [1]
     assert rejected * PERIOD == pytest.approx(LIMITS.settled, abs=0.05)
+
+
+def jump_together(stream, size=0.05, pause=0.0):
+    """Let several lengths jump in a stream; return which the samples name as jumped."""
+    jumped, stream_time = [], 0.0
+    for n in range(200):
+        stream_time += PERIOD + pause * (n == 20)
+        states = resting()
+        states[0, :3] += size * (n >= 20) * np.array([1.0, -1.0, 0.8])
+        with suppress(RejectionError):
+            jumped += stream.take_states(states, stream_time).jumped
+    return jumped
+
+
+def test_lengths_that_jump_together_are_all_named_and_displaced_until_new_offsets_are_found():
+    stream = MuscleStream(ROBOT)
+    assert jump_together(stream) == [0, 1, 2]
+    assert stream.displaced == {0, 1, 2}
+    assert not stream.has_displaced_unseen
+    stream.use_body(HEALTHY.with_offsets(HEALTHY.offsets.revoked()))
+    assert stream.displaced == {0, 1, 2}
+    stream.use_body(HEALTHY.with_offsets(LengthOffsets.unknown(M)))
+    assert not stream.displaced
+
+
+def test_a_jump_in_a_pause_of_the_messages_is_told_from_one_that_was_seen():
+    stream = MuscleStream(ROBOT)
+    assert jump_together(stream, size=0.09, pause=2.0 * LIMITS.pause) == [0, 1, 2]
+    assert stream.has_displaced_unseen
+
+
+def test_an_isolated_muscle_is_no_longer_displaced():
+    stream = MuscleStream(ROBOT)
+    jump_together(stream)
+    stream.use_body(HEALTHY.with_isolated([1]))
+    assert stream.displaced == {0, 2}
 
 
 def test_implausible_messages_are_a_fault_once_they_outlast_a_glitch():

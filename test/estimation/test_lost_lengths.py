@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Modules that lose their count: nothing relies on their lengths until they are found anew."""
+
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.finding import Kind
+from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.signals.muscle_stream import RejectionError
+
+DT = 0.01
+SIGNS = np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
+SEVERAL = 0.05 * SIGNS
+ONE = 0.06 * (np.arange(6) == 2)
+
+
+class Wandering:
+    """An estimator, and a model arm that wanders; lengths and joint sensors may be off."""
+
+    def __init__(self, robot, mae, **detection):
+        self.robot, self.core, self.time = robot, Estimator(robot), 0.0
+        self.core.use(mae)
+        self.core.configure(Detection(**detection))
+        self.rng = np.random.default_rng(0)
+        self.off, self.joint_off = np.zeros(robot.muscle_count), np.zeros(robot.joint_count)
+        self.tension = robot.tension.bias + 20.0
+
+    def go(self, seconds, sensors=True):
+        for _ in range(round(seconds / DT)):
+            self.time += DT
+            middle = 0.5 * (self.robot.lower + self.robot.upper)
+            span = 0.25 * (self.robot.upper - self.robot.lower)
+            theta = middle + span * np.sin([0.5 * self.time, 0.7 * self.time])
+            tension = self.tension + self.rng.standard_normal(len(self.tension))
+            length = self.robot.muscle_lengths(theta, tension) + self.off
+            length += 1e-4 * self.rng.standard_normal(len(length))
+            if sensors:
+                self.core.joints(theta + self.joint_off, self.time)
+            states = np.array([length, tension, np.full_like(length, 25.0)])
+            with suppress(RejectionError):
+                self.core.step(states, self.time, self.time)
+
+    @property
+    def kind(self):
+        finding = self.core.suspects.finding
+        return None if finding is None else finding.kind
+
+    @property
+    def offsets(self):
+        return self.core.body.offsets
+
+
+@pytest.mark.parametrize(
+    ('jump', 'on_anomaly', 'kind'),
+    [
+        (SEVERAL, 'stop', Kind.LENGTHS_JUMPED),
+        (SEVERAL, 'isolate', Kind.LENGTHS_JUMPED),
+        (ONE, 'stop', Kind.LENGTH_JUMP),
+    ],
+)
+def test_lengths_that_jump_revoke_their_offsets_until_they_are_found_anew(
+    robot, mae, jump, on_anomaly, kind
+):
+    arm = Wandering(robot, mae, on_anomaly=on_anomaly)
+    arm.go(2.0, sensors=False)
+    arm.off = jump
+    arm.go(2.0, sensors=False)
+    assert arm.kind is kind
+    assert arm.offsets.is_suspect
+    assert arm.core.body.isolated == ()
+    with pytest.raises(MusculoskeletalError, match='estimator/zero'):
+        arm.core.reset()
+    assert 'estimator/zero' in arm.core.report(arm.time).message
+    arm.core.calibrate_lengths()
+    assert arm.kind is None
+    assert not arm.offsets.is_suspect
+    assert not arm.offsets.known
+
+
+def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.core = Estimator(robot)
+    arm.go(1.0)
+    arm.off = SEVERAL
+    arm.go(2.0)
+    assert arm.offsets.is_suspect
+
+
+def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.core.calibrate_lengths()
+    arm.go(3.0)
+    before = arm.core.calibration
+    arm.off = SEVERAL
+    arm.go(2.0)
+    assert arm.core.calibration is not before
+
+
+def test_offsets_are_those_of_before_once_joint_sensors_agree_with_the_lengths(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.go(8.0)
+    before = arm.offsets
+    arm.off = SEVERAL
+    arm.go(2.0)
+    with pytest.raises(MusculoskeletalError, match='estimator/zero'):
+        arm.core.reset()
+    arm.off = np.zeros(6)
+    arm.go(3.0)
+    arm.core.reset()
+    assert arm.kind is None
+    assert arm.offsets is before
+
+
+@pytest.mark.parametrize('size', [0.03, 0.08])
+def test_lengths_that_drift_are_found_by_joint_sensors(robot, mae, size):
+    arm = Wandering(robot, mae)
+    arm.go(8.0)
+    for share in np.linspace(0.0, 1.0, 50):
+        arm.off = 2.0 * share * size * SIGNS
+        arm.go(0.1)
+    arm.go(2.0)
+    assert arm.kind is Kind.LENGTHS_DISAGREE
+    assert arm.offsets.is_suspect
+
+
+def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.off = 2.0 * SEVERAL
+    arm.go(4.0)
+    assert arm.kind is Kind.LENGTHS_DISAGREE
+
+
+def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.go(8.0)
+    arm.joint_off = np.array([0.0, 1.0])
+    arm.go(4.0)
+    assert arm.kind is Kind.JOINT_SENSORS_DISAGREE
+    assert robot.joints[1] in arm.core.cause
+    assert arm.offsets.known
+    arm.joint_off[:] = 0.0
+    arm.go(2.0)
+    arm.core.reset()
+    arm.go(3.0)
+    assert arm.kind is None
+
+
+def test_a_healthy_arm_with_joint_sensors_is_healthy(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.go(20.0)
+    assert arm.kind is None

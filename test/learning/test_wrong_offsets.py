@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nothing is learned from lengths with wrong offsets, and a false finding costs no sample."""
+
+import numpy as np
+import pytest
+
+from learning.test_learner import Arm, Prepared
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.margin import MARGIN
+from musculoskeletal_ae.learning.offset_history import OffsetHistory
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.signals.body_state import LengthOffsets
+
+OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
+POSTURE = 1.0 + MARGIN + 0.5  # [s] of rest after which there is a sample
+
+
+class Displaced(Arm):
+    """An arm whose lengths read too much."""
+
+    off = np.zeros(6)
+
+    def send(self, sample):
+        super().send(sample._replace(length=sample.length + self.off))
+
+
+@pytest.fixture
+def learner(arm26, initial):
+    return Learner(arm26, initial, trainer=Prepared)
+
+
+@pytest.fixture
+def arm(learner, stage):
+    arm = Displaced(learner, stage)
+    for _ in range(2):
+        arm.rest(POSTURE)
+    assert len(learner.samples) == 2
+    return arm
+
+
+def use(learner, offset, known=True):
+    offsets = LengthOffsets(np.asarray(offset, dtype=float), np.full(6, 0.001 if known else 1.0))
+    learner.use_body(learner.body.with_offsets(offsets))
+
+
+def revoke(learner):
+    learner.use_body(learner.body.with_offsets(learner.body.offsets.revoked()))
+
+
+def lengths(learner):
+    return [sample.length for sample in learner.samples.samples]
+
+
+@pytest.mark.parametrize('false', [OFF, -OFF, np.full(6, 0.08)])
+def test_false_zeros_are_not_believed_and_cost_nothing(learner, arm, false):
+    before = lengths(learner)
+    use(learner, np.zeros(6), known=False)
+    use(learner, false)
+    for _ in range(3):
+        arm.rest(POSTURE)
+    assert len(learner.samples) == 2
+    report = learner.report()
+    assert report.level == 'error'
+    assert 'length zeros do not agree' in report.message
+    assert 'estimator/zero' in report.message
+    use(learner, np.zeros(6), known=False)
+    use(learner, np.full(6, 0.001))  # as estimator/zero finds them
+    arm.rest(2.0 * POSTURE)
+    arm.rest(POSTURE)
+    assert len(learner.samples) >= 3
+    np.testing.assert_array_equal(lengths(learner)[:2], before)
+    assert learner.report().level == 'ok'
+
+
+def test_zeros_that_a_power_cycle_changed_are_believed_and_older_samples_stay(learner, arm):
+    before = lengths(learner)
+    use(learner, np.zeros(6), known=False)
+    arm.off = OFF
+    arm.rest(POSTURE)
+    use(learner, OFF)
+    for _ in range(2):
+        arm.rest(POSTURE)
+    assert len(learner.samples) >= 3
+    np.testing.assert_array_equal(lengths(learner)[:2], before)
+
+
+def test_samples_of_the_last_seconds_before_a_finding_are_put_back_if_it_was_false(learner, arm):
+    before = lengths(learner)
+    revoke(learner)
+    assert len(learner.samples) < 2
+    use(learner, np.zeros(6), known=False)
+    use(learner, np.full(6, 0.002))
+    arm.rest(3.0)
+    np.testing.assert_array_equal(lengths(learner)[:2], before)
+
+
+def test_they_are_dropped_if_other_zeros_are_found(learner, arm):
+    (first, *_), numbers = lengths(learner), learner.samples.accepted
+    revoke(learner)
+    held = 2 - len(learner.samples)
+    assert held > 0
+    use(learner, np.zeros(6), known=False)
+    arm.off = OFF
+    use(learner, OFF)
+    arm.rest(POSTURE)
+    assert learner.report().values['samples dropped with wrong length zeros'] == str(held)
+    assert learner.samples.accepted >= numbers
+    for number in learner.samples.numbers:
+        assert number == 1 or number > numbers
+    np.testing.assert_array_equal(lengths(learner)[:1], [first][: 2 - held])
+
+
+@pytest.mark.parametrize(('is_interrupted', 'corrected'), [(False, 2), (True, 0)])
+def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
+    stage, is_interrupted, corrected
+):
+    store, wrong = SampleStore(), np.full(6, 0.09)
+    history = OffsetHistory(store, np.zeros(6))
+    true = [stage.sample() for _ in range(4)]
+    for sample in true[:2]:
+        store.add(sample)
+    history.use(wrong)
+    for sample in true[2:]:
+        store.add(sample._replace(length=sample.length - wrong))
+    if is_interrupted:  # a power cycle may be why they are others
+        history.interrupt()
+    history.use(np.zeros(6))
+    assert history.corrected == corrected
+    if not is_interrupted:
+        for sample, expected in zip(store.samples, true, strict=True):
+            np.testing.assert_allclose(sample.length, expected.length)
+
+
+def test_nothing_is_learned_after_a_jump_of_lengths_until_they_are_found_anew(learner, arm):
+    arm.off = OFF
+    arm.rest(4.0)
+    for _ in range(3):
+        arm.rest(POSTURE)
+    assert len(learner.samples) == 2
+    assert 'lengths have jumped' in learner.report().message
