@@ -41,7 +41,8 @@ class OffsetHistory:
     def __init__(self, samples: SampleStore, offset: Array) -> None:
         """Begin with offsets [m] (M,)."""
         self._samples, self._offset = samples, offset
-        self._first = samples.accepted + 1  # number of the first sample under these offsets
+        #: number of the first sample since when all are under the present offsets
+        self._first = samples.accepted + 1
         self._recent: deque[tuple[float, int]] = deque()  # when they were taken [s], and numbers
         self._held: list[StoredSample] = []
         self._is_revoked = False
@@ -75,7 +76,8 @@ class OffsetHistory:
             self.dropped += len(self._held)
             if self._is_continuous and not self._is_revoked and size > SEEN:
                 self.corrected += self._samples.lengthen(change, self._first)
-            self._first = self._samples.accepted + 1
+            else:
+                self._first = self._samples.accepted + 1
         self._held = []
         if size > SAME or self._is_revoked:
             self._recent.clear()
