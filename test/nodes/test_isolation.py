@@ -90,3 +90,9 @@ def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, ar
     graph.wait(lambda: reported, 'the list')
     assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
+    # From now on the estimator knows them, and believes no other network.
+    graph.wait(lambda: not estimator.candidates.queue.is_busy, 'the end of the validation')
+    others = replace(trained['default'].without((1, 2)), version=6)
+    graph.send_network(checkpoint.to_bytes(others))
+    graph.wait(lambda: estimator.checkpoint_version == 6, 'the next network')
+    assert estimator.core.body.isolated == (4,)
