@@ -14,6 +14,7 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import shown
+from musculoskeletal_ae.signals.body_state import KNOWN
 
 LEAST_SHARE = 10.0  # [%] of its speed, from which on a trajectory's duration says more
 DOING = {
@@ -87,6 +88,8 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
+        unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
+        values['unknown length zeros'] = robot.names(unknown)
         warnings.append('length offsets are unknown: the arm only explores, gently')
     if tense := core.watchdog.overload.tense:
         warnings.append(f'tension above {shown(robot.tension.limit)} N: {", ".join(tense)}')

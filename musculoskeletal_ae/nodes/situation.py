@@ -221,11 +221,16 @@ class Situation:
         ]
 
     def _body(self) -> list[str]:
-        """Return what the estimator does not know of the body, or leaves out."""
+        """Return what is not known of the body, or left out.
+
+        The controller may not know zeros that the estimator takes for known: one that was started
+        again takes those that were right at its first start.
+        """
         values, parts = self._values('estimator'), []
         if isolated := values.get('isolated muscles'):
             parts.append(f'isolated: {isolated}')
-        if unknown := values.get('unknown length zeros'):
+        zeros = 'unknown length zeros'
+        if unknown := values.get(zeros) or self._values('controller').get(zeros):
             parts.append(_with_remedy(f'length zeros unknown: {unknown}', ZERO))
         return parts
 

@@ -194,6 +194,10 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
         'isolated: biceps, length zeros unknown: triceps (to go on: call estimator/zero), '
         'warning: /sim: slow'
     )
+    situation.diagnosed(said('/estimator', finding='none', state='estimating'))
+    situation.diagnosed(said('/controller', mode='idle', unknown_length_zeros='triceps'))
+    assert situation.trouble().startswith('length zeros unknown: triceps (to go on: ')
+    situation.diagnosed(said('/controller', mode='idle'))
     several = {'several_publishers': 'joint_states come from a and b', 'finding': 'none'}
     situation.diagnosed(said('/estimator', 'two', DiagnosticStatus.ERROR, **several))
     assert (situation.level(), situation.trouble()) == (
