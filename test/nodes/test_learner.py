@@ -82,13 +82,13 @@ class HostedLearner:
         self.arm = Arm(graph, robot)
         self.node.now = lambda: self.arm.time
         self.taken = 0
-        muscles = self.node.core.muscles
+        take = self.node.core.take
 
-        def take(*values):
+        def taking(*values):
             self.taken += 1
-            muscles(*values)
+            take(*values)
 
-        self.node.core.muscles = take
+        self.node.core.take = taking
 
     @property
     def samples(self):
