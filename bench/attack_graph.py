@@ -154,6 +154,7 @@ class Attack:
         self.lying: list[tuple[float, float]] = []
         self.strangers: list[Process] = []  # second nodes
         self.watches_processes = True  # whether one that ends is a finding
+        self._learner, self._other_learners = '', set[str]()  # identities in reports
         self._lying_since = 0.0  # [s]; 0: sensors do not
         self._topics: dict[str, str] = {}
         self._services: dict[str, str] = {}
@@ -259,6 +260,12 @@ class Attack:
 
     def _count_samples(self, status: DiagnosticStatus) -> None:
         values = {value.key: value.value for value in status.values}
+        identity = values.get('identity', '')
+        if self.strangers and identity != self._learner:
+            self._other_learners.add(identity)
+        if identity in self._other_learners:
+            return
+        self._learner = identity
         accepted = int(values.get('accepted', '0'))
         if accepted < self.samples:
             self.found('samples survive', f'{self.samples} samples accepted, {accepted} now')
