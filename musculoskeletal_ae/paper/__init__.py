@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's method to the letter, to be held beside the print.
+"""The method exactly as the paper describes it, for comparison with the printed text.
 
 K. Kawaharazuka et al., "Musculoskeletal AutoEncoder: A Unified Online Acquisition Method of
 Intersensory Networks for State Estimation, Control, and Simulation of Musculoskeletal Humanoids",
-IEEE Robotics and Automation Letters, 2020. Equations are numbered as in the print:
+IEEE Robotics and Automation Letters, 2020. Equation numbers are those of the paper:
 
     §III-A          network.py            layers, units, masks
     §III-B  (2, 3)  initial_training.py   random states of the geometric model, L_initial, Adam
@@ -15,7 +15,8 @@ IEEE Robotics and Automation Letters, 2020. Equations are numbered as in the pri
     §III-F  (13,14) simulation.py         both simulations
     §IV-A           exploration.py        the three steps of random motion
 
-`constants.py` holds the printed numbers, and what this project chose where the print is silent.
-Everything here runs as preset `paper`; `presets/` is the only other place that names it. What both
-presets share (the network's arithmetic, Adam, the geometric model) is imported.
+`constants.py` holds the printed numbers, and the values that this project chose where the paper
+gives none. Preset `paper` runs the code of this folder; outside it, only `presets/` imports it.
+Parts that both presets share (the network's arithmetic, Adam, the geometric model) are imported
+from elsewhere.
 """

@@ -5,7 +5,7 @@ from typing import Literal
 
 # §III-A: units of the encoder's hidden layers; the decoder's are the reverse.
 HIDDEN = (200, 30)
-# Not printed. tanh is smooth, which the descent through the decoder needs.
+# Not printed. The descent through the decoder needs a smooth function, such as tanh.
 ACTIVATION: Literal['tanh', 'silu'] = 'tanh'
 
 # §III-B: L_initial and its descent.
@@ -16,13 +16,13 @@ INITIAL_EPOCHS = 30  # C_epoch
 INITIAL_BATCH = 100
 INITIAL_SAMPLES = 10_000
 INITIAL_STEPS = INITIAL_EPOCHS * INITIAL_SAMPLES // INITIAL_BATCH
-STEP_SIZE = 1e-3  # of Adam; not printed: Adam's own default
+STEP_SIZE = 1e-3  # of Adam; not printed, so this is Adam's default
 
 # §III-C: online learning.
 ONLINE_BATCHES = 10  # C_batch
 ONLINE_EPOCHS = 10  # C_epoch
-THRESHOLD = 20  # C_thre: learning begins when there are more samples than this
-DATA = 10  # C_data: samples chosen at random for a batch
+THRESHOLD = 20  # C_thre: learning begins when more samples than this are stored
+DATA = 10  # C_data: stored samples drawn at random for each batch
 
 # §III-E: the proposed control.
 CONTROL_WEIGHTS = (1.0, 1.0, 0.01)  # w₁ of ‖T‖, w₂ of the posture, w₃ of the torque

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control methods by muscle lengths (§III-E).
+"""The control methods that command muscle lengths (§III-E).
 
     muscle stiffness control   T_target = T_bias + max(0, K_stiff (l − l_target))            (5)
                                l_comp(T) = −(T − T_bias)/K_stiff                             (6)
@@ -13,11 +13,12 @@
                             + w₃‖τ_target + Gᵀ(θ_target, T_current) T‖₂                      (9)
                 l_target = l_calc + l_comp(T_calc)                                           (12)
 
-(5) runs in the muscle modules. Not printed, and chosen here: T_current is read once, when a method
-starts; τ in (9) is in N·m and T in the network's units; G is a forward difference by Δθ = 0.01 rad.
+The muscle modules compute (5). The paper does not state the following, which we chose: T_current is
+read once, when a method starts. τ in (9) is in N·m and T in the network's units. G is a forward
+difference with Δθ = 0.01 rad.
 
-Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command,
-where T is T_const or T_current.
+Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command. T
+is T_const or T_current.
 """
 
 import numpy as np
@@ -41,7 +42,7 @@ SEARCH = StepSearch(CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS)
 
 
 def geometric(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
-    """Return the command by the geometric model, without the network."""
+    """Return the command of the geometric model; it does not use the network."""
     bias = np.full(robot.muscle_count, robot.tension.bias)
     return Solution(robot.muscle_lengths(theta, bias), bias, np.zeros(robot.joint_count))
 
@@ -53,14 +54,14 @@ def first(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -
 
 
 def second(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
-    """Return the command (8) for T_current; it follows on `first`."""
+    """Return the command (8) for T_current; this method runs after `first`."""
     return first(robot, mae, theta, torque, tension)
 
 
 def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
     """Return the command (12) for T_current.
 
-    It knows no limits of tension, and what it leaves of the torque is not reported as missing.
+    It does not enforce tension limits and always reports a torque error of zero.
     """
     terms = control_loss(robot, mae, theta, torque, tension)
     z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
@@ -77,17 +78,17 @@ def control_loss(
     jacobian = muscle_jacobian(mae, theta, tension)
     jacobian[list(robot.isolated)] = 0.0
     rows = np.eye(joints + 2 * muscles)
-    pull = rows[joints : joints + muscles]
+    tension_rows = rows[joints : joints + muscles]
     tension_weight, posture_weight, torque_weight = CONTROL_WEIGHTS
     return (
-        Term(tension_weight, pull, np.zeros(muscles)),
+        Term(tension_weight, tension_rows, np.zeros(muscles)),
         Term(posture_weight, rows[:joints], theta),
-        Term(torque_weight, jacobian.T @ pull / TENSION_SCALE, -torque),
+        Term(torque_weight, jacobian.T @ tension_rows / TENSION_SCALE, -torque),
     )
 
 
 def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_STEP) -> Array:
-    """Return G(θ, T) [m/rad] (..., M, D): the difference of ① at θ and at θ + Δθ."""
+    """Return G(θ, T) [m/rad] (..., M, D), the difference of ① between θ and θ + Δθ."""
     joints = theta.shape[-1]
     offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])
     postures = theta[..., None, :] + offsets  # (..., D+1, D)

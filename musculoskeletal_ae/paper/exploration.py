@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random motion that collects data (§IV-A): three steps, repeated.
 
-1. 5 s: first (7) with a random θ_target and T_const = T_bias,
-2. 2 s: second (8), the same θ_target with the tension of the moment,
-3. 3 s: first (7) again with a random T_const in [T_bias, T_limit].
+1. 5 s: `first` (7) with a random θ_target and T_const = T_bias, 2. 2 s: `second` (8) with the same
+θ_target and the current tension, 3. 3 s: `first` (7) again with a random T_const in [T_bias,
+T_limit].
 
-Not printed, and chosen here: targets are drawn among the postures that the arm can hold with
-tensions in [T_bias, T_limit], and each step ramps the command and then rests, since the body is
-learned at rest (`control/ramps.py`).
+The paper does not state the following, which we chose. Targets are drawn from the postures that the
+arm can hold with tensions in [T_bias, T_limit]. Each step ramps the command and then holds it,
+because the body is learned from rest samples (`control/ramps.py`).
 """
 
 from collections.abc import Callable
@@ -39,8 +39,8 @@ def three_steps(
     """Return the three steps at one random posture.
 
     Args:
-        robot: The body, whose isolated muscles pull nothing.
-        rng: Draws what is random.
+        robot: The body; its isolated muscles carry no tension.
+        rng: Random number generator of all draws.
         posture: Draws θ_target.
         constant_tension: Draws T_const of the third step.
 

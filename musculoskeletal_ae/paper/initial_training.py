@@ -4,8 +4,8 @@
     (θ, T, l) = (θ_r, T_r, f_geo(θ_r) − L_e(f_geo,abs(θ_r), T_r))                            (2)
     L_initial = w_θ ‖θ − θ_calc‖₂ + w_T ‖T − T_calc‖₂ + w_l ‖l − l_calc‖₂                    (3)
 
-Not printed, and chosen here: θ_r is uniform within the joint limits, and T_r of each muscle is
-uniform in [0, T_max].
+The paper does not state the distributions. We chose θ_r uniform within the joint limits, and T_r of
+each muscle uniform in [0, T_max].
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def random_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
-    """Return random states of the geometric model (2)."""
+    """Return `count` random states of the geometric model (2)."""
     theta = robot.random_postures(count, rng)
     tension = rng.uniform(0.0, robot.tension.max, (count, robot.muscle_count))
     absolute = robot.routes.absolute_lengths(theta)  # f_geo,abs
@@ -43,12 +43,12 @@ def loss(network: Network, values: Tensor, mask: Tensor) -> Tensor:
 
     Args:
         network: The network.
-        values: (N, D+2M).
-        mask: Which of ①, ②, ③ each of them enters by, 0 to 2, (N,).
+        values: Scaled states, (N, D+2M).
+        mask: Index of the mask ①, ② or ③ under which each state is encoded, 0 to 2, (N,).
     """
     error = network(values, mask) - values
     parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)
-    # TINY keeps the gradient of a norm finite where nothing is wrong.
+    # TINY keeps the gradient of a norm finite where the error is zero.
     norms = torch.stack([(part.sum(dim=1) + TINY).sqrt().mean() for part in parts])  # (3,)
     return norms @ norms.new_tensor(WEIGHTS)
 
@@ -56,12 +56,12 @@ def loss(network: Network, values: Tensor, mask: Tensor) -> Tensor:
 def train(
     robot: Robot, seed: int = 0, steps: int = INITIAL_STEPS, progress: Progress | None = None
 ) -> TrainedNetwork:
-    """Train a new network by Adam, entering each sample by ①, ② or ③ at random.
+    """Train a new network by Adam; encode each sample under ①, ② or ③ at random.
 
     Args:
         robot: The geometric model.
-        seed: Draws states, weights, masks and the order of the samples.
-        steps: Mini-batches in all.
+        seed: Seed of the states, weights, masks and the order of the samples.
+        steps: Total number of mini-batches.
         progress: Called after every mini-batch.
     """
     rng = np.random.default_rng(seed)

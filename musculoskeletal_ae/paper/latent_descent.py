@@ -4,8 +4,8 @@
     g = dL/dz                                                                               (10)
     z ← z − γ g/‖g‖₂                                                                        (11)
 
-with the best of N step sizes γ in [0, γ_max], C times. The losses (9), (13) and (14) are sums of
-norms of affine maps of the decoded state:
+Each of C iterations takes the best of N step sizes γ in [0, γ_max]. The losses (9), (13) and (14)
+are sums of norms of affine maps of the decoded state:
 
     L(z) = Σ_k w_k ‖A_k y − b_k‖₂,   y = f_decode(z) in scaled units
 """
@@ -18,7 +18,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-# Norms have no gradient at zero; below this they count as reached.
+# A norm has no gradient at zero. This summand keeps the divisions by norms finite.
 TINY = 1e-12
 
 
@@ -39,10 +39,10 @@ class StepSearch(NamedTuple):
 
 
 class Loss:
-    """L of several terms as one affine map: many small products cost more than a large one."""
+    """L of several terms as one affine map: one large product is faster than many small ones."""
 
     def __init__(self, terms: Sequence[Term]) -> None:
-        """Put the terms below each other."""
+        """Stack the rows of all terms."""
         rows = np.array([len(term.target) for term in terms])
         self._weights = np.array([term.weight for term in terms])
         self._matrix = np.concatenate([term.matrix for term in terms])
@@ -69,9 +69,9 @@ class Loss:
 
 
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
-    """Return z after the descent, from z of shape (D+M,)."""
+    """Return z (D+M,) after the descent from an initial z (D+M,)."""
     loss = Loss(terms)
-    # γ = 0 is a candidate, so that the loss never rises.
+    # With γ = 0 among the candidates, the loss never rises.
     steps = np.linspace(0.0, search.largest_step, search.candidates + 1)[:, None]
     for _ in range(search.epochs):
         y, pullback = mae.decode_scaled.with_pullback(z)

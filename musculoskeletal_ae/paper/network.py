@@ -8,8 +8,8 @@
     ② f_encode,2(T, l) = f_encode(0, T, l, (0, 1, 1))
     ③ f_encode,3(θ, l) = f_encode(θ, 0, l, (1, 0, 1))
 
-θ, T and l enter in [rad], [N/200] and [mm/100] (`mae/units.py`), without any other scaling. The
-latent layer and the output are linear.
+The inputs θ, T and l are in [rad], [N/200] and [mm/100] (`mae/units.py`), without any other
+scaling. The latent layer and the output layer are linear.
 """
 
 import numpy as np

@@ -3,17 +3,18 @@
 
     batch = {newest, (0, 0, 0), C_data random stored ones} × {①, ②, ③},   3 (C_data + 2) entries
 
-The network is updated as soon as more than C_thre samples are stored. A sample is stored where θ
-or T deviates from all stored ones by a threshold while the robot is at rest; both presets share
-that rule (`learning/samples.py`, `learning/rest.py`).
+The network is updated as soon as more than C_thre samples are stored. A sample is stored if the
+robot is at rest and θ or T differs from all stored samples by a threshold. Both presets share that
+rule (`learning/samples.py`, `learning/rest.py`).
 
-"The number of batches C_batch = 10" can be read as ten such batches, each with its own random
-samples, gone through ten times: 100 steps of 36 entries. Or as mini-batches of ten within one batch
-of 36: 4 × 10 steps. The first is chosen: the text calls the 36 entries "a batch", so their number
-counts such batches; and with the second an update would see only ten stored samples.
+"The number of batches C_batch = 10" has two readings. Ten such batches, each with its own random
+samples, are repeated for ten epochs: 100 steps of 36 entries. Or one batch of 36 entries is split
+into mini-batches of ten: 4 × 10 steps. We chose the first. The text calls the 36 entries "a batch",
+and under the second reading an update would use only ten stored samples.
 
-Not printed, and chosen here: the loss is L_initial (3) with its weights, the optimiser is Adam with
-the step size of initial training, and its moments are kept from update to update.
+The paper does not state the following, which we chose. The loss is L_initial (3) with its weights.
+The optimiser is Adam with the step size of initial training, and it keeps its moments between
+updates.
 """
 
 import numpy as np
@@ -38,7 +39,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def draw_batch(values: Array, rng: np.random.Generator) -> Array:
-    """Return the rows of a batch, which each of ①, ②, ③ enters once, (3 (C_data + 2), D+2M).
+    """Return the rows of a batch, once for each of ①, ②, ③, (3 (C_data + 2), D+2M).
 
     Args:
         values: Stored samples, scaled (θ, T, l), the newest last, (N, D+2M).
@@ -60,7 +61,7 @@ class OnlineLearning(Updater):
         self._steps = 0
 
     def _learn(self, job: Job) -> Update:
-        # The print knows no changed muscle: a sample that says nothing about one is none.
+        # The paper has no relearned muscles, so use only samples in which all values are known.
         observed = job.observed.with_all_angles()
         values = observed[np.flatnonzero(observed.known.all(axis=1))].state().scaled()
         count = ONLINE_BATCHES if len(values) > THRESHOLD else 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both simulations (§III-F): one descent of each of N simulated arms.
+"""Both simulations (§III-F): one descent for each of N simulated arms.
 
     z = f_encode,2(T_sim, l_sim)
     L_sim,1 = w₄‖T‖₂ + w₅‖l − l_sim‖₂ + w₆‖τ_target + Gᵀ(θ_sim, T_sim) T‖₂                   (13)
@@ -11,12 +11,14 @@ and, where joints are forced to θ_fix,
 
     (θ_sim, T_sim) ← f_decode(z) after the descent (`latent_descent`)
 
-l_sim is the length sent, l_target (in the Japanese text: the muscle length sent to the robot);
-only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle that was sent nothing gives
-way: its l_sim is the length it has. Not printed but kept: θ_sim and T_sim stay within what joints
-and modules can do. That bounds the iteration on any network, and without it tensions fall below
-T_bias: on a minute of individual 0 ‖T_sim − T‖ is then 573 N instead of 220 before learning, 219
-N instead of 173 after. (With l_target − l_comp(T_sim), the length at which MSC carries T_sim, it
+l_sim is the commanded length l_target (in the Japanese text: the muscle length sent to the robot).
+Only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle without a command gives way:
+its l_sim is its present length.
+
+The paper does not state that θ_sim and T_sim are kept within the limits of joints and modules; we
+do so. This bounds the iteration for any network, and without it tensions fall below T_bias. On one
+minute of individual 0, ‖T_sim − T‖ would be 573 N instead of 220 N before learning, and 219 N
+instead of 173 N after. (With l_target − l_comp(T_sim), the length at which MSC carries T_sim, it
 would be 85 N, and 0.34 rad instead of 0.49.)
 """
 
@@ -44,29 +46,29 @@ SEARCH = StepSearch(SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_E
 
 
 class LatentSimulation:
-    """Simulates arms of one robot; networks and arguments as for `QuasiStatics`."""
+    """Simulates arms of one robot; arguments are those of `QuasiStatics`."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._load = robot, Load(robot.kinematics)
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Take a network, and the robot with the muscles that are isolated now."""
+        """Use a network, and the robot with the muscles that are now isolated."""
         self._mae, self._robot = mae, robot
 
     def step(
         self,
         state: ArmState,
         command: Array,
-        h: float,  # noqa: ARG002 (the print knows no time: one step is one descent)
+        h: float,  # noqa: ARG002 (in the paper one step is one descent, of no duration)
         wrench: Array,
         fixed: Array,
     ) -> ArmState:
         """Return the arms after one descent each."""
         load, _ = self._load(state.theta, wrench)
         length = np.where(command == PAID_OUT, state.length, command)
-        # A bound that no command in its senses meets: no muscle is wound in by its whole length.
-        whole = self._robot.routes.length_at_zero
-        length = np.clip(length, -whole, whole)
+        # A bound beyond any reasonable command: no muscle is wound in by its whole length.
+        whole_length = self._robot.routes.length_at_zero
+        length = np.clip(length, -whole_length, whole_length)
         arms = zip(state.theta, state.tension, length, load, fixed, strict=True)
         theta, tension, reached = map(np.stack, zip(*(self._descend(*arm) for arm in arms)))
         return ArmState(theta, tension, reached, length, np.zeros_like(theta), state.slid)
@@ -78,18 +80,18 @@ class LatentSimulation:
         robot, mae = self._robot, self._mae
         joints, muscles = robot.joint_count, robot.muscle_count
         row = np.eye(joints + 2 * muscles)
-        pull, wind = row[joints : joints + muscles], row[joints + muscles :]
+        tension_rows, length_rows = row[joints : joints + muscles], row[joints + muscles :]
         terms = [
-            Term(TENSION_WEIGHT, pull, np.zeros(muscles)),
-            Term(LENGTH_WEIGHT, wind, LENGTH_SCALE * length),
+            Term(TENSION_WEIGHT, tension_rows, np.zeros(muscles)),
+            Term(LENGTH_WEIGHT, length_rows, LENGTH_SCALE * length),
         ]
-        given = np.flatnonzero(np.isfinite(fixed))
-        if not len(given):
+        forced = np.flatnonzero(np.isfinite(fixed))
+        if not len(forced):
             jacobian = muscle_jacobian(mae, theta, tension)
-            terms.append(Term(TORQUE_WEIGHT, jacobian.T @ pull / TENSION_SCALE, -torque))
+            terms.append(Term(TORQUE_WEIGHT, jacobian.T @ tension_rows / TENSION_SCALE, -torque))
             z = mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length)
         else:
-            terms.append(Term(POSTURE_WEIGHT, row[given], fixed[given]))
+            terms.append(Term(POSTURE_WEIGHT, row[forced], fixed[forced]))
             z = mae.encode(Mask.THETA_LENGTH, theta=theta, length=length)
         state = mae.decode(descend(mae, z, terms, SEARCH))
         return (

@@ -4,9 +4,9 @@
     (θ_est, T_est, l_est) = f_decode(f_encode,2(T, l))
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                                                          (4)
 
-The estimate is the same in both presets (`estimation/state_estimator.py`). Not printed, and chosen
-here: A is in scaled units, its threshold is that of the checkpoint, and a finding takes five
-messages running.
+Both presets share the estimate (`estimation/state_estimator.py`). The paper does not state the
+following, which we chose: A is in scaled units, its threshold comes from the checkpoint, and a
+finding needs five consecutive messages.
 """
 
 import math
@@ -24,7 +24,7 @@ def estimate(mae: Mae, tension: Array, length: Array) -> State:
 
 
 class AnomalyNorm(ResidualDistance):
-    """Decides by A alone."""
+    """Detector that decides by A alone."""
 
     symbol, threshold_name = 'A', NORM
 
@@ -38,5 +38,5 @@ class AnomalyNorm(ResidualDistance):
         return math.sqrt(tension @ tension) + math.sqrt(length @ length)
 
     def limit(self, theta: Array, tension: Array) -> float:  # noqa: ARG002
-        """Return the threshold of A, the same everywhere; ∞ without one."""
+        """Return the threshold of A, the same for every state; ∞ if there is none."""
         return self.threshold

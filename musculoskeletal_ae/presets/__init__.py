@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two presets, and the interface behind which they are chosen."""
+"""The two presets, and the interface that they share."""

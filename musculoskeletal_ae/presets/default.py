@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preset `default`: the best that this project can measure."""
+"""Preset `default`: the most accurate methods of this project."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class DefaultPreset:
-    """See `Preset` for what each part means."""
+    """The methods of this project; see `Preset` for the meaning of each part."""
 
     name = 'default'
     least_samples = 2
@@ -33,13 +33,13 @@ class DefaultPreset:
     simulates_on_devices = True
 
     def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return more for a larger body."""
+        """Return a number of mini-batches that grows with the size of the body."""
         from musculoskeletal_ae.mae.default_training import default_steps
 
         return default_steps(groups)
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
-        """Return states some of which are beyond the tension limit."""
+        """Return random states, some of which exceed the tension limit."""
         from musculoskeletal_ae.mae.default_training import overload_states
 
         return overload_states(robot, count, rng)
@@ -47,13 +47,13 @@ class DefaultPreset:
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
     ) -> TrainedNetwork:
-        """Train on lengths and slopes, by all masks, with Muon."""
+        """Train on lengths and muscle Jacobians under all masks, with Muon."""
         from musculoskeletal_ae.mae.default_training import train
 
         return train(robot, seed, steps, progress)
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
-        """Learn by fitting the calibrated body model."""
+        """Return an updater that fits the calibrated body model."""
         from musculoskeletal_ae.learning.update import BodyUpdater
 
         return BodyUpdater(robot, mae, seed)
@@ -61,7 +61,7 @@ class DefaultPreset:
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Decide by d, and by the physics of tendons and modules."""
+        """Return the detector by d, and detectors by the physics of tendons and modules."""
         from musculoskeletal_ae.estimation.detectors.jammed_module import JammedModule
         from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
         from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
@@ -70,20 +70,20 @@ class DefaultPreset:
         return ResidualDistance(robot, settings, slack), [slack, JammedModule(robot)]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return those that are not solved as a trajectory: the paper's, but `proposed`."""
+        """Return the methods of the paper except `proposed`, which follows a trajectory here."""
         from musculoskeletal_ae.paper.control import METHODS
 
         return {name: method for name, method in METHODS.items() if name != 'proposed'}
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Take the paper's three steps, with some joints at their limits."""
+        """Return the three steps of the paper, with some joints at their limits."""
         from musculoskeletal_ae.control.exploration import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps
 
         return partial(three_steps, posture=posture_at_limits, constant_tension=pressing_tension)
 
     def make_simulator(self, robot: Robot) -> SimulatedBody:
-        """Solve the balance of torques."""
+        """Return a simulator that solves the balance of torques."""
         from musculoskeletal_ae.simulation.equilibrium import QuasiStatics
 
         return QuasiStatics(robot)

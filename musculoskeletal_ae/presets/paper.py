@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preset `paper`: what the paper prints, of the folder `paper/`."""
+"""Preset `paper`: the methods of the folder `paper/`, as printed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class PaperPreset:
-    """See `Preset` for what each part means."""
+    """The methods of the paper; see `Preset` for the meaning of each part."""
 
     name = 'paper'
     least_samples = THRESHOLD + 1
@@ -34,11 +34,11 @@ class PaperPreset:
     simulates_on_devices = False
 
     def initial_steps(self, groups: Iterable[Group]) -> int:  # noqa: ARG002
-        """Return the same for any body (§III-B)."""
+        """Return the same number of mini-batches for any body (§III-B)."""
         return INITIAL_STEPS
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
-        """Return states up to the greatest tension (§III-B)."""
+        """Return random states with tensions up to T_max (§III-B)."""
         from musculoskeletal_ae.paper.initial_training import random_states
 
         return random_states(robot, count, rng)
@@ -52,7 +52,7 @@ class PaperPreset:
         return train(robot, seed, steps, progress)
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
-        """Learn on the samples alone (§III-C)."""
+        """Return an updater that learns from the samples alone (§III-C)."""
         from musculoskeletal_ae.paper.online_learning import OnlineLearning
 
         return OnlineLearning(robot, mae, seed)
@@ -60,25 +60,25 @@ class PaperPreset:
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Decide by A alone (§III-D)."""
+        """Return a detector that decides by A alone (§III-D)."""
         from musculoskeletal_ae.paper.state_estimation import AnomalyNorm
 
         return AnomalyNorm(robot, settings), []
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return all four (§III-E)."""
+        """Return all four methods (§III-E)."""
         from musculoskeletal_ae.paper.control import METHODS
 
         return METHODS
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Take the three steps (§IV-A)."""
+        """Return the three steps of random motion (§IV-A)."""
         from musculoskeletal_ae.paper.exploration import three_steps
 
         return three_steps
 
     def make_simulator(self, robot: Robot) -> SimulatedBody:
-        """Descend in the latent space (§III-F)."""
+        """Return a simulator that descends in the latent space (§III-F)."""
         from musculoskeletal_ae.paper.simulation import LatentSimulation
 
         return LatentSimulation(robot)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a preset chooses: one strategy for each part in which presets differ.
+"""The interface of a preset: one strategy for each part in which the presets differ.
 
-A preset only names its strategies; they live where their subject is. Each method imports what it
-returns, because options and parameters are read without numpy and torch.
+A preset only selects strategies, which are implemented beside related code. Each method imports its
+strategy when it is called, because options and parameters are read without numpy and torch.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 class Preset(Protocol):
-    """Everything in which two presets differ.
+    """All parts in which the presets differ.
 
     Attributes:
-        name: As users choose it.
-        least_samples: From how many samples on a network is updated online.
-        validates_updates: Whether the learner validates what it learned before it publishes it
+        name: Name by which users select the preset.
+        least_samples: Number of samples from which on a network is updated online.
+        validates_updates: Whether the learner validates an update before it publishes it
             (`estimation/checkpoint_validation.py`).
-        simulates_on_devices: Whether the simulator can compute on a device of torch.
+        simulates_on_devices: Whether the simulator can run on a torch device.
     """
 
     name: str
@@ -46,10 +46,10 @@ class Preset(Protocol):
     # -- network and initial training -----------------------------------------------------------
 
     def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return the mini-batches of initial training for a robot's groups."""
+        """Return the number of mini-batches of initial training for a robot's muscle groups."""
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
-        """Return random states of the geometric model, such as initial training uses."""
+        """Return random states of the geometric model with the distribution of initial training."""
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
@@ -59,16 +59,16 @@ class Preset(Protocol):
     # -- online learning ------------------------------------------------------------------------
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
-        """Return what learns online, going on from a network."""
+        """Return the online updater, which starts from a network."""
 
     # -- anomalies ------------------------------------------------------------------------------
 
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detector that decides by the network's residual.
+        """Return the detector that decides by the network's residual, and physics-based detectors.
 
-        With it come the detectors by physics, if there are any, which count before it.
+        The physics-based detectors, if there are any, take precedence.
         """
 
     # -- control --------------------------------------------------------------------------------
@@ -76,13 +76,13 @@ class Preset(Protocol):
     def length_methods(self) -> Mapping[str, LengthMethod]:
         """Return the control methods that ramp to one length command, by name.
 
-        All other methods are followers of trajectories or command tensions.
+        All other methods follow trajectories or command tensions.
         """
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return what draws the next steps of exploration."""
+        """Return a function that draws the next steps of exploration."""
 
     # -- simulation -----------------------------------------------------------------------------
 
     def make_simulator(self, robot: Robot) -> SimulatedBody:
-        """Return what steps simulated arms of a robot."""
+        """Return a simulator of arms of a robot."""

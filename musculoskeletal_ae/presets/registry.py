@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All presets by name. A new one is a class with the methods of `Preset`, and an entry here."""
+"""All presets by name.
+
+To add a preset, implement the methods of `Preset` in a class and add an instance to `PRESETS`.
+"""
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets.default import DefaultPreset
@@ -7,17 +10,17 @@ from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.preset import Preset
 
 DEFAULT = DefaultPreset.name
-#: the preset that does everything as printed; experiments show it beside the one they measure
+#: the preset that follows the paper exactly; experiments compare it with the one they measure
 AS_PRINTED = PaperPreset.name
 
 PRESETS: dict[str, Preset] = {preset.name: preset for preset in (DefaultPreset(), PaperPreset())}
 
 
 def preset_named(name: str) -> Preset:
-    """Return the preset of that name.
+    """Return the preset with a name.
 
     Raises:
-        MusculoskeletalError: If there is none.
+        MusculoskeletalError: If no preset has this name.
     """
     if name not in PRESETS:
         raise MusculoskeletalError(f'preset {name!r} is unknown; legal: {", ".join(PRESETS)}')
