@@ -109,6 +109,8 @@ def _environment(home: Path) -> dict[str, str]:
     }
     paths = kept.get('PATH', '').split(os.pathsep)
     kept['PATH'] = os.pathsep.join(path for path in paths if not path.startswith(sys.prefix))
+    # What pip has downloaded once is used again.
+    kept.setdefault('PIP_CACHE_DIR', str(Path.home() / '.cache' / 'pip'))
     return {**kept, 'HOME': str(home)}
 
 
