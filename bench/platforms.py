@@ -233,6 +233,7 @@ PLATFORMS: dict[str, Callable[[Site], None]] = {
     'sourced-pinocchio': _sourced_with_pinocchio,
     'debian-13': _debian_13,
 }
+CHROOTS = ('debian-13',)
 
 
 # --- what is checked there -----------------------------------------------------------------------
@@ -275,20 +276,24 @@ def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
 
 def check_node(name: str, folder: Path, checkpoint: Path) -> str:
     """Check the core and one node in a virtual environment; return one line about it."""
-    version = name.removeprefix('wheels-')
-    site = Site(folder)
+    is_sourced = not name.startswith('wheels-')
+    version = '3.12' if is_sourced else name.removeprefix('wheels-')
+    site, venv = Site(folder), folder / 'venv'
+    PLATFORMS[name](site)
     packages = pinned(ROOT / 'requirements.txt', version, NODE_REQUIREMENTS)
-    packages += pinned(ROS_REQUIREMENTS, version)
-    venv = folder / 'venv'
+    packages += [] if is_sourced else pinned(ROS_REQUIREMENTS, version)
     site.run(
         f'Python {version} with {len(packages)} packages and what they need',
-        f'{shlex.quote(str(_needed(version)))} -m venv {venv}',
+        *site.setup,
+        f'"${{PYTHON:-python3}}" -m venv {"--system-site-packages" if is_sourced else ""} {venv}',
         f'{venv}/bin/python -m pip install --no-compile {" ".join(packages)}',
     )
     output = site.run(
         'a node',
+        *site.setup,
         f'cd {shlex.quote(str(ROOT))}',
-        f'export AMENT_PREFIX_PATH={venv} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
+        f'export AMENT_PREFIX_PATH="${{AMENT_PREFIX_PATH:-{venv}}}"',
+        'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST',
         f'{venv}/bin/python -m bench.platform_node {shlex.quote(str(checkpoint))}',
     )
     return output.splitlines()[-1]
@@ -307,15 +312,15 @@ def _options(argv: list[str]) -> argparse.Namespace:
     for name in options.names:
         if name not in PLATFORMS:
             parser.error(f'platform {name!r}: expected one of {", ".join(PLATFORMS)}')
-        if options.node and not name.startswith('wheels-'):
-            parser.error(f'platform {name!r}: --node is for the wheels')
+        if options.node and name in CHROOTS:
+            parser.error(f'platform {name!r}: --node is not for a chroot')
     return options
 
 
 def main(argv: list[str]) -> int:
     """Check platforms one after another; exit status 1 if one fails."""
     options = _options(argv)
-    names = options.names or [n for n in PLATFORMS if not options.node or n.startswith('wheels-')]
+    names = options.names or [n for n in PLATFORMS if not options.node or n not in CHROOTS]
     rows, failed = [], 0
     for name in names:
         print(f'-- {name}', flush=True)
