@@ -33,7 +33,8 @@ doc/howto/your_robot.md leads from a robot of your own to one that learns.
                              learner, or a MuJoCo model with the robot's names (default: kin)
   --joint-source sensor|marker|none
                              what the learner knows of joint angles: all of them, what a camera sees of
-                             the hand, or nothing; the status line shows the emulator's own angles
+                             the hand, or nothing (then the first network takes 20 samples, some two
+                             minutes); the status line shows the emulator's own angles
                              (default: sensor)
   --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml
   -p NODE:NAME:=VALUE        one parameter of one node, such as -p estimator:on_anomaly:=isolate;
@@ -329,7 +330,9 @@ elif [ $controller = true ]; then
 fi
 if [ $view = true ]; then
   start view --robot "$robot" --port "$port" "${read_only[@]}" --ros-args "${under[@]}"
-  say "the page will be on http://localhost:$port"
+  # It prints its address once it can be visited.
+  tail -n +1 -s 0.2 -f --pid="$!" "$logs/view.log" </dev/null 2>/dev/null |
+    sed -un 's/^http:/-- the page is on http:/p' &
 fi
 
 # The status line. It counts --duration from when estimates arrive, however late that is on a slow

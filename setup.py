@@ -15,6 +15,26 @@ COMBINED = ['combined']
 ROS_TOOLS = ['check_driver', 'record', 'render', 'replay', 'view']
 TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'import_robot', 'train']
 
+#: what only the page and only the experiments need: extras of `pip install .[view,experiments]`
+EXTRAS = {
+    'view': ['viser', 'websockets', 'trimesh', 'Jinja2'],
+    'experiments': ['matplotlib', 'mujoco', 'Jinja2', 'cma'],
+}
+BUILD = ['colcon-common-extensions', 'setuptools']  # with which the scripts build a ROS package
+
+
+def requirements() -> dict[str, list[str]]:
+    """Return what requirements.txt pins, as compatible releases: of the core ('') and of extras."""
+    found = defaultdict(list)
+    # colcon runs this file by a link in its build folder.
+    text = Path(__file__).resolve().with_name('requirements.txt').read_text('utf-8')
+    for line in filter(None, (line.partition('#')[0].strip() for line in text.splitlines())):
+        name = line.partition('==')[0]
+        if name not in BUILD:
+            for extra in [extra for extra, names in EXTRAS.items() if name in names] or ['']:
+                found[extra].append(line.replace('==', '~=', 1))
+    return found
+
 
 def config_files() -> list[tuple[str, list[str]]]:
     """List config/** folder by folder, so that robots keep their directories under share/."""
@@ -25,6 +45,7 @@ def config_files() -> list[tuple[str, list[str]]]:
     return list(folders.items())
 
 
+NEEDED = requirements()
 setup(
     name=NAME,
     version='0.1.0',
@@ -35,8 +56,9 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         *config_files(),
     ],
-    # colcon test looks here for the kind of tests there are.
-    extras_require={'test': ['pytest']},
+    install_requires=NEEDED.pop(''),
+    # colcon test looks in "test" for the kind of tests there are.
+    extras_require={**NEEDED, 'test': ['pytest']},
     zip_safe=False,
     maintainer='musculoskeletal_ae maintainers',
     maintainer_email='maintainers@musculoskeletal-ae.org',

@@ -10,6 +10,7 @@ import importlib
 import sys
 from pathlib import Path
 
+from musculoskeletal_ae.exceptions import replace_unprintable
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
@@ -40,5 +41,6 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == '__main__':
+    replace_unprintable()
     STOP.install(Reaction.RAISE)  # SIGTERM ends a bench, and what it started, as Ctrl-C does
     sys.exit(main(sys.argv[1:]))

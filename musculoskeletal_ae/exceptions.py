@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of this package: one base, so that a caller can catch all of them."""
 
+import io
+import sys
 from pathlib import Path
 
 LONGEST_TEXT = 4000
@@ -10,6 +12,13 @@ def printable(text: object) -> str:
     """Return a text that can do nothing to a terminal: what is not printable is escaped."""
     shown = str(text)[:LONGEST_TEXT]
     return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in shown)
+
+
+def replace_unprintable() -> None:
+    """Let what the terminal's encoding lacks, such as θ in ISO-8859-1, be replaced by "?"."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='replace')
 
 
 class MusculoskeletalError(Exception):

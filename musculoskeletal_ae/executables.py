@@ -15,6 +15,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
+from musculoskeletal_ae.exceptions import replace_unprintable
 from musculoskeletal_ae.stop_signals import INTERRUPTED, STOP, Reaction
 
 
@@ -23,6 +24,7 @@ def _prepare_process() -> None:
 
     With glfw, importing MuJoCo would start processes that look for a display.
     """
+    replace_unprintable()
     os.environ.setdefault('MUJOCO_GL', 'disable')
     with suppress(AttributeError, ValueError, RuntimeError, OSError):  # stderr may be closed
         faulthandler.enable()
@@ -36,9 +38,22 @@ def _run_node(name: str) -> int:
         print(_node_help(name))
         return 0
     try:
-        return int(import_module('musculoskeletal_ae.nodes.running').run(name))
+        status = int(import_module('musculoskeletal_ae.nodes.running').run(name))
     finally:
         STOP.ignore()
+    _end_process(status)
+    return status
+
+
+def _end_process(status: int) -> None:
+    """End a process whose nodes, ROS context and child processes have ended already.
+
+    Python would first collect as garbage all that torch, numba and pinocchio have made. On a busy
+    machine that takes up to ten seconds, and whoever waits for the end takes the node to hang.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 def _node_help(name: str) -> str:

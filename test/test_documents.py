@@ -132,3 +132,16 @@ def test_parameters_that_the_documents_name_exist():
     named += re.findall(r' -p \w+:(\w+):=', text)
     assert named
     assert all(f' {name}: ' in parameters for name in named)
+
+
+#: commands of the documents that make a new file or directory
+MAKES = re.compile(r'(?:\brecord (?!-)|\bcp -r \S+ |--record |--out |-o )([\w./]+)')
+
+
+def test_no_two_commands_of_the_documents_write_to_the_same_place():
+    makers = {}
+    for page in PAGES:
+        for command in commands(ROOT / page):
+            for made in MAKES.findall(command.line):
+                makers.setdefault(made.rstrip('/'), []).append((page, command.line))
+    assert {place: pages for place, pages in makers.items() if len(pages) > 1} == {}

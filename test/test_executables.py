@@ -32,7 +32,7 @@ TOOLS = {
 MOMENTS = (0.3, 0.9, 2.0)
 
 
-def run(name, *arguments, before=''):
+def run(name, *arguments, before='', **environment):
     """Run an executable in a process of its own, after other statements."""
     code = (
         f'import sys\nfrom musculoskeletal_ae import executables\n'
@@ -42,8 +42,10 @@ def run(name, *arguments, before=''):
         [sys.executable, '-c', code, *arguments],
         capture_output=True,
         text=True,
+        errors='replace',
         timeout=300,
         cwd=ROOT,
+        env={**os.environ, **environment},
     )
 
 
@@ -61,10 +63,13 @@ def test_there_is_an_executable_for_every_node_and_tool():
 
 @pytest.mark.parametrize('name', [*NODES, *TOOLS])
 def test_help_loads_nothing_that_takes_long(name):
-    # All of them together take 0.1 to 0.4 s of CPU.
+    # All of them together take 0.1 to 0.4 s of CPU. A terminal may not show every letter.
     heavy = "{'numba', 'torch', 'scipy', 'matplotlib'} & set(sys.modules)"
     done = run(
-        name, '--help', before=f'import atexit\natexit.register(lambda: print("heavy", *{heavy}))'
+        name,
+        '--help',
+        before=f'import atexit\natexit.register(lambda: print("heavy", *{heavy}))',
+        PYTHONIOENCODING='ascii:strict',
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == 'heavy'
@@ -124,6 +129,22 @@ def test_a_file_of_parameters_for_all_nodes_may_name_no_unknown_one(tmp_path):
     done = run('estimator', '--ros-args', '--params-file', str(file))
     assert done.returncode == 1
     assert "'temprature_limit'; nearest: temperature_limit" in done.stderr
+
+
+def test_a_node_that_has_ended_does_not_wait_for_python_to_collect_garbage():
+    clean_up = 'import atexit; atexit.register(print, "cleaned up")'
+    start = f'import os, signal, threading\n{clean_up}\n'
+    start += 'timer = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGTERM))\ntimer.start()'
+    done = run('sim', before=start)
+    assert done.returncode == 0, done.stderr
+    assert 'cleaned up' not in done.stdout
+
+
+@pytest.mark.parametrize('encoding', ['iso-8859-1', 'ascii'])
+def test_what_a_terminal_cannot_show_is_replaced(encoding):
+    done = run('check_robot', 'arm26', PYTHONIOENCODING=f'{encoding}:strict')
+    assert done.returncode == 0, done.stderr
+    assert 'arm26: sound' in done.stdout and '?' in done.stdout
 
 
 def test_the_experiments_are_those_that_the_help_names():

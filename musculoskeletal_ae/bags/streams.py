@@ -45,6 +45,11 @@ class Pairs(NamedTuple):
     tension: Array  # T [N], (P, M)
     isolated: Ints  # 1 of isolated muscles, 0 of others, -1 where that was not recorded, (P, M)
 
+    def first(self, count: int) -> 'Pairs':
+        """Return the first so many pairs."""
+        time, theta, length, tension, isolated = self
+        return Pairs(time[:count], theta[:count], length[:count], tension[:count], isolated[:count])
+
 
 class Streams(NamedTuple):
     """What one arm measured and was commanded; a topic that the bag lacks is an empty series."""

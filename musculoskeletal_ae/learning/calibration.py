@@ -155,6 +155,11 @@ def uncalibrated(mae: Mae) -> Mae:
     return replace(mae, anomaly=replace(mae.anomaly, calibrated=False))
 
 
+def is_learned(mae: Mae) -> bool:
+    """Return whether a network was learned from an arm, not only from its geometric model."""
+    return mae.covariance is not None or is_calibrated(mae)
+
+
 def is_calibrated(mae: Mae) -> bool:
     """Whether a network's statistics come from the real arm."""
     return mae.anomaly is not None and mae.anomaly.calibrated

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from musculoskeletal_ae.learning.calibration import is_calibrated
+from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
 from musculoskeletal_ae.learning.trainer import Update
 from musculoskeletal_ae.report import Level, Report
 from musculoskeletal_ae.robot.robot import Robot
@@ -45,6 +45,8 @@ def _values(learner: Learner) -> dict[str, str]:
         'accepted': str(learner.samples.accepted),
         'checkpoints': str(keeper.publication.count),
         'checkpoint version': str(0 if keeper.mae is None else keeper.mae.version),
+        'network learned': str(keeper.mae is not None and is_learned(keeper.mae)),
+        'samples to begin with': str(learner.scheduler.least_samples),
         'preset': learner.trainer.preset.name,
         'healthy time': f'{collector.healthy.time:.0f} s',
         **learner.trainer.values(),

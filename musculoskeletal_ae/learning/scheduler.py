@@ -21,6 +21,7 @@ class UpdateScheduler:
     """Decides when to train, and composes the job.
 
     Attributes:
+        least_samples: With how many the first one begins.
         updates: How many updates were made.
         last_update: The last of them, if any.
         statistics_hold: Whether the statistics of the detector are of the arm as it is. They are
@@ -32,7 +33,7 @@ class UpdateScheduler:
         self.updates = 0
         self.last_update: Update | None = None
         self.statistics_hold = True
-        self._least_samples, self._steps = least_samples, steps
+        self.least_samples, self._steps = least_samples, steps
         self._has_news = True
         self._began_at = -math.inf  # the last update [s]
         self._has_changed = False  # a muscle, since the last update began
@@ -53,7 +54,7 @@ class UpdateScheduler:
 
     def is_due(self, now: float, sample_count: int) -> bool:
         """Whether an update is to begin at `now` [s]."""
-        enough = sample_count >= self._least_samples
+        enough = sample_count >= self.least_samples
         return self._has_news and enough and not is_recent(self._began_at, now)
 
     def begin(

@@ -241,8 +241,14 @@ class Situation:
 
     def hint(self) -> str:
         """Return why the error may rise before anything is learned, '' once something is."""
+        values = self._values('learner')
+        if self.samples == '' or values.get('network learned') == 'True':
+            return ''
+        needed = values.get('samples to begin with', '1')
+        if not self.samples.isdecimal() or int(self.samples) >= int(needed):
+            return ''
         why = 'nothing learned yet: the error may rise while the arm leaves its first posture'
-        return why if self.samples == '0' else ''  # '' without a learner
+        return why if needed == '1' else f'{why}; learning begins with {needed} samples'
 
 
 def _is_needed(name: str) -> bool:

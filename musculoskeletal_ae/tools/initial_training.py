@@ -16,7 +16,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
-from musculoskeletal_ae.estimation.finding import observe
+from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
@@ -66,8 +66,7 @@ def train(args: Namespace) -> None:
     preset = PRESETS[args.preset]
     steps = preset.initial_steps(robot.groups) // (10 if args.quick else 1)
     if args.from_bag:
-        checkpoint.save(_learned(robot, args, steps).mae, args.out)
-        print(f'checkpoint: {args.out}')
+        _learn_recordings(robot, args, steps)
         return
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
@@ -78,6 +77,7 @@ def train(args: Namespace) -> None:
                 bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
 
         trained = initial_mae(robot, args.preset, args.seed, progress, steps)
+    checkpoint.save(trained.mae, args.out)  # before anything else can go wrong
     print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
     # Not the stream of the training, so none of these states has been seen.
     rng = np.random.default_rng([args.seed, 2])
@@ -88,12 +88,11 @@ def train(args: Namespace) -> None:
         overload = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, most, limit))
         print(table(overload, f'the same, T in [{shown(limit)}, {shown(most)}] N (overload)'))
     print(joint_table(robot, planned))
-    checkpoint.save(trained.mae, args.out)
     print(f'checkpoint: {args.out}')
     save_plot(args.plot, lambda: plot(robot, trained, planned))
 
 
-def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
+def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
     """Learn from recordings in their order, those held out judged only; print errors."""
     # Read before the network is trained, which takes longer than finding a bag unusable.
     recordings = {
@@ -111,13 +110,46 @@ def _learned(robot: Robot, args: Namespace, steps: int) -> Learner:
             total = round(pairs.time[-1] - pairs.time[0], 1)
             with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
                 learn(learner, pairs, bar.update)
+    checkpoint.save(learner.mae, args.out)  # before anything else can go wrong
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
     for path, pairs in recordings.items():
         kind = 'held out' if path in args.hold_out else 'learned from'
         after = error(learner.mae, pairs)
         change = f'{before[path]:.4f} → {after:.4f} {robot.kinematics.distance_unit}'
         print(f'{path} ({kind}): {change} against its joint sensors')
-    return learner
+        if path in args.hold_out and (told := anomaly_in(robot, pairs, learner.mae, args.preset)):
+            print(f'warning: {path} (held out): {told}', file=sys.stderr)
+    print(f'checkpoint: {args.out}')
+
+
+def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
+    """Return what an anomaly in a recording makes of its error, or ''.
+
+    The health monitor of a learned network decides, as on a running arm.
+    """
+    stream, health = MuscleStream(robot), HealthMonitor(robot, preset)
+    isolated: tuple[int, ...] | None = None
+    steps = np.diff(recording.time, prepend=recording.time[:1])
+    for row, (at, dt) in enumerate(zip(recording.time, steps)):
+        said = _isolated(recording.isolated[row], mae.isolated)
+        if said != isolated:
+            isolated, reduced = said, mae.without(said)
+            stream.use_body(stream.body.with_isolated(said))
+            stream.use_friction(reduced.friction)
+            health.reset()
+            health.use(reduced)
+        states = np.array([recording.length[row], recording.tension[row], recording.tension[row]])
+        states[2] = np.nan
+        finding = _finding(health, reduced, stream, states, at, min(dt, LONGEST_PERIOD))
+        if finding is None:
+            continue
+        muscle = robot.muscles[finding.muscle]
+        told = f'an anomaly ({muscle}: {finding.kind.value}) begins {at:.1f} s into it'
+        before = recording.first(row)
+        if row:
+            told += f'; until then the error is {error(mae, before):.4f}'
+        return f'{told} {robot.kinematics.distance_unit}. Hold out a healthy recording'
+    return ''
 
 
 def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
@@ -168,7 +200,7 @@ def learn(
             health.use(mae)
         states = np.array([length, tension, np.full(len(length), np.nan)])
         learner.joints(at, theta)
-        if _has_finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD)):
+        if _finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD)) is not None:
             learner.anomaly(True)
         learner.muscles(states, at)
         learner.poll(at)
@@ -176,21 +208,21 @@ def learn(
             progress(dt)
 
 
-def _has_finding(
+def _finding(
     health: HealthMonitor,
     mae: Mae,
     stream: MuscleStream,
     states: Array,
     time: float,
     dt: float,
-) -> bool:
-    """Return whether a message shows a fault of the arm; an implausible message shows none."""
+) -> Finding | None:
+    """Return the fault of the arm that a message shows; an implausible message shows none."""
     try:
         sample = stream.take_states(states, time)
     except RejectionError:
-        return False
+        return None
     observation = observe(mae, sample.length, sample.motor_tension, sample.bone_tension, dt)
-    return health.step(observation) is not None
+    return health.step(observation)
 
 
 def error(mae: Mae, recording: Pairs) -> float:

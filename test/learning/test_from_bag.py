@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools.initial_training import error, learn, read
+from musculoskeletal_ae.tools import initial_training
+from musculoskeletal_ae.tools.initial_training import anomaly_in, error, learn, read
 from musculoskeletal_ae.tools.train import main
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
@@ -91,3 +94,27 @@ def test_wrong_bags_and_options_end_with_one_clear_error(
         assert main(everything) == status
     assert expected in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it(
+    arm26, initial, monkeypatch
+):
+    class Monitor(HealthMonitor):
+        """Finds a muscle at the 301st message."""
+
+        count = 0
+
+        def step(self, _):
+            self.count += 1
+            return Finding(2, Kind.SLACK_TENDON, '') if self.count > 300 else None
+
+    count = 500
+    theta = np.tile(0.5 * (arm26.lower + arm26.upper), (count, 1))
+    tension = np.full((count, arm26.muscle_count), 60.0)
+    length, nobody = initial.lengths(theta, tension), np.zeros(tension.shape, dtype=int)
+    recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
+    assert anomaly_in(arm26, recording, initial, 'default') == ''
+    monkeypatch.setattr(initial_training, 'HealthMonitor', Monitor)
+    told = anomaly_in(arm26, recording, initial, 'default')
+    assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s into it' in told
+    assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in told

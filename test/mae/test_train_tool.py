@@ -5,6 +5,7 @@ from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools import initial_training
 from musculoskeletal_ae.tools.train import main
 
 
@@ -58,3 +59,13 @@ def test_unwritable_output_exits_with_1_before_training(tmp_path, capsys):
     reported = capsys.readouterr().err
     assert reported.count('\n') == 4
     assert reported.count('choose another place') == 2
+
+
+def test_a_checkpoint_is_written_before_anything_is_printed_of_it(tmp_path, monkeypatch):
+    def fail(*_):
+        raise BrokenPipeError('the terminal is gone')
+
+    monkeypatch.setattr(initial_training, 'table', fail)
+    out = tmp_path / 'a.safetensors'
+    assert main(['--robot', 'arm26', '--quick', '--preset', 'paper', '--out', str(out)]) == 1
+    assert load(out, Robot.load('arm26')).preset == 'paper'

@@ -30,6 +30,20 @@ def test_before_the_first_sample_it_says_why_the_error_may_rise():
     assert situation.hint() == '' and (situation.samples, situation.checkpoints) == ('3', '2')
 
 
+def test_a_learned_network_is_not_said_to_have_learned_nothing():
+    situation = Situation('/left')
+    situation.diagnosed(said('/left/learner', samples='0', network_learned='True'))
+    assert situation.hint() == ''
+
+
+def test_it_says_with_how_many_samples_learning_begins():
+    situation = Situation('/left')
+    situation.diagnosed(said('/left/learner', samples='3', samples_to_begin_with='20'))
+    assert 'learning begins with 20 samples' in situation.hint()
+    situation.diagnosed(said('/left/learner', samples='20', samples_to_begin_with='20'))
+    assert situation.hint() == ''
+
+
 def test_what_is_not_known_is_said_to_be_waited_for():
     assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
     assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate joint angles and learn an arm in plain Python, without ROS.
+
+    python -m venv arm && . arm/bin/activate
+    pip install --extra-index-url https://download.pytorch.org/whl/cpu .      # in the repository
+    python examples/learn_in_python.py
+
+Replace `EmulatedArm` by whatever reads your muscles.
+"""
+
+import argparse
+
+import numpy as np
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
+
+PERIOD = 0.01  # [s] between two readings
+
+parser = argparse.ArgumentParser(description='Learn an emulated arm, and estimate its joints.')
+parser.add_argument('--postures', type=int, default=40, help='in which the arm rests')
+parser.add_argument('--steps', type=int, default=1000, help='of the initial training')
+parser.add_argument('--out', default='learned.safetensors', help='where the network is kept')
+options = parser.parse_args()
+
+robot = Robot.load('arm26')  # or the directory of your robot.urdf and muscles.yaml
+initial = initial_mae(robot, steps=options.steps).mae  # trained on the geometric model
+arm = EmulatedArm(robot, seed=1)
+learner = Learner(robot, initial)
+
+rng, time = np.random.default_rng(0), 0.0
+errors = []  # of the initial and of the newest network, at each rest [rad]
+for theta in robot.random_postures(options.postures, rng):
+    tension = rng.uniform(40.0, 120.0, robot.muscle_count)
+    goal = robot.muscle_lengths(theta[None], tension[None])[0]
+    direction, start = FrictionDirection(), arm.sense().length
+    for step in range(150):  # move for half a second, then rest
+        time += PERIOD
+        arm.command_length(start + (goal - start) * min(1.0, step / 50))
+        arm.step(PERIOD)
+        read = arm.sense()
+        way = direction.step(read.length)
+        learner.step(time, read.theta, read.tension, read.length)
+    estimates = [
+        # T without the friction along the wires, as far as the network knows it.
+        mae.estimate(end_tension(mae.friction, read.tension, way), read.length).theta
+        for mae in (initial, learner.mae)
+    ]
+    errors.append([np.linalg.norm(estimate - read.theta) for estimate in estimates])
+
+before, after = np.mean(errors[-10:], axis=0)
+print(f'{len(learner.samples)} samples, {learner.updates} updates')
+print(f'error in the last postures: {before:.3f} rad before learning, {after:.3f} rad after')
+checkpoint.save(learner.mae, options.out)

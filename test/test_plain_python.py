@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package in plain Python: `pip install .` brings what it needs, and the example runs."""
+
+import ast
+import os
+import subprocess
+import sys
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / 'musculoskeletal_ae'
+#: folders whose imports come with an extra, or with ROS
+EXTRAS = {'view': 'view', 'experiments': 'experiments', 'importing': 'experiments'}
+MUJOCO = ('foreign.py', 'mjcf.py')  # emulated arms of MuJoCo come with the experiments
+
+
+def imported(files):
+    """Return the top-level modules that files import when they are imported."""
+    names = set()
+    for file in files:
+        for node in ast.parse(file.read_text('utf-8')).body:
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names.add((node.module or '').partition('.')[0])
+    return names - sys.stdlib_module_names - {'musculoskeletal_ae', ''}
+
+
+def extra_of(file):
+    """Return the extra with which the imports of a file come; '' if they always do."""
+    return 'experiments' if file.name in MUJOCO else EXTRAS.get(file.parent.name, '')
+
+
+def distribution(module):
+    """Return the name under which a module is installed; pin keeps pinocchio in a folder apart."""
+    return 'pin' if module == 'pinocchio' else packages_distributions()[module][0].lower()
+
+
+@pytest.fixture(scope='module')
+def requirements():
+    """Return the names of required distributions, by extra; '' for those that are always."""
+    program = (
+        'import json, sys; from distutils.core import run_setup\n'
+        'from unittest import mock\n'
+        'd = run_setup("setup.py", stop_after="init")\n'
+        'print(json.dumps({"": d.install_requires, **d.extras_require}))'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', f'import setuptools; {program}'],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    listed = ast.literal_eval(done.stdout.splitlines()[-1])
+    return {
+        extra: {each.partition('~=')[0].lower() for each in all_} for extra, all_ in listed.items()
+    }
+
+
+@pytest.mark.parametrize('extra', ['', 'view', 'experiments'])
+def test_what_the_package_imports_is_required(requirements, extra):
+    files = [
+        file
+        for file in PACKAGE.rglob('*.py')
+        if file.parent.name != 'nodes' and extra_of(file) == extra
+    ]
+    needed = {distribution(module) for module in imported(files)}
+    assert needed <= requirements[''] | requirements[extra]
+
+
+def test_the_tests_import_only_what_the_requirements_of_the_tests_bring():
+    listed = ''.join(
+        (ROOT / file).read_text('utf-8')
+        for file in ('requirements.txt', '.ci/requirements-test.txt', '.ci/requirements-ros.txt')
+    ).lower()
+    tests = ROOT / 'test'
+    own = (
+        {path.stem for path in tests.rglob('*.py')} | {p.name for p in tests.iterdir()} | {'bench'}
+    )
+    brought = {module: distribution(module) for module in imported(tests.rglob('*.py')) - own}
+    # Message packages and what rclpy depends on come with the wheels of ROS, or with Jazzy.
+    of_ros = ('_msgs', '_srvs', '_interfaces', 'rclpy')
+    missing = {m for m, name in brought.items() if name not in listed and not m.endswith(of_ros)}
+    assert missing == set()
+
+
+def test_the_example_learns_without_ros(tmp_path):
+    blocked = ('rclpy', 'std_msgs', 'sensor_msgs', 'geometry_msgs', 'viser', 'mujoco', 'matplotlib')
+    program = (
+        'import runpy, sys\n'
+        f'sys.modules.update(dict.fromkeys({blocked}))\n'
+        f'sys.argv[0] = {str(ROOT / "examples" / "learn_in_python.py")!r}\n'
+        'runpy.run_path(sys.argv[0])'
+    )
+    options = ['--postures', '6', '--steps', '200', '--out', str(tmp_path / 'a.safetensors')]
+    done = subprocess.run(
+        [sys.executable, '-c', program, *options],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    before, after = (float(word) for word in done.stdout.split() if word.startswith('0.'))
+    assert after < before
+    assert (tmp_path / 'a.safetensors').exists()
