@@ -128,6 +128,7 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], list[st
     except MusculoskeletalError as error:
         return [str(error)], []
     left_out = [f'rejected {n}: {why}' for why, n in streams.rejected.items()]
+    left_out += streams.notes
     left_out += [f'used in part {n}: {why}' for why, n in streams.ignored.items()]
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'nothing says whether it fits {name}: no joint_states or muscle_states is in it'

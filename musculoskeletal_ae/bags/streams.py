@@ -3,6 +3,7 @@
 
 import heapq
 import math
+from array import array
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,6 +28,10 @@ from musculoskeletal_ae.validity import (
     read_names,
     read_posture,
 )
+
+#: a topic of this many messages is judged: its delays differ by so much [ns], and so many of its
+#: messages were written with the one before
+FEW, BUNCHED, MANY = 20, 50_000_000, 0.3
 
 
 class Series(NamedTuple):
@@ -61,6 +66,7 @@ class Streams(NamedTuple):
     isolated: Series  # 1 of isolated muscles, else 0, (N, M)
     rejected: Counter[str]  # messages left out, by topic and reason
     ignored: Counter[str]  # parts of messages left out, by topic and what it was
+    notes: tuple[str, ...]  # what else is to be known
 
     def pairs(self) -> Pairs:
         """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.signals.pairing`)."""
@@ -149,6 +155,7 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     recorded = interface_topics(bag, namespace)
     topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
     start, warnings = bag.start, list[str]()
+    late = _bunched(bag, list(topics))
     reception = Reception(warnings.append)
     receive = dict[tuple[str, ...], Callable[[Any, dict[str, Any]], Any]]()
     # The body state comes first: the recorder may have received it later than the readings.
@@ -161,7 +168,10 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
             take = topics[message.topic].take
             receive[sender] = reception.of(message.topic, take, lambda: 1)
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
-        receive[sender](((message.log_time - start) / 1e9, decoded), sent)
+        came = message.log_time
+        if message.topic in late:
+            came = message.publish_time + late[message.topic]
+        receive[sender](((came - start) / 1e9, decoded), sent)
     for topic, stream in topics.items():
         reasons = [text.partition(f' {topic}: ')[2] for text in warnings if f' {topic}: ' in text]
         if reasons and not stream.values:
@@ -176,7 +186,33 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += int((~use).sum())
         states = Series(states.time[use], states.values[use])
     series = joint_states, states, lengths, tensions, isolated_series
-    return Streams(*series, reception.rejected, reception.ignored)
+    notes = [
+        f'{topic}: the recorder wrote late and in bunches; messages count from when they were sent'
+        for topic in late
+    ]
+    return Streams(*series, reception.rejected, reception.ignored, tuple(notes))
+
+
+def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
+    """Return the topics whose log times are bunched, and what to add to their publish times [ns].
+
+    A recorder that is held up for a moment writes many messages with one log time. The clock of
+    the publisher may be another one: the message that was written soonest has no delay.
+    """
+    times = {topic: (array('q'), array('q')) for topic in topics}
+    for message in bag.messages(topics):
+        times[message.topic][0].append(message.log_time)
+        times[message.topic][1].append(message.publish_time)
+    bunched = {}
+    for topic, parts in times.items():
+        log, sent = (np.array(part, dtype=np.int64) for part in parts)
+        if len(log) < FEW or not (sent > 0).all() or (np.diff(sent) < 0).any():
+            continue
+        delay = log - sent
+        together = (np.diff(log) < 0.1 * np.median(np.diff(sent))).mean()
+        if np.ptp(delay) > BUNCHED and together > MANY:
+            bunched[topic] = int(delay.min())
+    return bunched
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:

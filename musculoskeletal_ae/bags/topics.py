@@ -106,7 +106,9 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
     """Return each recorded name without the namespace; names outside it stay absolute."""
     if namespace is None:
         namespace, *others = namespaces(bag.topics)
-        if others:
+        if others and (nested := _innermost(bag.topics, [namespace, *others])) is not None:
+            namespace = nested
+        elif others:
             several = ', '.join(name or '/' for name in (namespace, *others))
             problem = f'topics of the interface lie under several namespaces: {several}'
             remedy = 'choose one with --from-namespace (or replay all with --keep-names)'
@@ -115,7 +117,32 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
     if not any(name.startswith(prefix) for name in bag.topics):
         there = ', '.join(name or '/' for name in namespaces(bag.topics)) or 'none'
         raise BagError(bag.path, f'has no topic under {prefix!r}', f'namespaces in it: {there}')
-    return {name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics}
+    names = {
+        name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics
+    }
+    # What the namespace lacks may lie in one around it, as joint_states of a driver in the root.
+    for outer in _around(namespace):
+        for name in bag.topics:
+            relative = name.removeprefix(f'{outer}/')
+            if names[name] == name and relative in TOPICS and relative not in names.values():
+                names[name] = relative
+    return names
+
+
+def _around(namespace: str) -> list[str]:
+    """Return the namespaces around one, the nearest first; '' is the root."""
+    parts = [part for part in namespace.split('/') if part]
+    return [''.join(f'/{part}' for part in parts[:n]) for n in reversed(range(len(parts)))]
+
+
+def _innermost(topics: Iterable[str], found: Sequence[str]) -> str | None:
+    """Return the namespace that all others lie around, if no topic is in two of them."""
+    innermost = max(found, key=len)
+    if not set(found) <= {innermost, *_around(innermost)}:
+        return None
+    relative = [interface_name(name) for name in topics if interface_name(name) in TOPICS]
+    ours = [name for name in relative if name != DIAGNOSTICS]
+    return innermost if len(ours) == len(set(ours)) else None
 
 
 def _compare_type(bag: Bag, name: str, relative: str) -> None:

@@ -163,6 +163,8 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
     streams = read_streams(bag, robot, namespace)
     for reason, count in streams.rejected.items():
         print(f'warning: {path}: {count} messages rejected, {reason}', file=sys.stderr)
+    for note in streams.notes:
+        print(f'warning: {path}: {note}', file=sys.stderr)
     for part, count in streams.ignored.items():
         print(f'warning: {path}: {count} messages used in part, {part}', file=sys.stderr)
     pairs = streams.pairs()

@@ -212,3 +212,21 @@ def test_who_publishes_some_joints_has_a_clock_of_its_own(robot, tmp_path):
     found = streams(arm, robot, tmp_path)
     assert not found.rejected
     assert np.isfinite(found.joints.values).sum(axis=0).tolist() == [200, 200]
+
+
+@pytest.mark.parametrize('period', [0.5, 0.2])
+def test_a_recorder_that_wrote_in_bunches_costs_no_pairs(robot, tmp_path, period):
+    arm = Arm(robot)
+    regular = streams(arm, robot, tmp_path).pairs()
+
+    def bunched(sample):
+        late = -(-(sample.log_time - samples.START) // round(period * 1e9))
+        return sample._replace(log_time=samples.START + late * round(period * 1e9))
+
+    content = [bunched(sample) for sample in arm.content]
+    samples.write_ours(tmp_path / 'bunched', content, 'zstd', True)
+    found = read_streams(Bag.open(tmp_path / 'bunched'), robot)
+    assert any('in bunches' in note for note in found.notes)
+    pairs = found.pairs()
+    assert len(pairs.time) >= len(regular.time) - 1
+    assert_allclose(np.diff(pairs.time), 0.01, atol=1e-6)

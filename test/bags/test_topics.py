@@ -156,3 +156,24 @@ def test_a_topic_of_the_wrong_type_is_refused(tmp_path):
 def test_topics_of_the_interface_are_latched_whatever_the_recorder_noted(tmp_path, content):
     samples.write_mcap(tmp_path / 'a.mcap', content)
     assert '/left_arm/mae_checkpoint' in latched_topics(Bag.open(tmp_path / 'a.mcap'))
+
+
+def test_what_an_arm_lacks_is_taken_from_the_namespace_around_it(tmp_path):
+    names = [('/left/arm/muscle_states', 'muscle_states'), ('/joint_states', 'joint_states')]
+    bag = make(tmp_path, *ours(*names, ('/left/imu', 'imu')))
+    expected = {
+        '/left/arm/muscle_states': 'muscle_states', '/joint_states': 'joint_states',
+        '/left/imu': 'imu',
+    }  # fmt: skip
+    assert select(bag, ['default'], None, False) == expected
+    assert select(bag, ['default'], '/left/arm', False) == expected
+    assert set(interface_topics(bag)) == {'muscle_states', 'joint_states', 'imu'}
+
+
+def test_a_topic_that_an_arm_has_is_not_taken_from_around_it(tmp_path):
+    names = [('/left/joint_states', 'joint_states'), ('/joint_states', 'joint_states')]
+    bag = make(tmp_path, *ours(*names, ('/left/muscle_states', 'muscle_states')))
+    with pytest.raises(BagError, match='several namespaces'):
+        select(bag, ['default'], None, False)
+    chosen = select(bag, ['default'], 'left', False)
+    assert set(chosen) == {'/left/joint_states', '/left/muscle_states'}

@@ -2,10 +2,13 @@
 """The rights in config/security_policy.xml are those that the running nodes use."""
 
 import importlib
+import os
+import subprocess
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+from graph import executable
 
 POLICY = Path(__file__).parents[2] / 'config' / 'security_policy.xml'
 NODES = ['controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
@@ -60,3 +63,15 @@ def test_commands_checkpoints_and_targets_have_one_source():
     ):
         allowed = [n for n in (*NODES, 'operator') if topic in rights(n, 'topics', 'publish')]
         assert allowed == [source]
+
+
+def test_security_without_keys_says_what_to_set():
+    environment = {**os.environ, 'ROS_SECURITY_ENABLE': 'true', 'ROS_SECURITY_STRATEGY': 'Enforce'}
+    environment.pop('ROS_SECURITY_KEYSTORE', None)
+    for command in (['record', '/nowhere/bag'], ['bringup_status']):
+        done = subprocess.run(
+            [*executable(command[0]), *command[1:]],
+            env=environment, capture_output=True, text=True, timeout=300, check=False,
+        )  # fmt: skip
+        assert done.returncode in (1, 2)
+        assert 'set ROS_SECURITY_KEYSTORE' in done.stderr and 'error not set' not in done.stderr
