@@ -144,7 +144,8 @@ def test_a_node_that_has_ended_does_not_wait_for_python_to_collect_garbage():
 def test_what_a_terminal_cannot_show_is_replaced(encoding):
     done = run('check_robot', 'arm26', PYTHONIOENCODING=f'{encoding}:strict')
     assert done.returncode == 0, done.stderr
-    assert 'arm26: sound' in done.stdout and '?' in done.stdout
+    assert 'arm26: sound' in done.stdout
+    assert ('?' in done.stdout) == (encoding == 'ascii')  # the other one has all of these letters
 
 
 def test_the_experiments_are_those_that_the_help_names():

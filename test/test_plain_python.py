@@ -5,6 +5,7 @@ import ast
 import os
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -34,9 +35,12 @@ def extra_of(file):
     return 'experiments' if file.name in MUJOCO else EXTRAS.get(file.parent.name, '')
 
 
+distributions = cache(packages_distributions)  # a second each time
+
+
 def distribution(module):
     """Return the name under which a module is installed; pin keeps pinocchio in a folder apart."""
-    return 'pin' if module == 'pinocchio' else packages_distributions()[module][0].lower()
+    return 'pin' if module == 'pinocchio' else distributions()[module][0].lower()
 
 
 @pytest.fixture(scope='module')
