@@ -15,7 +15,8 @@ tells its readers, it also tells this bench:
 
 `REPOSITORY` stands for a clone of what is committed here. The shell has no ROS and a home of its
 own. A page ends at its first command that fails; exit status 1 if there was one. The first page
-installs about 2 GB of wheels; all pages take about half an hour.
+installs about 2 GB of wheels; all pages take about half an hour on an idle machine. On a busy one,
+`check_driver` may find gaps in the messages of the driver, as it should.
 """
 
 import os

@@ -35,7 +35,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test' / 'view'))
 from browser import Browser  # noqa: E402 - the tests' own browser
 
-SIZE, SCALED, COLOURS = (1280, 720), (960, 540), 128
+SIZE, SCALE, COLOURS = (1280, 720), 0.75, 128  # of the page, and of its pictures
+SCALED = round(SCALE * SIZE[0]), round(SCALE * SIZE[1])
 LEARNING, MOVING_ON = 60.0, 25.0  # [s] before the rupture, and after the isolation
 EVERY, EVERY_LATER = 1.0, 0.4  # [s] between pictures while learning, and around the rupture
 FRAME, LAST = 110, 1500  # [ms] that a picture of the film is shown, and the last one
@@ -54,14 +55,18 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
         while time.monotonic() < end:
             begun = time.monotonic()
             shot = browser.screenshot(folder / 'frame.png')
-            picture = Image.open(io.BytesIO(shot)).convert('RGB')
-            frames.append(picture.resize(SCALED, Image.Resampling.LANCZOS))
+            frames.append(Image.open(io.BytesIO(shot)).convert('RGB'))
             if until(browser.text):
                 return True
             time.sleep(max(0.0, begun + every - time.monotonic()))
         return False
 
     try:
+        # Without a graphics card, every point that is drawn costs time.
+        browser.call(
+            'Emulation.setDeviceMetricsOverride',
+            width=SIZE[0], height=SIZE[1], deviceScaleFactor=SCALE, mobile=False,
+        )  # fmt: skip
         browser.wait_for('samples')
         time.sleep(SETTLE)
         browser.close_notifications()
