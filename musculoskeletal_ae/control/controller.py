@@ -29,7 +29,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.calibrating import Calibrating, gentle_limit
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull, msc_compensation
+from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.limiter import CommandLimiter
@@ -51,9 +51,6 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream
 
 WINDOW = 3  # messages of the median against glitches
 RESTORE = 'estimator/restore uses isolated muscles again'
-#: of the way from tension.limit to tension.max that may be demanded; the watchdog stops at a half
-DEMANDED = 1.0 / 3.0
-EASED = 0.9  # of tension.limit, demanded at most of a muscle that has been above it for long
 AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
 APPROACHES = 3  # of a target by an arm that lacks a muscle and falls
 
@@ -461,7 +458,7 @@ class Controller:
             self.activities.leave()
             return None
         try:
-            return self._slack(self._bounded(self._step(control, self._inputs(dt))))
+            return self._slack(self._step(control, self._inputs(dt)))
         except RobotDescriptionError as error:  # too little is left to explore with
             self._request(Activity.IDLE)
             reason = str(error)
@@ -511,29 +508,6 @@ class Controller:
             limit=np.minimum(self.watchdog.heat.planned, self.robot.tension.limit),
             dt=dt,
         )
-
-    def _bounded(self, command: Command | None) -> Command | None:
-        """Return a command that demands no tension for which the watchdog would stop the arm.
-
-        Plans of `proposed` stay within tension.limit; feedback, an arm that does not come along,
-        and some length methods demand more. Stiffness is as was asked for, whatever pushes the
-        arm.
-        """
-        if command is None or command.kind != LENGTH or self.sample is None:
-            return command
-        activity = self.supervisor.activity
-        if activity is Activity.CALIBRATING or (
-            self.settings.method == 'stiffness' and activity is not Activity.EXPLORING
-        ):
-            return command
-        age, limits = self.watchdog.age, self.robot.tension
-        largest = limits.limit + DEMANDED * (limits.max - limits.limit)
-        strained = self.watchdog.overload.strained(
-            age.awake(age.stepped_at), self.settings.overload_time
-        )
-        largest = np.where(strained, EASED * limits.limit, largest)
-        shortest = self.sample.length + msc_compensation(self.robot, largest)
-        return Command(LENGTH, np.maximum(command.value, shortest))
 
     def _slack(self, command: Command | None) -> Command | None:
         """Return a command that gives isolated muscles all the length, or no tension."""

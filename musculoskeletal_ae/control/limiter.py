@@ -6,14 +6,26 @@
 Muscle stiffness control pulls with T_bias + K (l − l_target), so that the tension limit of a muscle
 is a limit of its commanded length:
 
-    l_target ≥ l + l_comp(T_limit),   l_comp(T) = −(T − T_bias) / K_stiff
+    l_target ≥ l + l_comp(T_limit) + r,   l_comp(T) = −(T − T_bias) / K_stiff
+    dr/dt = RELIEF (T − T_limit)/K_stiff,   0 ≤ r ≤ −l_comp(T_limit)
 
-It may pay a muscle out faster than the rate limit, if the tension that is measured is above
-`tension.limit`, and it never winds one in. The rate limit compares with the last command that was
-published, whatever has happened in between.
+Whatever a plan, a feedback, a wrong network or a push from outside asks for, no module is told to
+pull harder than T_limit. The feedback r pays a muscle out further whose measured tension exceeds
+the limit all the same, as where K_stiff or a sensor of the module is not what it should be. A
+muscle whose measured tension is above `tension.limit` is paid out faster than the rate limit; none
+is ever wound in faster.
 
-The tension limit is what the heat of the motors allows for a moment (`watchdog.HeatLimit`), at most
-`tension.max`. While the length offsets are unknown it is at most `calibrating.gentle_limit`.
+T_limit is the least of `tension.limit`, of what the heat of the motors allows for a moment
+(`watchdog.HeatLimit`) and, while the length offsets are unknown, of `calibrating.gentle_limit`.
+
+The rate limit compares with the last command that was published, in whatever mode. Between length
+and tension commands that is a comparison of the tension that they demand of a module:
+
+    T_target = T_bias + max(0, K_stiff (l − l_target))
+
+Of the lengths that demand T_bias, all that are beyond l, the one nearest to the last published
+length is taken. Before the first command the muscles go on to pull as they do: a controller that
+was restarted does not know what was commanded before.
 """
 
 from __future__ import annotations
@@ -35,6 +47,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 POSTURES = 200  # random postures that tell how long the muscles can get
 #: [m] by which a real muscle, or its sensor, may be longer than the model's
 LENGTH_MARGIN = 0.03
+RELIEF = 5.0  # [1/s] of the feedback from measured tension; slow beside the modules (30 ms)
 
 
 class CommandLimiter:
@@ -48,6 +61,9 @@ class CommandLimiter:
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.command: Command | None = None
+        #: the last one of each kind that was published, and for how long it has been [s]
+        self._published: dict[str, tuple[Array, float]] = {}
+        self._relief: Array = np.zeros(robot.muscle_count)  # r [m]
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
         longest = robot.routes.relative_lengths(postures).max(axis=0)
@@ -65,17 +81,42 @@ class CommandLimiter:
 
     def shift(self, offset: Array) -> None:
         """Measure lengths from other offsets, by which they are less [m], (M,)."""
+        if LENGTH in self._published:
+            value, age = self._published[LENGTH]
+            self._published[LENGTH] = value - offset, age
         if self.command is not None and self.command.kind == LENGTH:
             self.command = Command(LENGTH, self.command.value - offset)
 
     def last(self, kind: str, sample: MuscleSample) -> Command:
-        """Return the last command, or one of this kind under which the muscles pull as now."""
-        if self.command is not None and self.command.kind == kind:
+        """Return the last command, or one of this kind that demands the same of the modules.
+
+        Before the first command: one under which the muscles go on to pull as they do.
+        """
+        if self.command is None:
+            command = unchanging(self._robot, kind, sample)
+            if kind == LENGTH:
+                command = Command(kind, np.minimum(command.value, self.longest))
+            return command
+        if self.command.kind == kind:
             return self.command
-        command = unchanging(self._robot, kind, sample)
-        if kind == LENGTH:
-            command = Command(kind, np.minimum(command.value, self.longest))
-        return command
+        return Command(kind, self._converted(kind, self.command.value, sample))
+
+    def _converted(self, kind: str, other: Array, sample: MuscleSample) -> Array:
+        """Return the command of this kind [m] or [N] that demands what one of the other does."""
+        robot = self._robot
+        before, age = self._published.get(kind, (None, 0.0))
+        if kind == TENSION:
+            value = robot.demanded(sample.length, other)
+        else:
+            demand = np.maximum(other, robot.tension.bias)
+            length = np.minimum(sample.length, self.longest)
+            value = length + msc_compensation(robot, demand)
+            if before is not None:
+                value = np.where(demand > robot.tension.bias, value, np.maximum(value, before))
+        if before is None:
+            return value
+        change = self.largest_change(kind, age)
+        return np.clip(value, before - change, before + change)
 
     def largest_change(self, kind: str, dt: float) -> Array | float:
         """Return by how much a command may change within dt [s]: [m], or [N] (M,)."""
@@ -90,32 +131,42 @@ class CommandLimiter:
         Args:
             desired: What is wanted.
             sample: The newest muscle states.
-            tension_limit: Highest tension of every muscle [N], (M,).
+            tension_limit: Highest tension of every muscle for other reasons than its
+                `tension.limit` [N], (M,).
             dt: Time since the last command [s].
 
         Returns:
             The limited command, or None if it is not finite; the last one stays then.
         """
         kind = desired.kind
+        self._published = {k: (value, age + dt) for k, (value, age) in self._published.items()}
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
         value = np.clip(desired.value, before - change, before + change)
+        # An isolated muscle has no limit of its own; a suspect is wound in to verify it.
+        limit = np.minimum(tension_limit, self._robot.description.tension.limit)
         if kind == TENSION:
-            value = np.clip(value, self._robot.tension.bias, tension_limit)
+            value = np.clip(value, self._robot.tension.bias, limit)
         else:
-            value = np.maximum(value, self._shortest(before, change, sample, tension_limit))
+            value = np.maximum(value, self._shortest(before, change, sample, limit, dt))
         if not np.isfinite(value).all():
             return None
         self.command = Command(kind, value)
+        self._published[kind] = value, 0.0
         return self.command
 
     def _shortest(
-        self, before: Array, change: Array | float, sample: MuscleSample, tension_limit: Array
+        self, before: Array, change: Array | float, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
         """Return the shortest length [m] (M,) that demands no tension above the limit."""
+        robot = self._robot
+        tension = sample.motor_tension * sample.usable
+        depth = -msc_compensation(robot, limit)
+        relief = self._relief + RELIEF * dt * (tension - limit) / robot.stiffness
+        self._relief = np.clip(relief, 0.0, depth)
         length = np.minimum(sample.length, self.longest)
-        shortest = length + msc_compensation(self._robot, tension_limit)
+        shortest = length - depth + self._relief
         # Only a muscle that is measured to pull too hard is paid out faster than the rate limit: a
         # length sensor alone may be wrong.
-        too_tense = sample.motor_tension * sample.usable > self._robot.tension.limit
+        too_tense = tension > robot.description.tension.limit
         return np.where(too_tense, shortest, np.minimum(shortest, before + change))

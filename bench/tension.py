@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Healthy arms from their first second on: how long does a measured tension exceed its limit?
+
+    python -m bench tension [--robot musashi_left_arm] [--seeds 5,…,14] [--quick]
+
+Fresh individuals with the initial network, in closed loop with estimate, controller and learner as
+the nodes connect them, in one process. Each explores for a minute and learns meanwhile, then goes
+to random targets by every control method, with the network as it was at first, and holds them.
+Printed for each: the highest measured tension as a multiple of `tension.limit`, the longest time
+above `ALLOWED` times the limit without a break, the time above it and above the limit altogether,
+the stops, and of exploration the number of samples and the held-out error of the network.
+
+Exit status 1 if a tension was above `ALLOWED` times its limit for longer than `LONGEST`, or if a
+healthy arm stopped.
+"""
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
+from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import KIN, make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.recording import (
+    EXPLORATION_STREAM,
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    ClosedLoop,
+    Recording,
+    estimation_error,
+    record,
+)
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser, names, positive
+from musculoskeletal_ae.robot.robot import Robot
+
+ALLOWED, LONGEST = 1.1, 0.5  # times the limit; [s]
+EXPLORED = 60.0  # [s]
+TARGETS, HELD = 4, 4.0  # of each method; [s] for each
+HELD_OUT = 60.0  # [s]
+HEAD = (
+    f'{"seed":>5} {"what":<12} {"max/limit":>9} {"longest":>8} {"above":>7} {"above":>7} '
+    f'{"stops":>5} {"samples":>7} {"error":>7}\n'
+    f'{"":>5} {"":<12} {"":>9} {f"> {ALLOWED} [s]":>8} {f"{ALLOWED} [s]":>7} {"1 [s]":>7} '
+    f'{"":>5} {"":>7} {"[rad]":>7}'
+)
+
+
+class Excess(NamedTuple):
+    """How measured tensions exceeded their limit."""
+
+    highest: float  # as a multiple of the limit
+    longest: float  # above ALLOWED times the limit, without a break [s]
+    allowed: float  # above ALLOWED times the limit, of the muscle with the most [s]
+    limit: float  # above the limit, of the muscle with the most [s]
+
+
+def excess(share: Array, dt: float) -> Excess:
+    """Judge measured tensions.
+
+    Args:
+        share: As multiples of the limit, (N, M).
+        dt: Time between two rows [s].
+    """
+    longest, run = 0.0, np.zeros(share.shape[1])
+    for row in share > ALLOWED:
+        run = np.where(row, run + dt, 0.0)
+        longest = max(longest, float(run.max()))
+    above = [float((share > level).sum(axis=0).max()) * dt for level in (ALLOWED, 1.0)]
+    return Excess(float(share.max(initial=0.0)), longest, above[0], above[1])
+
+
+class Observed:
+    """A loop whose measured tensions are kept."""
+
+    def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
+        self.loop = ClosedLoop(arm, mae, settings, EXPLORATION_STREAM + seed)
+        self.shares: list[Array] = []
+
+    def run(self, step: Callable[[], tuple[Array, ...]], seconds: float) -> None:
+        """Let time pass [s]."""
+        limit = self.loop.arm.robot.tension.limit
+        for _ in range(round(seconds / SAMPLE_TIME)):
+            self.shares.append(step()[3] / limit)
+
+    @property
+    def excess(self) -> Excess:
+        """How tensions exceeded their limit so far."""
+        return excess(np.array(self.shares), SAMPLE_TIME)
+
+
+def explore(
+    arm: Arm, initial: Mae, seed: int, seconds: float, held_out: Recording
+) -> tuple[Excess, int, int, float]:
+    """Explore and learn for a time [s]; return excess, stops, samples and held-out error [rad]."""
+    observed = Observed(arm, initial, Settings(), seed)
+    loop, learner = observed.loop, Learner(arm.robot, initial, 'default', seed)
+    count = 0
+
+    def step() -> tuple[Array, ...]:
+        nonlocal count
+        if learner.mae is not loop.mae:
+            loop.use(learner.mae)
+        row = loop.explore()
+        learner.step(count * SAMPLE_TIME, row[1], row[3], row[2])
+        count += 1
+        return row
+
+    observed.run(step, seconds)
+    error = estimation_error(learner.mae, held_out, 10)
+    return observed.excess, loop.stops, len(learner.samples), error
+
+
+def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Excess, int]:
+    """Go to random targets by one method and hold them; return excess and stops."""
+    observed = Observed(arm, initial, Settings(method=method), seed)
+    robot, loop = arm.robot, observed.loop
+    rng = np.random.default_rng([seed, 0x7E])
+    postures = (robot.random_postures(1, rng)[0] for _ in range(TRIES))
+    stops = 0
+    observed.run(loop.step, 0.1)
+    for theta, _ in holdable_postures(robot, postures, targets):
+        if method != 'float':
+            loop.target(theta)
+        observed.run(loop.step, HELD if method not in ('first', 'second') else 2.0 * HELD)
+        if not loop.core.supervisor.is_running:
+            stops += 1
+            loop.core.reset(np.inf)
+    return observed.excess, stops
+
+
+def line(seed: int, what: str, found: Excess, stops: int, rest: str = '') -> str:
+    """Return a line of the table."""
+    return (
+        f'{seed:>5} {what:<12} {found.highest:>9.3f} {found.longest:>8.2f} {found.allowed:>7.2f} '
+        f'{found.limit:>7.2f} {stops:>5}{rest}'
+    )
+
+
+def main(argv: list[str]) -> int:
+    """Measure every individual, and print the table."""
+    parser = Parser('tension', (__doc__ or '').partition('\n')[0])
+    parser.add_robot()
+    parser.add_seeds(tuple(range(5, 15)))
+    parser.add_quick('a quarter of the time')
+    parser.add_argument('--reality', default=KIN, help='emulator model: kin, foreign, MJCF file')
+    parser.add_argument('--methods', type=names, default=METHODS, help='of control; none: -')
+    parser.add_argument('--seconds', type=positive, default=EXPLORED, help='of exploration')
+    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
+    options = parser.parse_args(argv)
+    share = 0.25 if options.quick else 1.0
+    robot = Robot.load(options.robot)
+    if options.initial is None:
+        initial = initial_mae(robot).mae
+    else:
+        initial = checkpoint.load(options.initial, robot)
+    methods = [] if '-' in options.methods else options.methods
+    if wrong := set(methods) - set(METHODS):
+        raise MusculoskeletalError(f'--methods {sorted(wrong)}; legal: {", ".join(METHODS)}')
+    print(HEAD)
+    failures, worst, rows = 0, Excess(0.0, 0.0, 0.0, 0.0), []
+    for seed in options.seeds:
+        fresh = make_arm(robot, seed, options.reality)
+        held_out = record(copy.deepcopy(fresh), initial, HELD_OUT_STREAM, share * HELD_OUT)
+        results = []
+        if options.seconds * share >= SAMPLE_TIME:
+            found, stops, samples, error = explore(
+                copy.deepcopy(fresh), initial, seed, share * options.seconds, held_out
+            )
+            rows.append((samples, error))
+            results.append(('exploring', found, stops, f' {samples:>7} {error:>7.3f}'))
+        for method in methods:
+            arm = copy.deepcopy(fresh)
+            count = max(1, round(share * TARGETS))
+            results.append((method, *go(arm, initial, seed, method, count), ''))
+        for what, found, stops, rest in results:
+            print(line(seed, what, found, stops, rest), flush=True)
+            failures += (found.longest > LONGEST) + stops
+            worst = Excess(*np.maximum(worst, found))
+    samples, error = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
+    print(line(-1, 'worst, mean', worst, failures, f' {samples:>7.0f} {error:>7.3f}'))
+    return int(failures > 0)
