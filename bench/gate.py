@@ -6,8 +6,8 @@
 For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
 minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
 Printed are the largest of every measure over all of them beside its limit, the same of the messages
-(`signals/limits.py`, `controller`'s overload_time), what was refused (none may be), and how many of
-the initial and the last learned networks are refused under each attack.
+(`signals/limits.py`), what was refused (none may be), and how many of the initial and the last
+learned networks are refused under each attack.
 
 Exit status 1 if a healthy network was refused, or an attack was not.
 """
@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from network_attacks import ATTACKS
 
-from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.estimation.checkpoint_validation import (
@@ -50,7 +49,6 @@ LOAD, MINUTE = 3.6, 60.0  # [kg], [s]
 MESSAGES = {
     'step of l in 10 ms [m]': SIGNAL_LIMITS.step,
     'T beside tension.max': SIGNAL_LIMITS.highest_tension,
-    'time of a T above tension.limit [s]': Settings().overload_time,
     'θ_est beyond its limits, of the range': SIGNAL_LIMITS.estimate_outside,
 }
 
@@ -58,14 +56,9 @@ MESSAGES = {
 def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, float]:
     """Return the largest of MESSAGES over a recording, θ_est by `mae`."""
     theta = mae.estimate(end_tensions(mae, stream), stream.length).theta
-    above, longest = np.zeros(robot.muscle_count), 0.0
-    for over in stream.tension > robot.tension.limit:
-        above = (above + SAMPLE_TIME) * over
-        longest = max(longest, above.max())
     values = (
         np.abs(np.diff(stream.length, axis=0)).max(),
         (stream.tension / robot.tension.max).max(),
-        longest,
         max(0.0, share_outside(robot, theta).max()),
     )
     return dict(zip(MESSAGES, map(float, values), strict=True))

@@ -14,7 +14,6 @@ Exit status 1 if a tension was above `ALLOWED` times its limit for longer than `
 healthy arm stopped.
 """
 
-import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -169,17 +168,19 @@ def main(argv: list[str]) -> int:
     print(HEAD)
     failures, worst, rows = 0, Excess(0.0, 0.0, 0.0, 0.0), []
     for seed in options.seeds:
-        fresh = make_arm(robot, seed, options.reality)
-        held_out = record(copy.deepcopy(fresh), initial, HELD_OUT_STREAM, share * HELD_OUT)
+        held_out = record(
+            make_arm(robot, seed, options.reality), initial, HELD_OUT_STREAM, share * HELD_OUT
+        )
         results = []
         if options.seconds * share >= SAMPLE_TIME:
+            arm = make_arm(robot, seed, options.reality)
             found, stops, samples, error = explore(
-                copy.deepcopy(fresh), initial, seed, share * options.seconds, held_out
+                arm, initial, seed, share * options.seconds, held_out
             )
             rows.append((samples, error))
             results.append(('exploring', found, stops, f' {samples:>7} {error:>7.3f}'))
         for method in methods:
-            arm = copy.deepcopy(fresh)
+            arm = make_arm(robot, seed, options.reality)
             count = max(1, round(share * TARGETS))
             results.append((method, *go(arm, initial, seed, method, count), ''))
         for what, found, stops, rest in results:

@@ -37,7 +37,7 @@ from musculoskeletal_ae.control.planner import Plan, Planner
 from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget, length_methods
 from musculoskeletal_ae.control.settings import BY_TENSION, Settings
 from musculoskeletal_ae.control.stopping import SafeStop
-from musculoskeletal_ae.control.stops import Condition, StopCause
+from musculoskeletal_ae.control.stops import Action, Condition, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.control.trajectory import Points, Setpoint
@@ -528,7 +528,8 @@ class Controller:
         causes = {condition.cause for condition in present}
         is_fresh = StopCause.STALE_MUSCLE_STATES not in causes
         may_wind = self.supervisor.may_wind_suspect
-        return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, may_wind)
+        at_once = self.supervisor.action is Action.RELEASE_AT_ONCE
+        return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, may_wind, at_once)
 
     def _limited(self, desired: Command | None, dt: float) -> Command | None:
         if desired is None or self.sample is None:

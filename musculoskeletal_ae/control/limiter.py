@@ -61,8 +61,8 @@ class CommandLimiter:
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.command: Command | None = None
-        #: the last one of each kind that was published, and for how long it has been [s]
-        self._published: dict[str, tuple[Array, float]] = {}
+        #: the last length command that was published [m], (M,), and how long ago [s]
+        self._last_length: tuple[Array, float] | None = None
         self._relief: Array = np.zeros(robot.muscle_count)  # r [m]
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
@@ -81,9 +81,8 @@ class CommandLimiter:
 
     def shift(self, offset: Array) -> None:
         """Measure lengths from other offsets, by which they are less [m], (M,)."""
-        if LENGTH in self._published:
-            value, age = self._published[LENGTH]
-            self._published[LENGTH] = value - offset, age
+        if self._last_length is not None:
+            self._last_length = self._last_length[0] - offset, self._last_length[1]
         if self.command is not None and self.command.kind == LENGTH:
             self.command = Command(LENGTH, self.command.value - offset)
 
@@ -99,24 +98,21 @@ class CommandLimiter:
             return command
         if self.command.kind == kind:
             return self.command
-        return Command(kind, self._converted(kind, self.command.value, sample))
-
-    def _converted(self, kind: str, other: Array, sample: MuscleSample) -> Array:
-        """Return the command of this kind [m] or [N] that demands what one of the other does."""
-        robot = self._robot
-        before, age = self._published.get(kind, (None, 0.0))
         if kind == TENSION:
-            value = robot.demanded(sample.length, other)
-        else:
-            demand = np.maximum(other, robot.tension.bias)
-            length = np.minimum(sample.length, self.longest)
-            value = length + msc_compensation(robot, demand)
-            if before is not None:
-                value = np.where(demand > robot.tension.bias, value, np.maximum(value, before))
-        if before is None:
-            return value
-        change = self.largest_change(kind, age)
-        return np.clip(value, before - change, before + change)
+            return Command(TENSION, self._robot.demanded(sample.length, self.command.value))
+        return Command(LENGTH, self._length_demanding(self.command.value, sample))
+
+    def _length_demanding(self, tension: Array, sample: MuscleSample) -> Array:
+        """Return lengths [m] (M,) that demand tensions [N] (M,), near the last ones published."""
+        robot = self._robot
+        demand = np.maximum(tension, robot.tension.bias)
+        length = np.minimum(sample.length, self.longest) + msc_compensation(robot, demand)
+        if self._last_length is None:
+            return length
+        before, age = self._last_length
+        length = np.where(demand > robot.tension.bias, length, np.maximum(length, before))
+        change = self.largest_change(LENGTH, age)
+        return np.clip(length, before - change, before + change)
 
     def largest_change(self, kind: str, dt: float) -> Array | float:
         """Return by how much a command may change within dt [s]: [m], or [N] (M,)."""
@@ -139,7 +135,6 @@ class CommandLimiter:
             The limited command, or None if it is not finite; the last one stays then.
         """
         kind = desired.kind
-        self._published = {k: (value, age + dt) for k, (value, age) in self._published.items()}
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
         value = np.clip(desired.value, before - change, before + change)
@@ -152,7 +147,10 @@ class CommandLimiter:
         if not np.isfinite(value).all():
             return None
         self.command = Command(kind, value)
-        self._published[kind] = value, 0.0
+        if kind == LENGTH:
+            self._last_length = value, 0.0
+        elif self._last_length is not None:
+            self._last_length = self._last_length[0], self._last_length[1] + dt
         return self.command
 
     def _shortest(

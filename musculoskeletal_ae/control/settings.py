@@ -83,9 +83,6 @@ class Settings:
         40.0,
         200.0,
     )
-    overload_time: float = settable(
-        20.0, 'a tension above tension.limit for this long stops the arm', 's', 0.1, 3600.0
-    )
 
     def desired_stiffness(self, radian: Iterable[float]) -> tuple[float, ...]:
         """Return `joint_stiffness`, one for each joint; nothing, or one 0, is all as they come.

@@ -13,7 +13,6 @@ from musculoskeletal_ae.control.methods import Solution
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.signals.body_state import KNOWN
 
 LEAST_SHARE = 10.0  # [%] of its speed, from which on a trajectory's duration says more
@@ -92,7 +91,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         values['unknown length zeros'] = robot.names(unknown)
         warnings.append('length offsets are unknown: the arm only explores, gently')
     if tense := core.watchdog.overload.tense:
-        warnings.append(f'tension above {shown(robot.tension.limit)} N: {", ".join(tense)}')
+        warnings.append(f'too much tension: {", ".join(tense)}')
     return warnings + _heat_warnings(core, values)
 
 

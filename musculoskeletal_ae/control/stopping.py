@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a stopped arm does: it holds, is released, and a suspect muscle may be wound in a little.
 
-The last command is held for `hold_time`. Then lengths are paid out at the rate limit until muscle
-stiffness control holds only T_bias, and tensions fall to T_bias at K_stiff times that rate.
+The last command is held for `hold_time`, except after an overload. Then lengths are paid out at the
+rate limit until muscle stiffness control holds only T_bias, and tensions fall to T_bias at K_stiff
+times that rate.
 
 While a suspect is verified after an anomaly (`estimation/verification`), it is wound in once the
 others are paid out: slowly, until its tension, or what muscle stiffness control demands of it, has
@@ -59,7 +60,12 @@ class SafeStop:
         return self._held > self._settings.hold_time
 
     def step(
-        self, sample: MuscleSample, dt: float, is_fresh: bool, may_wind: bool
+        self,
+        sample: MuscleSample,
+        dt: float,
+        is_fresh: bool,
+        may_wind: bool,
+        releases_at_once: bool = False,
     ) -> Command | None:
         """Return the desired command, dt [s] after the last one; None before the first.
 
@@ -68,11 +74,14 @@ class SafeStop:
             dt: How long the stop has gone on since the last call [s].
             is_fresh: Whether the sample still tells where the muscles are.
             may_wind: Whether the suspect may be wound in.
+            releases_at_once: Whether the last command is not to be held.
         """
         last = self._limiter.command
         if last is None:
             return None
         self._held += dt
+        if releases_at_once and not self.is_releasing:
+            self._held = self._settings.hold_time + dt
         if not self.is_releasing:
             return last
         winds = (

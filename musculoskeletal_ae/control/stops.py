@@ -18,6 +18,8 @@ class Action(IntEnum):
     HOLD = 1
     #: keep the last command for `hold_time`, then pay out until every muscle is at T_bias
     RELEASE = 2
+    #: pay out at once, until every muscle is at T_bias
+    RELEASE_AT_ONCE = 3
 
 
 class Clears(Enum):
@@ -158,9 +160,9 @@ class StopCause(Enum):
     OVERLOAD = (
         'overload',
         Declaration(
-            'a tension is above tension.limit for overload_time or far above it for 1 s',
-            Action.RELEASE,
-            Clears.RESET,
+            'a tension is above 1.1 × tension.limit for 0.2 s although its muscle is paid out',
+            Action.RELEASE_AT_ONCE,
+            Clears.VERIFICATION,
             'overload',
             f'free the arm; {RESET}',
         ),
@@ -211,7 +213,7 @@ def table() -> str:
     """Return the table of stop causes as Markdown."""
     rows = ['| cause | condition | action | ends | remedy |', '|---|---|---|---|---|']
     for cause in StopCause:
-        action = cause.action.name.lower()
+        action = cause.action.name.lower().replace('_', ' ')
         rows.append(
             f'| `{cause.identifier}` | {cause.condition} | {action} | {cause.clears.value} '
             f'| {cause.remedy} |'

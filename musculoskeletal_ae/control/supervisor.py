@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-from musculoskeletal_ae.control.stops import Clears, Condition, StopCause
+from musculoskeletal_ae.control.stops import Action, Clears, Condition, StopCause
 
 RESUME = 0.2  # [s] without a cause after which a paused arm goes on
 
@@ -117,6 +117,12 @@ class Supervisor:
     def may_wind_suspect(self) -> bool:
         """Whether a suspect muscle may be wound in; an operator's stop outranks that."""
         return self.state is StopState.VERIFYING and StopCause.OPERATOR not in self._causes
+
+    @property
+    def action(self) -> Action:
+        """What the arm does in this stop: the most severe action of all that caused it."""
+        shown = () if self.condition is None else (self.condition.cause,)
+        return max((cause.action for cause in (*self._causes, *shown)), default=Action.HOLD)
 
     @property
     def explores(self) -> bool:

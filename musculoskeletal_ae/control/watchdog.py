@@ -9,18 +9,16 @@ to `SLOWEST`; a fast clock makes no age limit shorter. The controller's own paus
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
@@ -28,7 +26,9 @@ OWN_PAUSE = 0.3  # [s] between two steps; what is longer counts for no age
 SLOWEST = 0.05  # pace of the messages' clock, of real time, below which ages grow no further
 PACE_SPAN = 1.0  # [s] over which the two clocks are compared
 OVERHEATED = 20.0  # [°C] above temperature_limit
-OVERLOAD_MOMENT = 1.0  # [s] of a tension nearer to tension.max than to tension.limit
+#: times tension.limit, and for how long [s] a tension may be higher: the limiter pays such a muscle
+#: out at once; where that does not help, the whole arm is paid out
+OVERLOAD, OVERLOAD_TIME = 1.1, 0.2
 
 MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMATE
 
@@ -94,42 +94,31 @@ class DataAge:
 
 
 class Overload:
-    """Which muscles pull above `tension.limit`, and for how long."""
+    """Which muscles pull above OVERLOAD times `tension.limit`, and for how long."""
 
     def __init__(self, robot: Robot) -> None:
-        limits = robot.tension
         self._robot = robot
-        #: tensions [N] that are too high for long, and for more than a moment, (2, M)
-        self._levels = np.array([limits.limit, 0.5 * (limits.limit + limits.max)])
-        #: since when each muscle has been above each of them [s], (2, M)
-        self._since: Array = np.full((2, robot.muscle_count), math.inf)
+        self._level: Array = OVERLOAD * robot.tension.limit
+        self._since: Array = np.full(robot.muscle_count, math.inf)  # above it, since when [s]
 
     def take(self, tension: Array, awake: float) -> None:
         """Take T [N] (M,), without glitches."""
-        since = np.minimum(self._since, awake)
-        self._since = np.where(tension > self._levels, since, math.inf)
-
-    def strained(self, awake: float, overload_time: float) -> Bools:
-        """Return which muscles have used half of the time after which they stop the arm, (M,)."""
-        strained: Bools = awake - self._since[0] > 0.5 * overload_time
-        return strained
+        self._since = np.where(tension > self._level, np.minimum(self._since, awake), math.inf)
 
     @property
     def tense(self) -> list[str]:
-        """Names of the muscles that pull above `tension.limit`."""
-        return [name for name, at in zip(self._robot.muscles, self._since[0]) if at < math.inf]
+        """Names of the muscles that pull too hard, and how hard is too hard."""
+        each = zip(self._robot.muscles, self._level, self._since, strict=True)
+        return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
 
-    def conditions(self, awake: float, overload_time: float) -> list[Condition]:
+    def conditions(self, awake: float) -> list[Condition]:
         """Return the overload, if there is one."""
-        for since, allowed, level in zip(
-            self._since, (overload_time, OVERLOAD_MOMENT), self._levels
-        ):
-            m = int(since.argmin())
-            if awake - since[m] > allowed:
-                name = self._robot.muscles[m]
-                detail = f'{name}: tension above {level[m]:g} N for {allowed:g} s'
-                return [Condition(StopCause.OVERLOAD, detail)]
-        return []
+        m = int(self._since.argmin())
+        if awake - self._since[m] <= OVERLOAD_TIME:
+            return []
+        level = f'{self._level[m]:.0f} N for {OVERLOAD_TIME:g} s'
+        detail = f'{self._robot.muscles[m]}: tension above {level}'
+        return [Condition(StopCause.OVERLOAD, detail)]
 
 
 class HeatLimit:
@@ -143,22 +132,16 @@ class HeatLimit:
 
     def __init__(self, robot: Robot) -> None:
         self.heat = Heat(robot)
-        self._temperatures: deque[Array] = deque(maxlen=5)
         self._is_overheated = False
         self.planned: Array = np.full(robot.muscle_count, robot.tension.max)
         self.momentary = self.planned
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
         """Take muscle states, `elapsed` [s] after the last ones."""
-        _, tension, temperature = sample.newest
-        # NaN is unknown; so is what no module can have, which an isolated one may read.
-        possible = (temperature >= LIMITS.lowest_temperature) & (
-            temperature <= LIMITS.highest_temperature
-        )
-        self._temperatures.append(np.where(possible, temperature, -np.inf))
+        tension = sample.newest[1]
         # The tension that an isolated muscle reads may be anything; it is told to pull T_bias.
         pull = np.where(robot.used, tension, robot.description.tension.bias)
-        self.heat.step(pull, median_of_rows(np.array(self._temperatures)), elapsed)
+        self.heat.step(pull, sample.temperature, elapsed)
 
     def lower(self, highest: float, fall: Array | float) -> None:
         """Let the limits follow the temperatures, and fall by at most so much [N]."""
@@ -211,8 +194,8 @@ class Watchdog:
             present.append(Condition(StopCause.ANOMALY))
         if self.second_publisher:
             present.append(Condition(StopCause.SECOND_PUBLISHER, self.second_publisher))
-        settings, awake = self._settings, self.age.awake(now)
-        present += self.overload.conditions(awake, settings.overload_time)
+        settings = self._settings
+        present += self.overload.conditions(self.age.awake(now))
         present += self.heat.conditions(self._robot, settings.temperature_limit)
         present += self.age.stale(now, settings.max_age)
         return present

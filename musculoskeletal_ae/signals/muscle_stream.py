@@ -2,7 +2,7 @@
 """From a raw `muscle_states` message to numbers: the only place where that happens.
 
     message ─► shape, finite ─► plausible level ─► plausible step ─► median ─► length offset
-            ─► tendon friction ─► MuscleSample
+            ─► tendon friction, believed temperature ─► MuscleSample
 
 A message that fails a check raises a `RejectionError`, which names the reason, the value and the
 legal range. Nodes, bags, `check_driver` and experiments all use this class, and `signals/limits.py`
@@ -60,7 +60,8 @@ class MuscleSample:
         motor_tension: T at the motor [N].
         bone_tension: T_end at the bone, with tendon friction removed [N].
         sliding: Which way each tendon slid last: 1 wound in, −1 paid out.
-        temperature: Of the module's housing [°C]; NaN where it is unknown.
+        temperature: Of the module's housing, which changes no faster than one can [°C]; NaN where
+            it is unknown.
         usable: Which muscles count; isolated ones do not.
         newest: l (offset removed), T and temperature of the last message alone, before the median
             against glitches, (3, M).
@@ -179,6 +180,42 @@ class StepCheck:
         self._accepted, self._settled_since = length, math.inf
 
 
+class TemperatureCheck:
+    """Believes a temperature only where a housing can have got there since the last one believed.
+
+    A sensor that reads 199 °C for three messages changes nothing. One that goes on to read it is
+    believed some seconds later: a hot module must stop the arm.
+    """
+
+    def __init__(self, muscle_count: int) -> None:
+        self._believed: Array = np.full(muscle_count, math.nan)  # [°C], (M,)
+        self._age: Array = np.zeros(muscle_count)  # of what is believed [s]
+        self._first: Array = self._believed.copy()  # a reading to begin with [°C]
+        self._first_age: Array = np.zeros(muscle_count)  # for how long others agree with it [s]
+        self._last_at = math.nan
+
+    def step(self, read: Array, now: float) -> Array:
+        """Return what is believed [°C] (M,) of readings that came at `now` [s]; NaN is unknown."""
+        elapsed = max(now - self._last_at, 0.0) if math.isfinite(self._last_at) else 0.0
+        self._last_at = now
+        possible = (read >= LIMITS.lowest_temperature) & (read <= LIMITS.highest_temperature)
+        self._age += elapsed
+        change = LIMITS.temperature_step + LIMITS.temperature_rate * self._age
+        accepted = possible & (np.abs(read - self._believed) <= change)
+        accepted |= self._begins(np.where(possible, read, math.nan), elapsed)
+        self._believed = np.where(accepted, read, self._believed)
+        self._age = np.where(accepted, 0.0, self._age)
+        return np.where(possible, self._believed, math.nan)
+
+    def _begins(self, read: Array, elapsed: float) -> Bools:
+        """Return where nothing was believed yet and readings have agreed for long enough, (M,)."""
+        agrees = np.abs(read - self._first) <= LIMITS.temperature_step
+        self._first_age = np.where(agrees, self._first_age + elapsed, 0.0)
+        self._first = np.where(agrees, self._first, read)
+        begins: Bools = np.isnan(self._believed) & (self._first_age > LIMITS.glitch)
+        return begins
+
+
 class MuscleStream:
     """Turns the messages of one arm's muscle modules into samples.
 
@@ -208,6 +245,7 @@ class MuscleStream:
         self.displaced: frozenset[int] = frozenset()
         self.has_displaced_unseen = False
         self.jumps = 0
+        self._temperatures = TemperatureCheck(robot.muscle_count)
         self.reset()
 
     def reset(self) -> None:
@@ -278,7 +316,7 @@ class MuscleStream:
             motor_tension=read[1],
             bone_tension=end_tension(self._friction, read[1], sliding),
             sliding=sliding,
-            temperature=read[2],
+            temperature=self._temperatures.step(read[2], now),
             usable=self.body.used,
             newest=newest,
             jumped=self._steps.jumped,

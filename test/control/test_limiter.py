@@ -48,10 +48,10 @@ def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_h
         assert (sent - before >= -rate * DT - 1e-12).all()
         demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
         tense = pull > ROBOT.tension.limit
-        assert (demanded <= limit + 1e-6)[tense].all()
-        # Paying out faster is what the tension limit may do, and nothing else.
-        slow = ~tense | (demanded < limit - 1e-6)
-        assert ((sent - before)[slow] <= rate * DT + 1e-12).all()
+        assert (demanded <= np.minimum(limit, ROBOT.tension.limit) + 1e-6)[tense].all()
+        # Paying out faster is what the tension limit may do, and no further than the muscle is.
+        assert ((sent - before)[~tense] <= rate * DT + 1e-12).all()
+        assert (sent <= np.maximum(before + rate * DT, length) + 1e-12).all()
         before = sent
 
 
@@ -86,18 +86,24 @@ def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths
         before = sent
 
 
-@given(vectors(-0.5, 0.5), vectors(BIAS, MAX), vectors(BIAS, MAX))
-def test_going_over_from_lengths_to_tensions_and_back_starts_from_how_the_muscles_pull(
-    desired, pull, other
-):
-    limiter, rate = CommandLimiter(ROBOT, Settings()), Settings().rate_limit
-    now = sample(0.0, pull)
-    limiter.limit(Command(LENGTH, desired), now, LIMIT, DT)
-    tension = limiter.limit(Command(TENSION, other), now, LIMIT, DT).value
-    assert (np.abs(tension - pull) <= ROBOT.stiffness * rate * DT + 1e-9).all()
-    length = limiter.limit(Command(LENGTH, desired), now, LIMIT, DT).value
-    before = np.minimum(unchanging(ROBOT, LENGTH, now).value, limiter.longest)
-    assert (length >= before - rate * DT - 1e-12).all()
+@given(
+    st.lists(
+        st.tuples(st.booleans(), vectors(-0.1, 0.1), vectors(BIAS, MAX)), min_size=2, max_size=15
+    )
+)
+def test_across_changes_between_lengths_and_tensions_no_demand_and_no_length_makes_a_step(wanted):
+    limiter, rate, now = CommandLimiter(ROBOT, Settings()), Settings().rate_limit, sample(0.0, BIAS)
+    demand, last_length, elapsed = np.full(COUNT, BIAS), None, 0.0
+    for by_length, length, tension in wanted:
+        desired = Command(LENGTH, length) if by_length else Command(TENSION, tension)
+        sent = limiter.limit(desired, now, LIMIT, DT).value
+        elapsed += DT
+        before, demand = demand, ROBOT.demanded(now.length, sent) if by_length else sent
+        assert (demand - before <= ROBOT.stiffness * rate * DT + 1e-6).all()
+        if by_length:
+            if last_length is not None:
+                assert (np.abs(sent - last_length) <= rate * elapsed + 1e-9).all()
+            last_length, elapsed = sent, 0.0
 
 
 @pytest.mark.parametrize('kind', [LENGTH, TENSION])

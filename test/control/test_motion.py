@@ -15,7 +15,7 @@ from nominal_body import nominal_arm
 
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH
-from musculoskeletal_ae.control.controller import DEMANDED, Controller
+from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import SHARE, slowness
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
@@ -298,21 +298,20 @@ def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench)
     bench.core.trajectory(points(OTHER))
     (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
     demanded = np.array([ROBOT.demanded(length, c.value) for c in bench.step(400)])
-    beyond = (demanded - limits.limit) / (limits.max - limits.limit)
-    assert 0.0 < beyond.max() <= DEMANDED + 1e-9 < 0.5
+    assert 0.9 < (demanded / limits.limit).max() <= 1.0 + 1e-9
 
 
 @pytest.mark.parametrize('trajectory', [True, False])
 def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
     bench.core.trajectory(points(OTHER)) if trajectory else bench.target(OTHER)
-    pull, highest = ROBOT.tension.bias, 0.0
+    pull, highest = ROBOT.tension.bias, -np.inf
     for _ in range(4000):
         (command,) = bench.step()
         length, _ = rest_readings(ROBOT, REST, bench.tension)
         demanded = np.clip(ROBOT.demanded(length, command.value), 0.0, ROBOT.tension.max)
         bench.tension = pull = pull + 0.3 * (demanded - pull)
         highest = max(highest, (pull - ROBOT.tension.limit).max())
-    assert highest > 20.0  # [N]
+    assert -20.0 < highest < 5.0  # [N]
     assert bench.cause == ''
 
 

@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control.supervisor import RESUME
-from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_MOMENT, OWN_PAUSE
+from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, OWN_PAUSE
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.validity import QUANTITIES
 
@@ -83,20 +83,23 @@ def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lie
         ('length', lambda v: v + 0.1, 'length jumped'),
         ('length', lambda v: v * 0.0 + 1e308, 'length beyond what the joints allow'),
         ('tension', lambda v: v * 0.0 + 600.0, 'tension beyond the maximum'),
-        ('tension', lambda v: v * 0.0 + 450.0, 'tension above 350 N for 1 s'),
+        ('tension', lambda v: v * 0.0 + 450.0, 'tension above 220 N for 0.2 s'),
         ('temperature', lambda v: v * 0.0 + 1e308, 'impossible temperature'),
-        ('temperature', lambda v: v * 0.0 + 110.0, f'overheated: {MUSCLE} 11'),
+        ('temperature', lambda v: v * 0.0 + 110.0, f'overheated: {MUSCLE}'),
     ],
 )
 def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(row, lie, cause):
     bench = Lied()
     before = bench.core.limiter.command
-    sent = bench.lies(70 if 'jumped' in cause else 110, **{row: lie})
+    sent = bench.lies(70 if 'jumped' in cause else 500, **{row: lie})
     assert cause in bench.condition
     assert bench.core.supervisor.mode != 'paused'
     assert cause in str(bench.core.reset(bench.now))
-    assert largest_step(before, sent) <= TICK + 1e-9
-    bench.step(120)
+    steps = np.diff(values([before, *sent]), axis=0)
+    assert steps.min() >= -TICK - 1e-9
+    # Only a muscle that pulls too hard is paid out faster.
+    assert 'tension above' in cause or steps.max() <= TICK + 1e-9
+    bench.step(500)
     assert bench.core.reset(bench.now) is None
     bench.step(200)
     assert bench.report().message == 'holding'
@@ -107,7 +110,7 @@ def test_modules_without_thermometers_do_not_stop_the_arm_and_a_hot_one_among_th
     bench = Lied()
     bench.temperature = np.full(ROBOT.muscle_count, np.nan)
     bench.temperature[known] = 110.0
-    bench.step(200)
+    bench.step(500)
     assert bench.condition[:10] == ('overheated' if known else '')
     warm = np.isin(np.arange(ROBOT.muscle_count), known)
     tension = ROBOT.tension
@@ -140,8 +143,16 @@ def test_a_glitch_of_temperature_changes_nothing_and_real_heat_pays_out_within_t
         np.testing.assert_array_equal(bench.core.watchdog.heat.planned, limit)
         assert largest_step(before, sent) <= TICK + 1e-9
     bench.temperature = COLD + np.array([60.0, *[0.0] * (ROBOT.muscle_count - 1)])
-    assert largest_step(before, bench.step(200)) <= TICK + 1e-9
+    assert largest_step(before, bench.step(500)) <= TICK + 1e-9
     assert bench.core.watchdog.heat.planned[0] == ROBOT.tension.bias[0]
+
+
+def test_temperatures_are_believed_only_as_fast_as_a_housing_can_warm():
+    bench = Lied()
+    bench.lies(3, temperature=lambda t: t * 0.0 + 199.0)
+    bench.step(50)
+    assert bench.cause == ''
+    assert bench.core.watchdog.heat.heat.core.max() < COLD[0] + 1.0
 
 
 def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
@@ -149,32 +160,34 @@ def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
     limit = bench.core.settings.temperature_limit
     bench.temperature = COLD.copy()
     bench.temperature[2] = limit + OVERHEATED + 1.0
-    bench.step(20)
+    bench.step(500)
     assert bench.condition.startswith(f'overheated: {ROBOT.muscles[2]} 106 °C')
     bench.temperature[2] = limit + 1.0
-    bench.step(20)
+    bench.step(100)
     assert 'overheated' in str(bench.core.reset(bench.now))
     bench.temperature[2] = limit - 6.0
-    bench.step(20)
+    bench.step(100)
     assert bench.core.reset(bench.now) is None
     bench.step(20)
     assert bench.cause == ''
 
 
-def test_a_tension_above_the_limit_is_reported_at_once_and_stops_the_arm_after_the_overload_time():
-    bench = Lied(overload_time=3.0)
+def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_the_arm():
+    bench = Lied(hold_time=5.0)
     tension = np.full(ROBOT.muscle_count, 60.0)
-    tension[3] = 220.0
     bench.pull(tension)
-    assert f'tension above 200 N: {ROBOT.muscles[3]}' in bench.report().message
-    bench.step(280)
+    tension[3] = 230.0
+    bench.tension = tension
+    bench.step(3)  # the median against glitches
+    assert f'too much tension: {ROBOT.muscles[3]} (above 220 N)' in bench.report().message
+    before = bench.step(round(OVERLOAD_TIME / DT) - 3)[-1]
     assert bench.cause == ''
-    bench.step(20)
-    assert bench.condition == f'overload: {ROBOT.muscles[3]}: tension above 200 N for 3 s'
+    after = bench.step(10)
+    assert bench.condition == f'overload: {ROBOT.muscles[3]}: tension above 220 N for 0.2 s'
+    assert (after[-1].value > before.value).any()  # it is not held for hold_time
     bench.tension = None
     bench.step(120)
     assert bench.core.reset(bench.now) is None
-    assert OVERLOAD_MOMENT < 3.0
 
 
 # -- late for a moment, or gone -------------------------------------------------------------------
