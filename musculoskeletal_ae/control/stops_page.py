@@ -28,7 +28,8 @@ controller in `/diagnostics` name the same.
 
 The action `hold` keeps the last command; a stop that outlasts `hold_time` releases the arm. The \
 action `release` keeps the last command for `hold_time` and then pays all muscles out until each \
-pulls with T_bias; `release at once` does not wait for `hold_time`. Of causes that begin together, the first in this table is reported.
+pulls with T_bias; `release at once` does not wait for `hold_time`. Of causes that begin together, \
+the first in this table is reported.
 
 {table}
 """

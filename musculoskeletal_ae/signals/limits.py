@@ -29,9 +29,9 @@ class Limits(NamedTuple):
     #: lowest and highest temperature of a muscle module [°C]
     lowest_temperature: float = -40.0
     highest_temperature: float = 200.0
-    #: a module's temperature changes by at most `temperature_step + temperature_rate · dt` since the
-    #: last one that was believed [°C], [°C/s]; the first is believed once others have agreed with it
-    #: to within the step for `glitch` [s]
+    #: a module's temperature changes by at most `temperature_step + temperature_rate · dt` [°C],
+    #: [°C/s] since the last one that was believed; the first is believed once others have agreed
+    #: with it to within the step for `glitch` [s]
     temperature_step: float = 5.0
     temperature_rate: float = 50.0
     #: how far a length may lie beyond what the joints allow [m]: tendons wrap, wind up with slack,

@@ -39,15 +39,17 @@ class Arm(RuleBasedStateMachine):
         super().__init__()
         self.arm, self.now, self.blind = EmulatedArm(ROBOT, 1), 100.0, set()
         self.offsets = LengthOffsets(np.zeros(COUNT), np.zeros(COUNT))
-        self.restart()
+        self.restart(False)
 
-    @rule()
-    def restart(self):
+    @rule(explores=st.booleans())
+    def restart(self, explores):
         """Kill the controller; a new one begins with nothing but the body state."""
         self.core = Controller(ROBOT)
         self.core.use(MAE)
         self.core.use_body(self.core.stream.body.with_offsets(self.offsets))
         self.core.target(dict(zip(ROBOT.joints, ((0.0, 0.0),) * ROBOT.joint_count)))
+        if explores:
+            self.core.explore(True)
         #: kind, value as published, and when, of the last command and of the last length command
         self.last = self.last_length = None
         self.has_stopped = False

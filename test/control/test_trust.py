@@ -91,7 +91,7 @@ def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lie
 def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(row, lie, cause):
     bench = Lied()
     before = bench.core.limiter.command
-    sent = bench.lies(70 if 'jumped' in cause else 500, **{row: lie})
+    sent = bench.lies(70 if 'jumped' in cause else 200, **{row: lie})
     assert cause in bench.condition
     assert bench.core.supervisor.mode != 'paused'
     assert cause in str(bench.core.reset(bench.now))
