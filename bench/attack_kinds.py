@@ -133,6 +133,14 @@ class Scene:
         elif step.startswith('check that'):
             for name in ('hardware_emulator', 'estimator'):
                 self.resume(name)
+        elif service and service[0] == 'estimator/zero':
+            # It takes half a minute of gentle motion, and would begin anew with every call.
+            attack.call(Trigger, service[0])
+            attack.call(Trigger, 'controller/reset')
+            attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
+            end = time.monotonic() + 0.6 * PATIENCE
+            while 'zeros unknown' in attack.situation.trouble() and time.monotonic() < end:
+                attack.spin(1.0)
         elif service and service[2] in ('explore', 'enable'):
             attack.call(SetBool, service[0], SetBool.Request(data=True))
         elif service:
