@@ -25,6 +25,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 
 from PIL import Image
 
@@ -121,6 +122,8 @@ def main(argv: list[str]) -> int:
                 print(line, end='')
                 if ' s  error ' in line:
                     break
+            # A pipe that nobody reads would stop the status line.
+            Thread(target=system.communicate, daemon=True).start()
             frames, kept = record(options, Path(folder))
         finally:
             end_processes([system], signal.SIGINT)
