@@ -15,7 +15,6 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 'musculoskeletal_ae'
 #: folders whose imports come with an extra, or with ROS
 EXTRAS = {'view': 'view', 'experiments': 'experiments', 'importing': 'experiments'}
-MUJOCO = ('foreign.py', 'mjcf.py')  # emulated arms of MuJoCo come with the experiments
 
 
 def imported(files):
@@ -31,8 +30,11 @@ def imported(files):
 
 
 def extra_of(file):
-    """Return the extra with which the imports of a file come; '' if they always do."""
-    return 'experiments' if file.name in MUJOCO else EXTRAS.get(file.parent.name, '')
+    """Return the extra with which the imports of a file come; '' if they always do.
+
+    Whatever uses MuJoCo comes with the experiments; the example shows that learning does not.
+    """
+    return 'experiments' if 'mujoco' in imported([file]) else EXTRAS.get(file.parent.name, '')
 
 
 distributions = cache(packages_distributions)  # a second each time
@@ -79,9 +81,8 @@ def test_the_tests_import_only_what_the_requirements_of_the_tests_bring():
         for file in ('requirements.txt', '.ci/requirements-test.txt', '.ci/requirements-ros.txt')
     ).lower()
     tests = ROOT / 'test'
-    own = (
-        {path.stem for path in tests.rglob('*.py')} | {p.name for p in tests.iterdir()} | {'bench'}
-    )
+    own = {path.stem for path in (*tests.rglob('*.py'), *(ROOT / 'doc').glob('*.py'))}
+    own |= {path.name for path in tests.iterdir()} | {'bench'}
     brought = {module: distribution(module) for module in imported(tests.rglob('*.py')) - own}
     # Message packages and what rclpy depends on come with the wheels of ROS, or with Jazzy.
     of_ros = ('_msgs', '_srvs', '_interfaces', 'rclpy')

@@ -111,10 +111,11 @@ def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
 
 
 def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp_path):
-    graph.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
     wanted = 'anomaly,muscle_states'
-    recorder = record(tool, graph, tmp_path / 'bag', '--duration', '1', '--topics', wanted)
-    output, ns = recorder.output(), graph.namespace
+    recorder = record(tool, graph, tmp_path / 'bag', '--topics', wanted)
+    graph.publisher(Float64MultiArray, 'muscle_states')  # waits for the recorder
+    graph.spin(1.0)
+    output, ns = recorder.end(signal.SIGINT), graph.namespace
     assert '0 messages recorded' in output
     silent = f'{ns}/anomaly, which nobody publishes; {ns}/muscle_states, which sent nothing'
     assert f'nothing was recorded of {silent}' in output
