@@ -17,6 +17,10 @@ doc/howto/your_robot.md leads from a robot of your own to one that learns.
 
   --robot NAME|DIR           a robot under config/, or a directory with robot.urdf and muscles.yaml
                              (default: musashi_left_arm)
+  --mujoco FILE.xml          a MuJoCo model instead of a robot: imports it, says what that changed,
+                             trains, and plays the model itself (doc/howto/mujoco.md); with
+                             --joints, --muscles, --without NAME,… and --base, --end NAME as of
+                             import_robot
   --checkpoint FILE          MAE to start from (default: train one, once, and keep it in the cache)
   --hardware                 your own driver instead of the emulator: waits for its muscle_states,
                              says what is wrong with them, and starts once nothing is
@@ -27,7 +31,8 @@ doc/howto/your_robot.md leads from a robot of your own to one that learns.
                              --hardware off: a real arm moves only on request)
   --no-learner               no online learning
   --preset default|paper     the best we can measure, or as printed in the paper (default: default)
-  --seed N                   which individual arm the emulator is (default: 0)
+  --seed N                   which individual arm the emulator is (default: 0; of a MuJoCo model:
+                             the model as it is)
   --reality kin|foreign|FILE.xml
                              its body: the first, a second one whose mechanics are foreign to the
                              learner, or a MuJoCo model with the robot's names (default: kin)
@@ -64,6 +69,8 @@ refuse() {
 # The nodes and tools check the values, and say what is wrong with them.
 
 robot=musashi_left_arm
+mujoco=
+chain=() # of import_robot
 checkpoint=
 hardware=false
 controller=true
@@ -90,12 +97,14 @@ nodes='controller|estimator|hardware_emulator|learner|sim'
 sorted=$(getopt --name bringup.sh --options hp: --longoptions robot:,checkpoint:,hardware \
   --longoptions no-controller,combined,bag:,explore,no-explore,no-learner,preset:,seed:,reality: \
   --longoptions joint-source:,params-file:,namespace:,network,duration:,record:,view,port: \
-  --longoptions read-only,help -- "$@") || refuse 'legal options: see ./bringup.sh --help'
+  --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,help -- "$@") || refuse 'legal options: see ./bringup.sh --help'
 eval set -- "$sorted"
 given=$sorted
 while [ $# -gt 0 ]; do
   case $1 in
     --robot) robot=$2 && shift ;;
+    --mujoco) mujoco=$2 && shift ;;
+    --joints | --muscles | --without | --base | --end) chain+=("$1" "$2") && shift ;;
     --checkpoint) checkpoint=$2 && shift ;;
     --hardware) hardware=true ;;
     --no-controller) controller=false ;;
@@ -143,12 +152,16 @@ exclude --bag --hardware --combined --explore --reality
 exclude --hardware --reality
 exclude --no-controller --combined --explore
 exclude --no-learner --joint-source
+exclude --mujoco --robot --hardware --bag --reality
+[ -n "$mujoco" ] || [ ${#chain[@]} = 0 ] || refuse "${chain[0]} goes with --mujoco"
+[ -z "$mujoco" ] || [ -f "$mujoco" ] || refuse "--mujoco '$mujoco' is no file"
 for option in --port --read-only; do
   ! is_given "$option" || [ $view = true ] || refuse "$option is about the page: it goes with --view"
 done
 
 robot_directory=$repository/config/$robot
-[ -f "$robot_directory/muscles.yaml" ] || robot_directory=$robot
+[ -z "$mujoco" ] || robot_directory=$repository # until it is imported
+[ -n "$mujoco" ] || [ -f "$robot_directory/muscles.yaml" ] || robot_directory=$robot
 [ -d "$robot_directory" ] || refuse "--robot '$robot' is neither a directory nor one of: $(
   cd "$repository/config" && dirname -- */muscles.yaml | paste -sd ' '
 )"
@@ -266,10 +279,31 @@ train_once() {
     return
   fi
   [ -t 1 ] || export TQDM_MININTERVAL=5 # a progress bar in a file: a line now and then
-  say "training the MAE of $robot, once (about a minute)"
+  say "training the MAE of $robot, once (a minute or two)"
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
     > >(tee "$logs/train.log") 2>&1
   wait_for train || died train $?
+}
+
+# --- a MuJoCo model ------------------------------------------------------------------------------
+
+# Sets $robot to a directory that is imported anew each time: it takes seconds, and checkpoints are
+# named after what is in it.
+import_mujoco() {
+  local status name
+  name=$(basename "$mujoco" .xml)
+  mujoco=$(realpath "$mujoco")
+  robot=$logs/${name//[^A-Za-z0-9_.-]/_} && robot_directory=$robot
+  say "importing $mujoco"
+  launch import_robot "$mujoco" --out "$robot" --play "${chain[@]}" > >(tee "$logs/import.log") 2>&1
+  wait_for import_robot
+  status=$?
+  case $status in
+    0) ;;
+    3) own_clock=true ;;
+    *) exit 1 ;;
+  esac
+  reality=$mujoco
 }
 
 # --- The system ----------------------------------------------------------------------------------
@@ -282,6 +316,8 @@ chosen_value() { # NAME
 
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, which ROS parameters are
 
+own_clock=false # of an emulated arm that is slower than real time
+[ -z "$mujoco" ] || import_mujoco
 [ -n "$checkpoint" ] || train_once
 
 under=()
@@ -289,7 +325,7 @@ under=()
 common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
   -p "robot:=$(quoted "$robot")" -p "preset:=$preset" -p "seed:=$seed"
   -p "checkpoint:=$(quoted "$checkpoint")")
-[ -z "$bag" ] || common+=(-p use_sim_time:=true)
+if [ -n "$bag" ] || [ $own_clock = true ]; then common+=(-p use_sim_time:=true); fi
 
 if [ $hardware = true ]; then
   # Nothing that could move the arm is there before its driver says what it must.
@@ -300,7 +336,10 @@ if [ $hardware = true ]; then
 elif [ -z "$bag" ]; then
   camera=()
   [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
-  start_node hardware_emulator -p "reality:=$(quoted "$reality")" "${camera[@]}"
+  deviates=false
+  [[ $reality =~ ^(kin|foreign)$ ]] || ! is_given --seed || deviates=true
+  start_node hardware_emulator -p "reality:=$(quoted "$reality")" -p "deviates:=$deviates" \
+    -p "clock:=$own_clock" "${camera[@]}"
   # That a file is another robot is for who started this to know, not for a log alone.
   tail -n +1 -s 0.2 -f --pid="$!" "$logs/hardware_emulator.log" </dev/null 2>/dev/null |
     sed -un 's/^\[WARN\][^:]*: \(reality .*\)/-- \1/p' &

@@ -13,7 +13,9 @@ NAME = 'musculoskeletal_ae'
 NODES = ['bringup_status', 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
 COMBINED = ['combined']
 ROS_TOOLS = ['check_driver', 'record', 'render', 'replay', 'view']
-TOOLS = ['check_robot', 'experiment', 'fit_series_elastic', 'import_robot', 'train']
+TOOLS = [
+    'check_robot', 'experiment', 'export_mjcf', 'fit_series_elastic', 'import_robot', 'train'
+]  # fmt: skip
 
 #: what only the page and only the experiments need: extras of `pip install .[view,experiments]`
 EXTRAS = {

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.signals.friction import REVERSAL
@@ -51,7 +52,9 @@ class EagerSimulation:
         turning = ways[:, 1:] & ~tree.slides[1:]  # ∂τ_k/∂θ_j for j at or before k that turns
         self.before = _single(turning[1:])
         onto = np.zeros((count - 1, robot.joint_count))
-        onto[np.arange(count - 1), tree.master[1:]] = tree.ratio[1:]
+        if tree.terms.shape[1] > 2:
+            raise MusculoskeletalError('eager simulation: couplings are lines only')
+        onto[np.arange(count - 1), tree.master[1:]] = tree.terms[1:, 1]
         self.onto = _single(onto)
         self.lever = _single(tree.axis), _single(tree.centre), _single(tree.mass)
         self.poses = tuple(map(_single, (tree.placement, tree.first, tree.second)))
@@ -131,7 +134,7 @@ class EagerSimulation:
         tree, (placement, first, second) = self.tree, self.poses
         poses = [placement.new_tensor(np.eye(4)).expand(len(theta), 4, 4)]
         for i in range(1, len(tree.parent)):
-            angle = float(tree.ratio[i]) * theta[:, tree.master[i]] + float(tree.offset[i])
+            angle = float(tree.terms[i, 1]) * theta[:, tree.master[i]] + float(tree.terms[i, 0])
             angle = angle[:, None, None]
             turned = angle if tree.slides[i] else torch.sin(angle)
             rest = torch.zeros_like(angle) if tree.slides[i] else 1.0 - torch.cos(angle)

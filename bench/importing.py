@@ -5,7 +5,8 @@
 
 The files are public models that you have fetched; nothing of them is part of this repository. For
 each it prints one row: joints, muscles, how many of them wrap, the largest and the median length
-error over 1000 postures (nan: it has no lengths of its own), and what `check_robot` says of 100.
+error over 1000 postures (nan: it has no lengths of its own), the largest error of a moment arm over
+200, how many muscles have one of wrong sign there, and what `check_robot` says of 100.
 With --learn an individual of each is learned by the experiments `online_learning` and `control`,
 and the row goes on with the error of the estimate on the held-out motion before and after, beside
 the oracle's (mean norms over the joints), and how far `proposed` leaves the arm from its targets.
@@ -27,7 +28,10 @@ from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 
 INDIVIDUAL = 0
-IMPORTED = ('model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'check_robot')
+IMPORTED = (
+    'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',
+    'wrong signs', 'check_robot',
+)  # fmt: skip
 LEARNED = ('before [rad]', 'after', 'oracle', '`proposed`')
 
 
@@ -35,15 +39,17 @@ def row(file: Path, out: Path, minutes: float | None) -> list[str]:
     """Import one file, learn it if for minutes, and return the cells of its row."""
     name = f'{file.parent.name}/{file.name}'
     try:
-        robot, notes, errors = import_robot(file, out)
+        robot, notes, comparison = import_robot(file, out)
     except MusculoskeletalError as error:
         return [name, str(error)[-160:]]
-    values = 1e3 * np.array(list(errors.values())) if errors else np.array([np.nan])
-    lengths = f'{values.max():.3f}', f'{np.median(values):.3f}'
+    parts = comparison if comparison and comparison.lengths else ({'': np.nan},) * 3
+    lengths, arms, flips = (np.array(list(part.values())) for part in parts)
+    errors = f'{1e3 * lengths.max():.3f}', f'{1e3 * np.median(lengths):.3f}'
+    errors += f'{1e3 * arms.max():.3f}', f'{(flips > 0.0).sum()}'
     check = check_verdict(check_robot(robot, 100)).removeprefix('check_robot: ')
     wraps = len(set(robot.routes.muscle[robot.routes.wrapping].tolist()))
     counts = (robot.joint_count, robot.muscle_count, wraps)
-    cells = [name, *map(str, counts), *lengths, f'{check} ({len(set(notes))} notes)']
+    cells = [name, *map(str, counts), *errors, f'{check} ({len(set(notes))} notes)']
     return cells if minutes is None else cells + learned(robot, minutes, out)
 
 

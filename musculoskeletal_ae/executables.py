@@ -100,6 +100,7 @@ view = partial(_run_tool, 'nodes.view')
 # Tools without ROS
 check_robot = partial(_run_tool, 'tools.check_robot')
 experiment = partial(_run_tool, 'tools.experiment')
+export_mjcf = partial(_run_tool, 'tools.export_mjcf')
 fit_series_elastic = partial(_run_tool, 'tools.fit_series_elastic')
 import_robot = partial(_run_tool, 'tools.import_robot')
 train = partial(_run_tool, 'tools.train')

@@ -20,6 +20,7 @@ TOOLS = {
     'check_driver': ['--robot', 'arm26'],
     'check_robot': ['arm26'],
     'experiment': ['all', '--quick', '--robot', 'arm26', '--out', '{folder}/results'],
+    'export_mjcf': ['none.safetensors', '--robot', 'arm26', '--out', '{folder}/model'],
     'fit_series_elastic': ['config/testbed/one_muscle.csv'],
     'import_robot': ['config/arm26/robot.urdf', '--out', '{folder}/arm'],
     'record': ['-o', '{folder}/bag'],

@@ -204,15 +204,33 @@ class EmulatedArm(modules.Arm):
 
     def _step(self) -> None:
         model, data, joint = self._model, self._data, self._joint
-        gear = self.robot.kinematics.tree.transmission
-        if gear is None:
+        if not self.robot.kinematics.tree.is_coupled:
             acceleration = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
-        else:  # of coupled joints, q̈ = A (Aᵀ M A)⁻¹ Aᵀ (τ − h); M holds the armature already
-            inertia = joint_space_inertia(model, data, joint.q)
-            bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
-            free = gear.T @ (joint.torque - bias)
-            acceleration = gear @ np.linalg.solve(gear.T @ inertia @ gear, free)
+        else:
+            acceleration = self._coupled_acceleration()
         muscle_step(self._handle, self._kind, acceleration)
+
+    def _coupled_acceleration(self) -> Array:
+        """Return q̈ (J−1,) of a tree whose joints follow others.
+
+            q̈ = A θ̈ + Ȧ θ̇,   θ̈ = (Aᵀ M A)⁻¹ Aᵀ (τ − h − M Ȧ θ̇)
+
+        M holds the armature already. Joints that follow by a curve get the q̈ that puts them onto
+        it at the end of the step.
+        """
+        model, data, joint, kin = self._model, self._data, self._joint, self.robot.kinematics
+        theta, gear = self.theta, kin.tree.transmission(self.theta)
+        inertia = joint_space_inertia(model, data, joint.q)
+        bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
+        if kin.tree.is_bent:
+            turning = self.velocity[kin.tree.theta_index[1:]] ** 2
+            bias = bias + inertia @ (kin.tree.curvatures(theta) * turning)
+        free = gear.T @ (joint.torque - bias)
+        acceleration = np.linalg.solve(gear.T @ inertia @ gear, free)
+        if not kin.tree.is_bent:
+            return gear @ acceleration
+        after = kin.tree.angles(theta + STEP * (self.velocity + STEP * acceleration))
+        return ((after - joint.q) / STEP - joint.velocity) / STEP
 
     def _sensed(self) -> tuple[Array, Array, Array, Array]:
         muscle, true = self._muscle, self.individual

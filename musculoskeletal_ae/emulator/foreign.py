@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.emulator import mjcf, wires
+from musculoskeletal_ae.emulator import deviation, mjcf, wires
 from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import STEP, Arm
@@ -71,7 +71,9 @@ class ForeignBody:
         rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
         for dense, angles in zip(jacobian, theta, strict=True):
             mujoco.mju_sparse2dense(dense, self.look(self._data, angles).ten_J, *rows)
-        return self._robot.kinematics.tree.of_theta(jacobian[:, self.tendons][:, :, self.tree])
+        return self._robot.kinematics.tree.of_theta(
+            jacobian[:, self.tendons][:, :, self.tree], theta
+        )
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l [m] without friction, loops, give and sensor errors, θ (N, D), T (N, M)."""
@@ -100,13 +102,24 @@ def _directory(robot: Robot, draw: Draw) -> Any:
     return model
 
 
+def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
+    """Let the body of a file be an individual; its wires jump only where those of the file do."""
+    smooth = ~jumping(ForeignBody(robot, copy.copy(model), draw).absolute_lengths, robot)
+    attachments = deviation.Attachments(robot, model, draw)
+    for _ in range(REDRAWN):
+        body = ForeignBody(robot, copy.copy(model), draw)
+        if not (wrong := smooth & jumping(body.absolute_lengths, robot)).any():
+            break
+        attachments.move(wrong)
+    deviation.change_masses(model, draw)
+
+
 def _other_routes(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
     """Say which muscles of a file have other lengths than the robot's, by `off` [m] (N, M)."""
     most = np.abs(off).max(axis=0)
     return tuple(
         f'reality {file}: muscle {robot.muscles[m]!r} is up to {1e3 * most[m]:.0f} mm longer or '
-        f'shorter there than in {robot.description.directory}; is it the same robot, and the same '
-        'way of the wire (import_robot keeps one branch of a pulley)?'
+        f'shorter there than in {robot.description.directory}; is it the same robot?'
         for m in np.flatnonzero(most > OTHER_ROUTE)
     )
 
@@ -194,26 +207,38 @@ class ForeignArm(Arm):
     """An arm of MuJoCo."""
 
     def __init__(
-        self, robot: Robot, seed: int = 0, effects: Effects | None = None, file: Path | None = None
+        self,
+        robot: Robot,
+        seed: int = 0,
+        effects: Effects | None = None,
+        file: Path | None = None,
+        deviates: bool = False,
     ) -> None:
         """Build an individual at rest, modules safe; effects are as calibrated by default.
 
-        A `file` is a user's own MJCF arm instead, which has its own effects and none of ours.
+        A `file` is a user's own MJCF arm instead. It has its own effects and none of ours, unless
+        the individual deviates from it, as `deviation` says.
 
         Raises:
             MusculoskeletalError: If the robot or the file cannot be built.
         """
         self.effects = (effects or Effects()) if file is None else NONE
+        if file is not None and deviates:
+            self.effects = deviation.effects(robot)
         draw = self._draw = Draw(seed, self.effects)
         try:
             model = self._model = mjcf.from_file(robot, file) if file else _directory(robot, draw)
+            if file is not None and deviates:
+                _deviate(robot, model, draw)
             data = self._data = mujoco.MjData(model)
             self.individual = body = ForeignBody(robot, copy.copy(model), draw)
+            if file is not None and deviates:
+                body.length_bias = deviation.slack(robot, draw)
         except (ValueError, mujoco.FatalError) as error:
             told = ' '.join(str(error).split())
             raise MusculoskeletalError(f'reality {file or "foreign"}: {told}') from error
         super().__init__(robot, seed, body.length_bias)
-        if file is None:
+        if file is None or deviates:
             self._rub()
         elif effects is not None and effects.joint_friction == 0.0:
             model.dof_frictionloss[:] = model.tendon_frictionloss[:] = 0.0
@@ -233,7 +258,7 @@ class ForeignArm(Arm):
         at_zero, bend = body.length_at_zero, self._memory.bend
         theta = robot.random_postures(500, np.random.default_rng(0))
         span = body.absolute_lengths(theta) - at_zero
-        if file:
+        if file and not deviates:
             routes = _other_routes(robot, file, span - robot.muscle_lengths(theta, still))
             self.warnings = *routes, *_other_limits(robot, file, model)
         self.wires = wires.make_wires(robot, body.elastic, at_zero, span, bend, draw)
@@ -255,7 +280,7 @@ class ForeignArm(Arm):
         torque = robot.kinematics.holding_torque(theta)
         load = robot.joint_load(torque, body.muscle_jacobian(theta))
         joints = [self._model.joint(name).dofadr[0] for name in robot.joints]
-        self._model.dof_frictionloss[joints] = load * draw.about('joint_friction', len(joints))
+        self._model.dof_frictionloss[joints] += load * draw.about('joint_friction', len(joints))
 
     def _root_pose(self) -> pin.SE3:
         """Return where a file has the robot's root link, joints mid-range.

@@ -66,7 +66,7 @@ class Individual:
             """Return the true routes of points that are off by so much [m], (P, 3)."""
             point = nominal.point + off
             objects = _objects(robot, point, spread.wrap, seed, thickness)
-            segments = nominal.first, nominal.second, nominal.muscle
+            segments = nominal.first, nominal.second, nominal.muscle, nominal.weight
             return WrappedRoutes(tree, nominal.joint, point, *segments, objects)
 
         self.routes = routes(off)
@@ -119,7 +119,7 @@ class Individual:
 
     def muscle_jacobian(self, theta: Array) -> Array:
         """Return the true G [m/rad], θ (N, D) gives (N, M, D)."""
-        return self._kinematics.tree.of_theta(self._evaluate(theta)[1])
+        return self._kinematics.tree.of_theta(self._evaluate(theta)[1], theta)
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return the true l [m] without friction and sensor error, θ (N, D), T (N, M)."""
@@ -140,8 +140,9 @@ def _objects(
     count = len(routes.first)
     nothing, nowhere = np.zeros((count, 3)), np.full((count, 3), np.nan)
     objects = WrapObjects(
-        np.zeros(count, np.int64), nothing, 1.0 * nothing, nowhere, np.zeros(count)
-    )
+        np.zeros(count, np.int64), nothing, 1.0 * nothing, nowhere, np.zeros(count, np.int64),
+        np.zeros(count),
+    )  # fmt: skip
     if routes.objects is not None:
         for whole, part in zip(objects, routes.objects, strict=True):
             whole[routes.wrapping] = part
@@ -159,7 +160,8 @@ def _objects(
             least = np.linalg.norm(away, axis=-1).min()
             scale = min(described[s], 0.95 * least / objects.radius[s])
             objects.radius[s] *= scale
-            objects.side[s] *= scale  # a ring stays one
+            if objects.side_joint[s] == objects.joint[s]:
+                objects.side[s] *= scale  # a ring stays one
             continue
         between = (
             kin.tree.hangs_on[routes.joint[ends[0]]] ^ kin.tree.hangs_on[routes.joint[ends[1]]]

@@ -19,12 +19,12 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints
+from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints, tie_rims
 from musculoskeletal_ae.importing.source import names_of_all, safe_name
 from musculoskeletal_ae.mujoco_version import check_mujoco
-from musculoskeletal_ae.robot.description import Wrap
+from musculoskeletal_ae.robot.description import Wrap, branches
 from musculoskeletal_ae.robot.joint_tree import JointPoses
-from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.kinematics import Kinematics, link_placement
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
@@ -54,6 +54,15 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
 
     By how much the route points of muscles are off is drawn `again` so often (M,).
     """
+    spec, bodies = skeleton(robot, draw)
+    add_routes(robot, draw, again, spec, bodies)
+    joint, at = robot.kinematics.placement(robot.description.end_effector)
+    _add_hand(bodies[joint], at)
+    return _pulled(spec, robot)
+
+
+def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
+    """Return the links and joints of a robot, individually off, and the body of each joint."""
     kin, spec = robot.kinematics, mujoco.MjSpec()
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
@@ -82,18 +91,18 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
             joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
         else:
             coupling, data = robot.description.couplings[name], np.zeros(mujoco.mjNEQDATA)
-            data[:2] = coupling.offset, coupling.ratio
+            if len(coupling.terms) > 5:
+                told = f'joint {name!r} follows by a polynomial of degree {len(coupling.terms) - 1}'
+                raise MusculoskeletalError(f'reality foreign: {told}; MuJoCo knows up to 4')
+            data[: len(coupling.terms)] = coupling.terms
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}
             link |= {'data': data, 'solimp': STIFF}
             spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, **link)
         bodies.append(body)
-    _add_routes(robot, draw, again, spec, bodies)
-    joint, at = kin.placement(robot.description.end_effector)
-    _add_hand(bodies[joint], at)
-    return _pulled(spec, robot)
+    return spec, bodies
 
 
-def _add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
+def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
     """Add the wires: route points that are off, what is described to wrap round, and heads."""
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.tree.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
@@ -112,10 +121,16 @@ def _add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[A
                 if item.side is not None:
                     side = f'{name} side'
                     beside = item.xyz + scale * (item.side - item.xyz)  # a ring stays one
-                    bodies[joint].add_site(name=side, pos=at.act(beside))
+                    carrier, place = joint, at.act(beside)
+                    if item.side_link is not None:
+                        carrier, place = kin.attach(item.side_link, item.side)
+                    bodies[carrier].add_site(name=side, pos=place)
                 tendon.wrap_geom(name, side)
                 before = []
                 continue
+            if item.divisor is not None and n:
+                tendon.wrap_pulley(item.divisor)
+                before = []
             shift = off.normal(size=3)
             if redrawn is not None:
                 shift = redrawn.normal(size=3)
@@ -140,8 +155,12 @@ def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
     poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
     for muscle, route in zip(robot.muscles, robot.description.routes):
-        placed = [kin.attach(item.link, item.xyz) for item in route]
-        for (joint, place), (other, end) in pairwise(placed):
+        placed = [
+            pair
+            for branch in branches(route)
+            for pair in pairwise(kin.attach(item.link, item.xyz) for item in branch)
+        ]
+        for (joint, place), (other, end) in placed:
             end = turn[joint].T @ (turn[other] @ end + origin[other] - origin[joint])
             line = (end - place) / max(float(np.linalg.norm(end - place)), 1e-9)
             bellies.append((muscle, (joint, 0.5 * (place + end), line)))
@@ -233,7 +252,9 @@ def from_file(robot: Robot, file: Path) -> Any:
     with _loading(file):
         spec = open_mjcf(file)
     followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
-    hand = _as_imported(spec, file, [*followers, *robot.muscles], robot.description.end_effector)
+    links = _links_of_the_hand(robot)
+    hand = _as_imported(spec, file, [*followers, *robot.muscles], [*links])
+    _split_balls(spec, followers)
     tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
     for kind, present, wanted in (
         ('joint', spec.joints, [*followers]),
@@ -242,11 +263,6 @@ def from_file(robot: Robot, file: Path) -> Any:
     ):
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
-            for ball in [j.name for j in spec.joints if j.type == kinds.mjJNT_BALL]:
-                if kind == 'joint' and missing[0].startswith(f'{safe_name(ball, "")}_'):
-                    told = f'{ball!r} is a ball joint there, {missing[0]!r} of'
-                    told = f'{told} {robot.description.directory} a part of it'
-                    raise _refusal(file, f'{told}; write it as three hinges')
             told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
             raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
     given_kinds = {joint.name: joint.type for joint in spec.joints}
@@ -277,15 +293,48 @@ def from_file(robot: Robot, file: Path) -> Any:
     for joint in spec.joints:  # limits of what the file's own actuators do
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
     # By name MuJoCo finds none that was named since it was compiled.
-    _add_hand(next(body for body in spec.bodies if body.name == hand), pin.SE3.Identity())
+    at = links.get(hand) or next(at for link, at in links.items() if safe_name(hand, '') == link)
+    _add_hand(next(body for body in spec.bodies if body.name == hand), at)
     with _loading(file):
         model = _pulled(spec, robot).compile()
+    tie_rims(model)
     for thing, values in moved:
         for name, value in values.items():
             getattr(model, name)[thing.id] = value
     if moved:
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
+    """Return the end effector and the links that it is fixed to, with its pose in each of them."""
+    model, name = robot.description.model, robot.description.end_effector
+    joint, hand = link_placement(model, name)
+    frame, links = model.getFrameId(name, pin.FrameType.BODY), dict[str, pin.SE3]()
+    while frame > 0 and model.frames[frame].parentJoint == joint:
+        link = model.frames[frame]
+        if link.type == pin.FrameType.BODY:
+            links[str(link.name)] = link.placement.inverse() * hand
+        frame = link.parentFrame
+    return links
+
+
+def _split_balls(spec: Any, followers: list[str]) -> None:
+    """Put three hinges in the place of each ball joint whose parts the robot has."""
+    wanted = set(followers)
+    for ball in [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_BALL]:
+        parts = [f'{safe_name(ball.name, "")}_{axis}' for axis in 'xyz']
+        if wanted.isdisjoint(parts):
+            continue
+        body, most = ball.parent, float(ball.range[1])
+        given = {'pos': ball.pos, 'damping': ball.damping, 'stiffness': ball.stiffness}
+        given |= {'armature': ball.armature, 'frictionloss': ball.frictionloss}
+        limited = ball.limited != mujoco.mjtLimited.mjLIMITED_FALSE and most > 0.0
+        spec.delete(ball)
+        for name, axis in zip(parts, np.eye(3)):
+            hinge = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, **given)
+            if limited:
+                hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-most, most]
 
 
 def _moves(geom: Any) -> bool:
@@ -325,9 +374,14 @@ def _moved_by(model: Any, spec: Any, held: list[Any]) -> list[tuple[Any, dict[st
     return moved
 
 
-def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
-    """Let joints and tendons have the names that `import_robot` gives them; return the hand's."""
+def _as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> str:
+    """Let joints and tendons have the names that `import_robot` gives them; return the hand's.
+
+    That is the first of several links that is a body of the file.
+    """
     kinds = {'joint': spec.joints, 'tendon': spec.tendons, 'body': spec.bodies}
+    bodies = {body.name for body in spec.bodies}
+    hand = next((name for name in hands if name in bodies), hands[0])
     if {hand, *wanted} <= {thing.name for things in kinds.values() for thing in things}:
         return hand
     with _loading(file):
@@ -357,7 +411,8 @@ def _as_imported(spec: Any, file: Path, wanted: list[str], hand: str) -> str:
         pairs = new[ties[tie.type]].items()
         again = {old: name for old, name in pairs if not {old, name}.isdisjoint(wanted)}
         tie.name1, tie.name2 = (again.get(name, name) for name in (tie.name1, tie.name2))
-    return next((name for name, safe in new['body'].items() if safe == hand), hand)
+    given = {safe: name for name, safe in new['body'].items()}
+    return next((given[name] for name in hands if name in given), hand)
 
 
 def bodies_as_imported(model: Any) -> dict[str, int]:

@@ -14,12 +14,19 @@ from musculoskeletal_ae.robot.robot import Robot
 KIN, FOREIGN = 'kin', 'foreign'
 
 
-def make_arm(robot: Robot, seed: int = 0, reality: str = KIN, friction: bool = True) -> Arm:
+def make_arm(
+    robot: Robot,
+    seed: int = 0,
+    reality: str = KIN,
+    friction: bool = True,
+    deviates: bool = False,
+) -> Arm:
     """Return an individual at rest, or the same body without friction in wires and joints.
 
     Realities are 'kin', the first body, which differs from its model in what the learner fits;
     'foreign', the second one, whose mechanics are foreign too; or a user's MJCF file, whose joints
-    and tendons have the names of the robot's joints and muscles.
+    and tendons have the names of the robot's joints and muscles. A file is played as it is, or, if
+    the individual deviates, as its seed draws it (`emulator/deviation.py`).
 
     Raises:
         MusculoskeletalError: If there is no such reality, or the robot's names are not in the file.
@@ -44,4 +51,4 @@ def make_arm(robot: Robot, seed: int = 0, reality: str = KIN, friction: bool = T
     effects = Effects()
     if not friction:
         effects = replace(effects, guide_friction=0.0, joint_friction=0.0)
-    return ForeignArm(robot, seed, effects, file)
+    return ForeignArm(robot, seed, effects, file, deviates)

@@ -45,6 +45,7 @@ class WrappedRoutes(NamedTuple):
     first: Ints  # points where each segment starts
     second: Ints  # and ends, (S,)
     muscle: Ints  # it belongs to, (S,)
+    weight: Array  # share of its length that counts, and of the tension that pulls, (S,)
     objects: WrapObjects  # what each segment wraps round, radius 0 for nothing
 
 
@@ -125,11 +126,12 @@ def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
         fill(placed.world[p], point_of(placed, routes.point_joint[p], routes.point[p]))
     placed.absolute[:] = 0.0
     for s in range(routes.first.shape[0]):
-        placed.absolute[routes.muscle[s]] += wrapped_segment(
+        length = wrapped_segment(
             routes.objects, s, placed.rotation, placed.translation,
             placed.world[routes.first[s]], placed.world[routes.second[s]],
             placed.leave[s], placed.arrive[s],
         )  # fmt: skip
+        placed.absolute[routes.muscle[s]] += routes.weight[s] * length
 
 
 @njit(cache=True)
@@ -147,8 +149,8 @@ def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Ar
 
 @njit(cache=True)
 def add_pull(routes: WrappedRoutes, s: int, placed: Placed, pull: float, torque: Array) -> None:
-    """Add what a tension `pull` in segment s does to the joints to torque (J−1,)."""
-    tree, objects = routes.tree, routes.objects
+    """Add what a tension `pull` of the muscle of segment s does there to torque (J−1,)."""
+    tree, objects, pull = routes.tree, routes.objects, routes.weight[s] * pull
     ends = (routes.first[s], placed.leave[s]), (routes.second[s], placed.arrive[s])
     for p, away in ends:
         add_torque(tree, placed, routes.point_joint[p], placed.world[p], away, pull, torque)

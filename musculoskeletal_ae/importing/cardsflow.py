@@ -3,7 +3,9 @@
 
 CARDSflow measures via points from a link's centre of mass, in the axes of the link; those of the
 link 'world' stand still. SPHERICAL and CYLINDRICAL via points (axis z) are wraps, a MESH is taken
-as the point it names. A URDF alone gives a skeleton of muscles.yaml, one muscle to be replaced.
+as the point it names. Limits of joints may stand in `joint_limits.yaml` beside the model: for each
+joint a list of angles that it took, of which the least and the greatest count. A URDF alone gives a
+skeleton of muscles.yaml, one muscle to be replaced.
 """
 
 import os
@@ -15,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.importing.source import (
     KINDS,
     Source,
@@ -31,18 +33,32 @@ from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_mimics, read_urdf
 
+Limits = dict[str, tuple[float, float]]  # lowest and highest of each joint [rad] or [m]
+
 ROUND = 'SPHERICAL', 'CYLINDRICAL'  # via points that are wraps
 FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # what later versions of SDF add
 
 
 def read_cardsflow(file: Path, root: ET.Element) -> Source:
     """Read a cardsflow.xml and the model beside it."""
+    limits_file = file.parent / 'joint_limits.yaml'
+    limits = _read_limits(limits_file)
     for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
         if os.path.lexists(beside := file.parent / model):
-            source, centres = read(beside, parse_xml(beside, read_text(beside, refuse)))
+            tree = parse_xml(beside, read_text(beside, refuse))
+            source, centres = read(beside, tree, (limits, limits_file.name))
             break
     else:
         raise refuse(file, 'there is no model.urdf and no model.sdf beside it')
+    if limits:
+        known = [name for name in limits if source.model.existJointName(name)]
+        source.note(
+            'chosen', f'limits in {limits_file.name}: of joints {", ".join(known) or "none"}'
+        )
+        if unknown := [name for name in limits if name not in known]:
+            source.note(
+                'dropped', f'limits in {limits_file.name} of no joint: {", ".join(unknown)}'
+            )
     centres.setdefault('world', np.zeros(3))
     for muscle in root.iter('myoMuscle'):
         fallback = f'muscle_{len(source.routes)}'
@@ -83,6 +99,25 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
     return source
 
 
+def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
+    """Return the limits of joints of a joint_limits.yaml, none if it is not there."""
+    if not os.path.lexists(file):
+        return {}
+    document, limits = read_yaml(file, refuse), dict[str, tuple[float, float]]()
+    expected = 'expected a list of at least 2 different finite numbers [rad] for each joint'
+    if not isinstance(document, dict):
+        raise refuse(file, f'{expected}, got {str(document)[:60]!r}')
+    for name, values in document.items():
+        try:
+            span = np.array(values, dtype=float).ravel()
+        except (TypeError, ValueError):
+            span = np.zeros(0)
+        if not span.size or not (np.abs(span) <= 1e6).all() or span.min() == span.max():
+            raise refuse(file, f'joint {str(name)[:60]}: {expected}, got {str(values)[:60]}')
+        limits[str(name)] = float(span.min()), float(span.max())
+    return limits
+
+
 def _measure(source: Source) -> None:
     """Let a source have the lengths that CARDSflow gives its straight routes."""
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
@@ -119,7 +154,9 @@ def _endless(*ends: str | None) -> bool:
         return False
 
 
-def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
+def _read_urdf(
+    file: Path, root: ET.Element, given: tuple[Limits, str] = ({}, '')
+) -> tuple[Source, dict[str, Array]]:
     """Return links and joints of a URDF, by pinocchio, and each link's centre of mass."""
     for joint in root.findall('joint'):
         limits, kind = joint.findall('limit'), joint.get('type')
@@ -133,6 +170,7 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
         ET.SubElement(joint, 'limit', lower='0', upper='0', effort='1', velocity='1')
     text = ET.tostring(root, encoding='unicode')
     source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
+    source.given_limits, source.limits_file = given
     model = source.model
     source.links = [str(frame.name) for frame in body_frames(model)]
     if shaped := [link for link in root.findall('link') if link.find('visual') is not None]:
@@ -156,7 +194,9 @@ def _read_urdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     return source, {name: numbers(xyz, 3, f'link {name}') for name, xyz in centres.items()}
 
 
-def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
+def _read_sdf(
+    file: Path, root: ET.Element, given: tuple[Limits, str] = ({}, '')
+) -> tuple[Source, dict[str, Array]]:
     """Return the first model of an SDF as `_read_urdf` does."""
     model = root.find('.//model')
     if root.tag != 'sdf' or model is None:
@@ -166,6 +206,7 @@ def _read_sdf(file: Path, root: ET.Element) -> tuple[Source, dict[str, Array]]:
     version = [int(part) for part in root.get('version', '1.6').split('.')]
     frame_of_axis = '1' if version < [1, 5] else '0'  # the model's before 1.5, then the joint's
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
+    source.given_limits, source.limits_file = given
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
             problem = f'{element.tag} with {element.attrib}: only what SDF 1.6 knows is read'

@@ -3,6 +3,7 @@
 
 import os
 import re
+import time
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
@@ -13,13 +14,26 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.mjcf import read_mjcf
-from musculoskeletal_ae.importing.source import POSTURES, Source, compare, cut, refuse, write
+from musculoskeletal_ae.importing.source import (
+    ARM_POSTURES,
+    POSTURES,
+    Comparison,
+    Source,
+    compare,
+    cut,
+    refuse,
+    write,
+)
 from musculoskeletal_ae.robot.checks import RobotCheck, check_robot
 from musculoskeletal_ae.robot.joint_tree import resolved
+from musculoskeletal_ae.robot.jumps import jump_choices
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
 LARGEST = 20_000_000  # [bytes] of a model
+WARM_UP, PLAYED = 0.1, 1.0  # [s] of a model
+REAL_TIME = 0.5  # [s] of a core for a second, beside the other nodes on two cores
+SLOW = 3  # exit status
 OPENSIM = (
     'OpenSim models are not read; convert it to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
@@ -37,7 +51,7 @@ class Imported(NamedTuple):
 
     robot: Robot
     notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed, renamed or approximated
-    errors: dict[str, float] | None  # largest length error of each muscle [m]; None: not computed
+    comparison: Comparison | None  # with the source's own engine; None: it has no lengths
 
 
 def read_source(file: Path) -> Source:
@@ -98,22 +112,50 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
 
 def run(args: Namespace) -> int:
     """Import, and print what a person should know; return the exit status."""
-    chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'base', 'end')}
-    robot, notes, errors = import_robot(args.file, args.out, **chain)
+    chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
+    robot, notes, comparison = import_robot(args.file, args.out, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.joint_notes:
         print(f'coupled: {note}')
     for warning in robot.description.warnings:
         print(f'warning: {warning}')
-    print(length_verdict(errors))
+    print(length_verdict(comparison))
+    if comparison is not None and comparison.lengths:
+        print(arm_verdict(comparison))
+    for line in jump_choices(robot):
+        print(line)
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
     print(check_verdict(check_robot(robot)))
-    return 0
+    return play(robot, args.file) if args.play else 0
 
 
-def length_verdict(errors: dict[str, float] | None) -> str:
+def play(robot: Robot, file: Path) -> int:
+    """Play the file for a second, say how fast that is, and return 0, or SLOW if it is too slow.
+
+    A MusculoskeletalError says why it cannot be played.
+    """
+    from musculoskeletal_ae.emulator.reality import make_arm
+
+    arm = make_arm(robot, reality=str(file))
+    for warning in arm.warnings:
+        print(f'warning: {warning}')
+    arm.step(WARM_UP)
+    start = time.process_time()
+    arm.step(PLAYED)
+    needed = (time.process_time() - start) / PLAYED
+    told = f'played: a second of the model takes {needed:.2g} s of a core'
+    if needed <= REAL_TIME:
+        print(f'{told}: it runs in real time')
+        return 0
+    slower = needed / REAL_TIME
+    print(f'{told}: about {slower:.2g} times slower than real time; the nodes run on its clock')
+    return SLOW
+
+
+def length_verdict(comparison: Comparison | None) -> str:
     """Say how far lengths are from the source's own."""
+    errors = comparison.lengths if comparison else None
     if not errors:
         return 'lengths: not compared, the source has none of its own here'
     worst = sorted(errors.items(), key=lambda item: -item[1])[:5]
@@ -121,6 +163,17 @@ def length_verdict(errors: dict[str, float] | None) -> str:
     verdict = f'largest length error over {POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
     verdict += f', {sum(e <= 1e-3 for e in errors.values())} of {len(errors)} muscles within 1 mm'
     return verdict + (f'; worst [mm]: {named}' if named else '')
+
+
+def arm_verdict(comparison: Comparison) -> str:
+    """Say how far moment arms are from the source's own, and whether signs agree."""
+    worst = sorted(comparison.arms.items(), key=lambda item: -item[1])[:5]
+    named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
+    verdict = f'largest moment arm error over {ARM_POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
+    verdict += f'; worst [mm]: {named}' if named else ''
+    wrong = {name: share for name, share in comparison.flips.items() if share > 0.0}
+    told = ', '.join(f'{name} in {100 * share:.0f} % of postures' for name, share in wrong.items())
+    return f'{verdict}; {f"wrong sign: {told}" if wrong else "all signs agree"}'
 
 
 def check_verdict(check: RobotCheck) -> str:

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """MuJoCo models (MJCF), through the `mujoco` package: what loads there loads here.
 
-Spatial tendons become routes: sites, wrapping spheres and cylinders with their side sites. Hinges
-and slides become joints, a body with several of them a chain of massless links; a ball joint three
-hinges. `equality/joint` becomes a coupling, a polynomial the line nearest to it.
+Spatial tendons become routes: sites, wrapping spheres and cylinders with their side sites, and
+branches over pulleys. Hinges and slides become joints, a body with several of them a chain of
+massless links; a ball joint three hinges. `equality/joint` becomes a coupling.
+
+Where a site of a tendon lies on the rim of what the tendon wraps round, MuJoCo lets rounding decide
+whether it does. It is tied to the rim here (`robot/wrapping.py`), and the geom that MuJoCo computes
+with is thinner by a share 2·RIM, so that it decides the same.
 """
 
 from collections import defaultdict
@@ -17,10 +21,18 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.importing.source import Source, distinct, names_of_all, refuse, safe_name
+from musculoskeletal_ae.importing.source import (
+    Source,
+    distinct,
+    names_of_all,
+    refuse,
+    safe_name,
+    tip_name,
+)
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
-from musculoskeletal_ae.robot.joint_tree import resolved
+from musculoskeletal_ae.robot.joint_tree import Coupling, resolved
+from musculoskeletal_ae.robot.wrapping import RIM
 
 check_mujoco()
 
@@ -28,6 +40,8 @@ check_mujoco()
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
+RANGE_POSTURES = 200  # in which the range of a tendon's length is measured
+LEAST_REACH = 1e-3  # [m] of a body's geometry
 STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stronger
 
 
@@ -67,6 +81,80 @@ def resting_joints(model: Any) -> list[float]:
     return [source.rest.get(name, 0.0) for name in reader.names['joint']]
 
 
+def tie_rims(model: Any) -> list[tuple[int, int]]:
+    """Make geoms thinner by a share 2·RIM on whose rim a site of a tendon lies that wraps them.
+
+    Returns each such tendon with its geom.
+    """
+    data, types, tied = mujoco.MjData(model), mujoco.mjtWrap, []
+    mujoco.mj_kinematics(model, data)
+    for t in range(model.ntendon):
+        path = range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+        for w in path:
+            if model.wrap_type[w] not in (types.mjWRAP_SPHERE, types.mjWRAP_CYLINDER):
+                continue
+            geom = int(model.wrap_objid[w])
+            turn, radius = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom][0]
+            for site in (int(model.wrap_objid[w - 1]), int(model.wrap_objid[w + 1])):
+                bodies = model.site_bodyid[site], model.geom_bodyid[geom]
+                if model.body_weldid[bodies[0]] != model.body_weldid[bodies[1]]:
+                    continue
+                away = turn.T @ (data.site_xpos[site] - data.geom_xpos[geom])
+                if model.wrap_type[w] == types.mjWRAP_CYLINDER:
+                    away[2] = 0.0
+                if abs(np.linalg.norm(away) - radius) <= RIM * radius:
+                    tied.append((t, geom))
+    for geom in {geom for _, geom in tied}:
+        model.geom_size[geom][0] *= 1.0 - 2.0 * RIM
+    return tied
+
+
+def far_end(model: Any, data: Any, body: int) -> Array | None:
+    """Return the point of a body's geometry that is farthest from its joint, in its frame [m].
+
+    Of what tendons wrap round, only if the body has nothing else; None if there is no geometry, or
+    none that reaches out.
+    """
+    turn, origin = data.xmat[body].reshape(3, 3), data.xpos[body].copy()
+    anchor = origin
+    if model.body_jntnum[body]:
+        anchor = data.xanchor[model.body_jntadr[body] + model.body_jntnum[body] - 1]
+    round_ = np.isin(
+        model.wrap_type, (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
+    )
+    wrapped = set(model.wrap_objid[round_].tolist())
+    first = model.body_geomadr[body]
+    own = list(range(first, first + model.body_geomnum[body]))
+    ends = [_ends(model, data, g) for g in [g for g in own if g not in wrapped] or [*own]]
+    ends = [points for points in ends if len(points)]
+    if not ends:
+        return None
+    points = np.concatenate(ends)
+    far = points[np.linalg.norm(points - anchor, axis=1).argmax()]
+    result: Array = turn.T @ (far - origin)
+    return result if np.linalg.norm(result) > LEAST_REACH else None
+
+
+def _ends(model: Any, data: Any, geom: int) -> Array:
+    """Return points at the ends of a geom, in the world [m] (N, 3)."""
+    kinds, size, place = mujoco.mjtGeom, model.geom_size[geom], data.geom_xpos[geom]
+    turn, kind = data.geom_xmat[geom].reshape(3, 3), model.geom_type[geom]
+    if kind == kinds.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first = model.mesh_vertadr[mesh]
+        local = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
+    elif kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
+        reach = size[1] + size[0] * (kind == kinds.mjGEOM_CAPSULE)
+        local = np.array([[0.0, 0.0, reach], [0.0, 0.0, -reach]])
+    elif kind == kinds.mjGEOM_SPHERE:
+        local = size[0] * np.concatenate([np.eye(3), -np.eye(3)])
+    elif kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_ELLIPSOID):
+        local = np.concatenate([np.diag(size), -np.diag(size)])
+    else:  # planes and fields have no end
+        return np.zeros((0, 3))
+    return local @ turn.T + place
+
+
 class _Reader:
     def __init__(self, model: Any, name: str) -> None:
         self.model, self.source = model, Source(safe_name(name, 'robot'))
@@ -79,7 +167,10 @@ class _Reader:
         #: joint that follows another (−1: none), by which polynomial
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
+        self.radius = model.geom_size[:, 0].copy()  # as in the file
+        self._tie_rims()
         self._bodies()
+        self._points()
         self._couplings()
         self._not_modelled()
         self._tendons()
@@ -99,9 +190,11 @@ class _Reader:
         for kind, effect, values in (
             ('joint', 'springs', m.jnt_stiffness),
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
+            ('joint', "limits of the actuators' force", m.jnt_actfrclimited),
             ('joint', 'damping', m.dof_damping[m.jnt_dofadr]),
             ('joint', 'friction', m.dof_frictionloss[m.jnt_dofadr]),
             ('tendon', 'springs', m.tendon_stiffness),
+            ('tendon', 'armature', m.tendon_armature),
             ('tendon', 'limits', m.tendon_limited),
             ('tendon', 'damping', m.tendon_damping),
             ('tendon', 'friction', m.tendon_frictionloss),
@@ -173,7 +266,8 @@ class _Reader:
                 continue
             start = m.qpos0[m.jnt_qposadr[master]]
             value = np.poly1d([zero]) + np.poly1d(terms)(np.poly1d([1.0, -start]))
-            source.couple(name, self.names['joint'][master], value)
+            rounded = [round(float(term), 12) for term in value.coeffs[::-1]]
+            source.couplings[name] = Coupling.of_terms(self.names['joint'][master], rounded)
 
     def _tendons(self) -> None:
         m, source = self.model, self.source
@@ -194,6 +288,9 @@ class _Reader:
                 self._route(name, range(first, first + m.tendon_num[t]))
                 known = [force for force in driven.get(t, []) if force < np.inf]
                 source.strength[name] = sum(known)
+                if m.tendon_actfrclimited[t]:  # a force that shortens is negative
+                    most = max(0.0, -float(m.tendon_actfrcrange[t][0]))
+                    source.strength[name] = min(sum(known) or np.inf, most)
         if self.tendons and not driven:
             source.note('chosen', 'every tendon is a muscle: no actuator pulls any')
 
@@ -210,6 +307,13 @@ class _Reader:
             and m.actuator_ctrllimited[a]
         ):  # a motor
             ends = gain[0] * m.actuator_ctrlrange[a]
+        elif m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED and m.actuator_ctrllimited[a]:
+            # A servo, as of position: force = gain · control + b₀ + b₁ · gear · length.
+            length, bias = self._tendon_range(int(m.actuator_trnid[a][0])), m.actuator_biasprm[a]
+            control, follows = gain[0] * m.actuator_ctrlrange[a], bias[1] * gear * length
+            ends = bias[0] + np.array(
+                [control.min() + follows.min(), control.max() + follows.max()]
+            )
         if m.actuator_forcelimited[a]:
             ends = np.clip(ends, *m.actuator_forcerange[a])
         # A force that shortens is negative in MuJoCo.
@@ -223,44 +327,79 @@ class _Reader:
 
     def _route(self, name: str, wraps: range) -> None:
         m, types = self.model, mujoco.mjtWrap
-        branches: list[list[RoutePoint | Wrap]] = [[]]
-        divided = False
+        parts: list[list[RoutePoint | Wrap]] = [[]]
+        divisor: float | None = None
         for w in wraps:
             kind, i = m.wrap_type[w], m.wrap_objid[w]
             if kind == types.mjWRAP_PULLEY:
-                branches.append([])
-                divided |= bool(m.wrap_prm[w] != 1.0)
+                parts.append([])
+                divisor = float(m.wrap_prm[w])
             elif kind == types.mjWRAP_SITE:
                 body = self.names['body'][m.site_bodyid[i]]
-                branches[-1].append(RoutePoint(body, m.site_pos[i].copy()))
+                begins = divisor if not parts[-1] else None
+                parts[-1].append(RoutePoint(body, m.site_pos[i].copy(), begins))
             else:
                 round_axis = kind == types.mjWRAP_CYLINDER
-                branches[-1].append(self._wrap(name, i, int(m.wrap_prm[w]), round_axis))
-        branches = [branch for branch in branches if branch]
-        if divided or len(branches) > 1:
-            problem = (
-                f'muscle {name}: of {len(branches)} branches over pulleys one is kept, undivided'
-            )
-            self.source.note('approximated', problem)
-        # Of several branches the format keeps one: the one that joints move most.
-        kept = max(branches, key=lambda branch: len({item.link for item in branch}))
-        self.source.routes[name] = tuple(kept)
+                parts[-1].append(self._wrap(i, int(m.wrap_prm[w]), round_axis))
+        # A branch of one site has no length.
+        self.source.routes[name] = tuple(item for part in parts if len(part) > 1 for item in part)
 
-    def _wrap(self, name: str, geom: int, site: int, round_axis: bool) -> Wrap:
+    def _wrap(self, geom: int, site: int, round_axis: bool) -> Wrap:
         m, body, data, side = self.model, int(self.model.geom_bodyid[geom]), self.start, None
-        turn = data.xmat[body].reshape(3, 3)
+        turn, side_link = data.xmat[body].reshape(3, 3), None
         if site >= 0:
-            side = turn.T @ (data.site_xpos[site] - data.xpos[body])
+            side = m.site_pos[site].copy()
             if m.site_bodyid[site] != body:
-                problem = f'muscle {name}: side site {m.site(site).name!r} is on another body'
-                self.source.note('approximated', f'{problem}; taken where it is at the start')
+                side_link = self.names['body'][m.site_bodyid[site]]
         axis = turn.T @ data.geom_xmat[geom][2::3] if round_axis else None
-        radius = float(m.geom_size[geom][0])
-        if axis is not None and side is not None:
+        radius = float(self.radius[geom])
+        if axis is not None and side is not None and side_link is None:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
                 side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo has it
-        return Wrap(self.names['body'][body], m.geom_pos[geom].copy(), radius, axis, side)
+        link = self.names['body'][body]
+        return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)
+
+    def _tie_rims(self) -> None:
+        """Make geoms thinner whose rim carries a site of a tendon that wraps round them."""
+        for tendon, geom in tie_rims(self.model):
+            body = self.names['body'][self.model.geom_bodyid[geom]]
+            tied = (
+                f'muscle {self.names["tendon"][tendon]}: a site on the rim of what it wraps round'
+            )
+            self.source.note(
+                'chosen', f'{tied} on {body} is tied to it; MuJoCo lets rounding decide'
+            )
+
+    def _points(self) -> None:
+        """Name the far ends of bodies' geometry and the sites, those on tendons last."""
+        m, source, points = self.model, self.source, dict[str, tuple[str, Array]]()
+        for i in range(1, m.nbody):
+            if (far := far_end(m, self.start, i)) is not None:
+                points[tip_name(self.names['body'][i])] = self.names['body'][i], far
+        passed = {int(i) for i in m.wrap_objid[m.wrap_type == mujoco.mjtWrap.mjWRAP_SITE]}
+        taken = {*source.links, *points}
+        for i in sorted(range(m.nsite), key=lambda i: (i in passed, i)):
+            if m.site(i).name and (name := safe_name(m.site(i).name, f'site_{i}')) not in taken:
+                points[name] = self.names['body'][m.site_bodyid[i]], m.site_pos[i].copy()
+        source.points = points
+
+    def _tendon_range(self, tendon: int) -> Array:
+        """Return the least and the greatest length of a tendon in random postures [m]."""
+        m, data, rng = self.model, mujoco.MjData(self.model), np.random.default_rng(0)
+        lengths = []
+        for _ in range(RANGE_POSTURES):
+            for j in np.flatnonzero(m.jnt_limited & (m.jnt_type != mujoco.mjtJoint.mjJNT_BALL)):
+                data.qpos[m.jnt_qposadr[j]] = rng.uniform(*m.jnt_range[j])
+            lengths.append(float(self._with_tendons(data).ten_length[tendon]))
+        return np.array([min(lengths), max(lengths)])
+
+    def _with_tendons(self, data: Any) -> Any:
+        """Return data with the lengths of its posture."""
+        mujoco.mj_kinematics(self.model, data)
+        mujoco.mj_comPos(self.model, data)
+        mujoco.mj_tendon(self.model, data)
+        return data
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
         """Return MuJoCo's own lengths."""
@@ -283,8 +422,5 @@ class _Reader:
                     at = m.jnt_qposadr[[slave, master]]
                     moved = (data.qpos - start)[at[1]] if master >= 0 else 0.0
                     data.qpos[at[0]] = start[at[0]] + np.polyval(terms, moved)
-            mujoco.mj_kinematics(m, data)
-            mujoco.mj_comPos(m, data)
-            mujoco.mj_tendon(m, data)
-            lengths.append(data.ten_length.copy())
+            lengths.append(self._with_tendons(data).ten_length.copy())
         return dict(zip(self.tendons, np.array(lengths)[:, list(self.tendons.values())].T))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -21,14 +21,16 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES = 1000  # in which lengths are compared
+POSTURES, ARM_POSTURES = 1000, 200  # in which lengths are compared, and moment arms
+TURN = 1e-5  # [rad], [m] by which joints are moved to measure a moment arm
+SHORT_ARM = 1e-3  # [m]; the sign of a shorter moment arm does not count
+LISTED = 12  # names in a line
 STRENGTH = 'tension.limit is what the source says a muscle can pull, bias a tenth, max 1.5 times'
 EARTH = 9.81  # [m/s²]
 UNLIMITED = {False: np.pi, True: 0.5}  # ± [rad], [m] of joints that slide, where there are none
 
 #: absolute lengths [m] (N,) of muscles, for values (N,) of joints that are not at rest
 Lengths = Callable[[dict[str, Array]], dict[str, Array]]
-Function = Callable[[Array], Array]
 
 
 class SourceError(MusculoskeletalError):
@@ -55,6 +57,11 @@ class Source:
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
     end_effector: str = ''
+    #: named points that may be the end effector: link and place in its frame [m]
+    points: dict[str, tuple[str, Array]] = field(default_factory=dict)
+    #: limits of joints that stand beside the model, and the file that holds them
+    given_limits: dict[str, tuple[float, float]] = field(default_factory=dict)
+    limits_file: str = ''
     above: dict[str, str] = field(default_factory=dict)  # link that each link hangs on, where known
 
     def note(self, kind: str, text: str) -> None:
@@ -77,12 +84,16 @@ class Source:
             self.note('renamed', f'{kind} {original} is {name} here')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
-        """Return limits of a joint, chosen ones where there are none."""
+        """Return limits of a joint: given, of the model, or chosen ones where there are none."""
+        if joint in self.given_limits:
+            return self.given_limits[joint]
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
             return float(low), float(high)
         end = UNLIMITED[slides]
         range_text = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
-        self.note('chosen', f'joint {joint}: limits ±{end:.4g}, the source has {range_text}')
+        remedy = self.limits_file or 'the source'
+        chosen = f'joint {joint}: limits ±{end:.4g}, the source has {range_text}'
+        self.note('chosen', f'{chosen}; give it a range in {remedy}')
         return -end, end
 
     def add_joint(
@@ -123,20 +134,31 @@ class Source:
         """Return whether a joint is prismatic."""
         return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
 
-    def couple(self, slave: str, master: str, function: Function) -> None:
-        """Let a joint follow another by the line nearest to a function, in squares."""
-        x = np.linspace(*self.span(master), 201)
-        y = function(x)
-        slope, offset = (round(float(v), 12) for v in np.polyfit(x, y, 1))
-        self.couplings[slave] = Coupling(master, slope, offset)
-        if (error := float(np.abs(slope * x + offset - y).max())) > 1e-6:
-            problem = f'{slave} follows {master} by a line, off by up to {error:.3g}'
-            self.note('approximated', f'joint {problem} {"m" if self.slides(slave) else "rad"}')
-
     def settle(self) -> None:
         """Let coupled joints rest where those that they follow put them."""
         for slave, c in self.couplings.items():
-            self.rest[slave] = c.ratio * self.rest.get(c.master, 0.0) + c.offset
+            self.rest[slave] = float(c.value(self.rest.get(c.master, 0.0)))
+
+    def point_link(self, name: str) -> str:
+        """Return a link by its name or by that of a point, for which a link is added."""
+        if name in self.links or name not in self.points:
+            return name
+        link, xyz = self.points[name]
+        joint, at = self.place(link)
+        self.add_link(name, joint, at * pin.SE3(np.eye(3), xyz))
+        self.above[name] = link
+        return name
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in a line, the first ones of many."""
+    more = f' and {len(names) - LISTED} more' if len(names) > LISTED else ''
+    return ', '.join(names[:LISTED]) + more
+
+
+def tip_name(link: str) -> str:
+    """Return the name of the point at the far end of a link's geometry."""
+    return f'{link}_tip'
 
 
 def tip(source: Source) -> str:
@@ -213,6 +235,7 @@ def cut(
     source: Source,
     joints: Sequence[str] = (),
     muscles: Sequence[str] = (),
+    without: Sequence[str] = (),
     base: str = '',
     end: str = '',
 ) -> None:
@@ -222,9 +245,12 @@ def cut(
     nor are one piece with it go, with the muscles that are fastened to them or move no joint.
     """
     model, links = source.model, source.links
-    for option, name in (('--base', base), ('--end', end)):
-        if name and name not in links:
-            raise SourceError(f'{option} {name}: no such link; links: {", ".join(links)}')
+    if base and base not in links:
+        raise SourceError(f'--base {base}: no such link; links: {listed(links)}')
+    if end and end not in {*links, *source.points}:
+        legal = f'links: {listed(links)}; points: {listed([*source.points])}'
+        raise SourceError(f'--end {end}: no such link or point; {legal}')
+    is_chosen, end = not end, source.point_link(end)
     root = source.place(base)[0] if base else 0
     inside = [i for i, above in enumerate(model.supports) if root in list(above)]
     if end and source.place(end)[0] not in inside:
@@ -255,28 +281,44 @@ def cut(
     locked = [i for i in range(1, model.njoints) if model.names[i] not in kept]
     at_rest = pin.integrate(model, pin.neutral(model), velocity)
     source.model = reduced(model, locked, at_rest)
-    if unknown := [name for name in muscles if name not in source.routes]:
-        legal = ', '.join(source.routes)
-        raise SourceError(f'--muscles {unknown[0]}: no such muscle; muscles: {legal}')
+    for option, given in (('--muscles', muscles), ('--without', without)):
+        if unknown := [name for name in given if name not in source.routes]:
+            legal = ', '.join(source.routes)
+            raise SourceError(f'{option} {unknown[0]}: no such muscle; muscles: {legal}')
     for name, route in list(source.routes.items()):
         lost = [item.link for item in route if item.link not in source.links]
         if lost:
             source.note('dropped', f'muscle {name}: fastened to {lost[0]}, which was cut off')
         elif len({source.place(p.link)[0] for p in route if isinstance(p, RoutePoint)}) < 2:
             source.note('dropped', f'muscle {name}: it moves no joint')
-        elif not muscles or name in muscles:
+        elif name not in without and (not muscles or name in muscles):
             continue
         del source.routes[name]
     if any(source.strength.values()):
         source.note('chosen', STRENGTH)
     if count := sum(not source.strength.get(name) for name in source.routes):
         source.note('chosen', f'tension of {count} muscles: the default, the source has none')
-    source.end_effector = end or tip(source)
-    if not end:
-        source.note('chosen', f'end effector {source.end_effector} (--end is another)')
+    if is_chosen:
+        _choose_end(source)
+    else:
+        source.end_effector = end
     if not wanted:
         held = [note for note in source.notes if note.startswith('held fixed')]
         raise SourceError('; '.join(['no joint is left that moves', *held[:3]]))
+
+
+def _choose_end(source: Source) -> None:
+    """Let the far end of the geometry of the last link be the end effector; name the others."""
+    link = tip(source)
+    leaves = [name for name in source.links if name not in source.above.values()]
+    others = [name for each in leaves for name in (tip_name(each), each)]
+    others += [name for name, (carrier, _) in source.points.items() if carrier in (link, *leaves)]
+    name = tip_name(link) if tip_name(link) in source.points else link
+    legal = [each for each in dict.fromkeys(others) if each in {*source.links, *source.points}]
+    legal.remove(name)
+    more = f'; others: {listed(legal)}' if legal else ''
+    source.note('chosen', f'end effector {name} (--end is another{more})')
+    source.end_effector = source.point_link(name)
 
 
 def _text(values: Any) -> str:
@@ -343,7 +385,7 @@ def write(source: Source, out: Path) -> None:
     document: dict[str, Any] = {'joints': joints, 'muscles': muscles}
     document['end_effector'] = source.end_effector
     if source.couplings:
-        document['couplings'] = [{'joint': s, **c._asdict()} for s, c in source.couplings.items()]
+        document['couplings'] = [_coupling(s, c) for s, c in source.couplings.items()]
     text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)
     head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
     out.mkdir(parents=True, exist_ok=True)
@@ -351,11 +393,55 @@ def write(source: Source, out: Path) -> None:
     (out / 'robot.urdf').write_text(body, encoding='utf-8')
 
 
-def compare(source: Source, robot: Robot) -> dict[str, float] | None:
-    """Return each muscle's largest length error [m] over POSTURES, or None without own lengths."""
+def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
+    """Return an entry of muscles.yaml."""
+    entry: dict[str, Any] = {'joint': slave, 'master': coupling.master}
+    if coupling.higher:
+        return {**entry, 'polynomial': list(coupling.terms)}
+    return {**entry, 'ratio': coupling.ratio, 'offset': coupling.offset}
+
+
+class Comparison(NamedTuple):
+    """How far the muscles of an imported robot are from those of the source's own engine."""
+
+    lengths: dict[str, float]  # largest error [m]
+    arms: dict[str, float]  # largest error of a moment arm [m], or of a length per length
+    flips: dict[str, float]  # share of the postures in which a moment arm has the wrong sign
+
+
+def compare(source: Source, robot: Robot) -> Comparison | None:
+    """Compare lengths over POSTURES and moment arms over ARM_POSTURES; None without own lengths.
+
+    The source's moment arms are differences of its lengths, so that nothing of this package
+    stands between.
+    """
     if source.lengths is None:
         return None
-    theta, kin = robot.random_postures(POSTURES, np.random.default_rng(0)), robot.kinematics
+    theta, own = robot.random_postures(POSTURES, np.random.default_rng(0)), source.lengths
+
+    def theirs(theta: Array) -> dict[str, Array]:
+        kin = robot.kinematics
+        return own(dict(zip(kin.model.names[1:], kin.tree.angles(theta).T)))
+
     ours = dict(zip(robot.muscles, robot.routes.absolute_lengths(theta).T))
-    theirs = source.lengths(dict(zip(kin.model.names[1:], kin.tree.angles(theta).T)))
-    return {name: float(np.abs(ours[name] - theirs[name]).max()) for name in ours if name in theirs}
+    lengths = {
+        name: float(np.abs(ours[name] - length).max())
+        for name, length in theirs(theta).items()
+        if name in ours
+    }
+    theta, step = theta[:ARM_POSTURES], TURN * np.eye(robot.joint_count)
+    arms, flips = dict.fromkeys(lengths, 0.0), dict.fromkeys(lengths, 0.0)
+    jacobian = robot.routes.muscle_jacobian(theta)
+    for j, turn in enumerate(step):
+        ahead, behind = theirs(theta + turn), theirs(theta - turn)
+        for name in lengths:
+            m = robot.muscles.index(name)
+            if not robot.routes.crossed[m, j]:
+                continue
+            there, here = (ahead[name] - behind[name]) / (2.0 * TURN), jacobian[:, m, j]
+            arms[name] = max(arms[name], float(np.abs(here - there).max()))
+            wrong = (np.sign(here) != np.sign(there)) & (
+                np.minimum(abs(here), abs(there)) > SHORT_ARM
+            )
+            flips[name] = max(flips[name], float(wrong.mean()))
+    return Comparison(lengths, arms, flips)

@@ -40,9 +40,11 @@ LARGEST_LOG = 1.5
 class Layout:
     """Where the parameters of one muscle are: δ (three per route point), κ, μ, o, r, v."""
 
-    def __init__(self, points: Ints, features: int) -> None:
+    def __init__(self, points: Ints, weights: Array, features: int) -> None:
         end = 3 * len(points)
         self.points = points  # its route points
+        #: of the lines between each two of them: the share of the length that counts
+        self.weights = weights
         self.attachment = slice(0, end)  # δ [m]
         self.elastic = slice(end, end + 3)  # κ: log of force, rate, wire_stretch over nominal ones
         self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
@@ -119,8 +121,10 @@ class CalibratedBody:
         self.smooth, self.layouts = smooth, list[Layout]()
         for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
-            points = np.append(routes.first[segments], routes.second[segments[-1]])
-            self.layouts.append(Layout(points, own.basis.shape[1]))
+            points = np.union1d(routes.first[segments], routes.second[segments])
+            weights = np.zeros(len(points) - 1)  # 0 from one branch to the next
+            weights[routes.first[segments] - points[0]] = routes.weight[segments]
+            self.layouts.append(Layout(points, weights, own.basis.shape[1]))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         # Where the next fit starts:
         #: offsets of the joint sensors [rad], (D,)
@@ -188,7 +192,7 @@ class CalibratedBody:
         poses = self.poses(theta)
         for m, layout in enumerate(self.layouts):
             world, _ = self._world(poses, m)
-            absolute = np.linalg.norm(world[:, 1:] - world[:, :-1], axis=-1).sum(axis=1)
+            absolute = np.linalg.norm(world[:, 1:] - world[:, :-1], axis=-1) @ layout.weights
             absolute += poses.detour[:, m]
             absolute, at_zero = absolute[:-1], absolute[-1]
             fixed = absolute - at_zero + self.parameters[m][layout.offset]
@@ -211,12 +215,12 @@ class CalibratedBody:
         world, turn = self._world(poses, m)
         line = world[:, 1:] - world[:, :-1]
         norm = np.linalg.norm(line, axis=-1)
-        along = line / np.maximum(norm, 1e-9)[..., None]
+        along = line * (layout.weights / np.maximum(norm, 1e-9))[..., None]
         pull = np.zeros_like(world)
         pull[:, 1:] += along
         pull[:, :-1] -= along
         by_point = (pull[:, :, None] @ turn).reshape(len(world), -1)
-        whole = norm.sum(axis=1) + poses.detour[:, m]
+        whole = norm @ layout.weights + poses.detour[:, m]
         absolute, at_zero = whole[:-1], whole[-1]
         elastic = self.elastic(m)
         end = np.maximum(end_tension(self.friction(m), tension, direction), 0.0)

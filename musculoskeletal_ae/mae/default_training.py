@@ -41,6 +41,8 @@ LAYERS = Layers((200, 100), 'silu')
 STEPS, BATCH, SAMPLES = 3000, 128, 200_000
 STEP_SIZE = 0.004  # of the biases; see `optimiser` for that of the matrices
 REFERENCE = 5 + 10  # D + M of the arm that these numbers are for
+# Muscles of a joint that count; further ones add equations, and nothing to be found.
+COUNTED_MUSCLES = 2.5
 
 # Share of samples with tensions beyond what is planned: a payload pulls muscles there, and an
 # estimator that has seen a few such states degrades gently.
@@ -60,8 +62,14 @@ RISE = 0.05  # share of the training in which the step size rises
 
 def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
     """Return a number of units of a group's layer, or of steps, as it is for given groups."""
-    times = max(1.0, max(sum(map(len, group)) for group in groups) / REFERENCE)
+    times = max(1.0, max(map(size, groups)) / REFERENCE)
     return round(number * times**power)
+
+
+def size(group: Group) -> float:
+    """Return D + M of a group, of whose muscles COUNTED_MUSCLES a joint count at most."""
+    joints, muscles = map(len, group)
+    return joints + min(muscles, COUNTED_MUSCLES * joints)
 
 
 def default_steps(groups: Iterable[Group]) -> int:

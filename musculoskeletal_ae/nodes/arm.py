@@ -50,16 +50,16 @@ class Markers:
     def _publish(self) -> None:
         if not is_heard(self._publisher) or not (lines := self._lines()):
             return
-        message, names = MarkerArray(), iter(self._node.robot.muscles)
+        message = MarkerArray()
         for number, line in enumerate(lines):
             marker = self._add(message, line.kind, number, Marker.LINE_STRIP)
             marker.scale.x = line.width
             look = self._bones if line.kind == 'bones' else (*line.colour, self._bones[3])
             marker.color = ColorRGBA(**dict(zip('rgba', look)))
             marker.points = [Point(x=x, y=y, z=z) for x, y, z in line.points.tolist()]
-            if line.kind == 'muscles':
+            if line.name:
                 name = self._add(message, 'names', number, Marker.TEXT_VIEW_FACING)
-                name.text, name.scale.z, name.color = next(names), NAME_HEIGHT, marker.color
+                name.text, name.scale.z, name.color = line.name, NAME_HEIGHT, marker.color
                 name.pose.position = Point(**dict(zip('xyz', line.points.mean(axis=0).tolist())))
         self._publisher.publish(message)
 

@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped, Vector3
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -24,6 +27,8 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.robot.kinematics import body_frames
 
+PACE_TIME = 5.0  # [s] over which the real-time factor is averaged
+
 
 class HardwareEmulator(Arm):
     """Node shell of the emulated arm."""
@@ -31,7 +36,12 @@ class HardwareEmulator(Arm):
     def __init__(self, **options: Any) -> None:
         super().__init__('hardware_emulator', **options)
         Markers(self, 'hardware_emulator', self._lines)
-        self.arm = make_arm(self.robot, self.parameter('seed'), self.parameter('reality'))
+        self.arm = make_arm(
+            self.robot,
+            self.parameter('seed'),
+            self.parameter('reality'),
+            deviates=self.parameter('deviates'),
+        )
         for warning in self.arm.warnings:
             self.get_logger().warning(warning)
         # Compiled code is loaded before the first message promises a living arm.
@@ -58,7 +68,14 @@ class HardwareEmulator(Arm):
         self.follow_wrench('hardware_emulator', self.arm.set_wrench)
         serve(self, Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()
-        self.create_timer(1.0 / self.rate, self._tick)
+        self.pace = 1.0  # simulated seconds in a second
+        self.time = self.clock_publisher = None
+        if self.parameter('clock'):
+            self.clock_publisher = self.create_publisher(ClockMessage, '/clock', RELIABLE)
+            self.time = time.time_ns()
+        # On a steady clock: with use_sim_time nothing passes before this node says so.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0 / self.rate, self._tick, clock=steady)
 
     def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
@@ -70,11 +87,20 @@ class HardwareEmulator(Arm):
 
     def _tick(self) -> None:
         now = time.monotonic()
-        elapsed = min(now - self.ticked, self.longest_step) + self.remainder
+        since = now - self.ticked
+        # By its own clock each tick is one period, however late it comes.
+        elapsed = min(since, self.longest_step if self.time is None else 1.0 / self.rate)
+        self.pace += min(1.0, since / PACE_TIME) * (elapsed / max(since, 1e-6) - self.pace)
+        elapsed += self.remainder
         self.ticked = now
         whole = int(elapsed * 1000.0) / 1000.0
         self.remainder = elapsed - whole
         self.arm.step(whole)
+        if self.time is not None and self.clock_publisher is not None:
+            self.time += round(whole * 1e9)
+            message = ClockMessage()
+            message.clock.sec, message.clock.nanosec = divmod(self.time, 10**9)
+            self.clock_publisher.publish(message)
         if self.arm.broken:
             return
         self.reading = self.arm.sense()
@@ -112,7 +138,7 @@ class HardwareEmulator(Arm):
     def report(self) -> Report:
         """Return what /diagnostics shows."""
         hottest = np.fmax.reduce(self.reading.temperature)  # NaN only where all are
-        values = {'hottest module': f'{hottest:.1f} °C'}
+        values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
         if self.arm.broken:
             return Report('error', 'broken by forces beyond all bounds: reset it', values)
         if self.arm.safe:

@@ -85,6 +85,16 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             'the body: kin (the first), foreign (a second one, of MuJoCo), or an MJCF file whose '
             'joints and tendons have the names of the joints and muscles',
         ),
+        'deviates': Parameter(
+            False,
+            'with an MJCF file as reality: an individual that deviates from it as the seed draws '
+            '(doc/howto/mujoco.md), instead of the file as it is',
+        ),
+        'clock': Parameter(
+            False,
+            'publish /clock, and let time pass no faster than it can be computed; all nodes need '
+            'use_sim_time',
+        ),
         'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(

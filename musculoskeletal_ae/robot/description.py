@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +49,7 @@ class RoutePoint(NamedTuple):
 
     link: str
     xyz: Array  # in the link's frame [m], (3,)
+    divisor: float | None = None  # another branch begins here; its length counts 1/divisor
 
 
 class Wrap(NamedTuple):
@@ -58,12 +60,13 @@ class Wrap(NamedTuple):
     radius: float  # [m]
     axis: Array | None  # unit vector of a cylinder; None: a sphere
     side: Array | None  # a point on the side that the wire takes [m]; inside: a ring
+    side_link: str | None = None  # link that carries this point; None: the one of the wrap
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:
     """Return an item of a route as muscles.yaml has it."""
     given = {key: value for key, value in item._asdict().items() if value is not None}
-    given = {k: v if isinstance(v, str) else np.round(v, 9).tolist() for k, v in given.items()}
+    given = {k: v if isinstance(v, str) else np.round(v, 10).tolist() for k, v in given.items()}
     if isinstance(item, Wrap):
         given = {'wrap': 'sphere' if item.axis is None else 'cylinder', **given}
     return given
@@ -71,6 +74,13 @@ def written(item: RoutePoint | Wrap) -> dict[str, Any]:
 
 #: points, joined by straight lines or round a wrap that stands between two of them
 Route = tuple[RoutePoint | Wrap, ...]
+
+
+def branches(route: Route) -> list[Route]:
+    """Return the branches of a route: parts that no line joins. Most routes have one."""
+    starts = [i for i, item in enumerate(route) if isinstance(item, RoutePoint) and item.divisor]
+    ends = sorted({0, *starts, len(route)})
+    return [route[start:end] for start, end in pairwise(ends)]
 
 
 @dataclass(frozen=True)
@@ -119,10 +129,7 @@ class RobotDescription:
     @property
     def joint_notes(self) -> list[str]:
         """Lines that name the joints which are not in θ: coupled ones, and those held fixed."""
-        lines = [
-            f'{joint} = {c.ratio:g} · {c.master}' + (f' {c.offset:+g}' if c.offset else '')
-            for joint, c in self.couplings.items()
-        ]
+        lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines
@@ -230,7 +237,10 @@ def _read_couplings(
     content: MuscleFile, mimics: dict[str, Coupling], model: pin.Model, urdf: Path, fail: Fail
 ) -> dict[str, Coupling]:
     """Return what each coupled joint follows, a joint that follows none itself."""
-    listed = {c.joint: Coupling(c.master, c.ratio, c.offset) for c in content.couplings}
+    listed = {
+        c.joint: Coupling.of_terms(c.master, c.polynomial or (c.offset, c.ratio))
+        for c in content.couplings
+    }
     links = mimics | listed
     for slave, coupling in links.items():
         if slave in content.joints:
@@ -281,19 +291,24 @@ def _read_route(
     for i, entry in enumerate(muscle.route):
         _check_link(f'{place}[{i}].link', entry.link, links, fail)
         if entry.wrap is not None:
+            if entry.side_link is not None:
+                _check_link(f'{place}[{i}].side_link', entry.side_link, links, fail)
             route.append(_read_wrap(entry))
             continue
-        point = RoutePoint(entry.link, np.array(entry.xyz))
+        point = RoutePoint(entry.link, np.array(entry.xyz), entry.divisor)
         last = route[-1] if route and isinstance(route[-1], RoutePoint) else None
-        if last and last.link == point.link and np.array_equal(last.xyz, point.xyz):
+        is_same = last and last.link == point.link and np.array_equal(last.xyz, point.xyz)
+        if is_same and not point.divisor:
             warnings.append(
                 f'muscle {muscle.name!r}: route[{i}] is the same point as the one before it, '
                 'and left out'
             )
             continue
         route.append(point)
-    if len(route) < 2:
-        raise fail(f'{place}: expected at least 2 different points, got {len(route)}')
+    parts = branches(tuple(route))
+    if short := [part for part in parts if len(part) < 2]:
+        each = ' in each branch' if len(parts) > 1 else ''
+        raise fail(f'{place}: expected at least 2 different points{each}, got {len(short[0])}')
     return tuple(route)
 
 
@@ -303,7 +318,8 @@ def _read_wrap(entry: RouteEntry) -> Wrap:
     if axis is not None:
         axis = axis / float(np.linalg.norm(axis))
     assert entry.radius is not None  # the format requires it of wraps
-    return Wrap(entry.link, np.array(entry.xyz), entry.radius, axis, side)
+    own = None if entry.side_link == entry.link else entry.side_link
+    return Wrap(entry.link, np.array(entry.xyz), entry.radius, axis, side, own)
 
 
 def _check_link(place: str, name: str, links: Iterable[str], fail: Fail) -> None:

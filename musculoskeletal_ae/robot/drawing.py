@@ -28,6 +28,7 @@ class Line(NamedTuple):
     points: Array  # [m], (N, 3)
     width: float  # [m]
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
+    name: str = ''  # of the muscle; further branches of its tendon have none
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:
@@ -39,6 +40,8 @@ def tension_share(robot: Robot, tension: Array) -> Array:
 
 def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = None) -> list[Line]:
     """Return the bones of an arm, then its muscles in their order, at θ [rad] (D,) and T [N] (M,).
+
+    A muscle is one line, or one for each branch of its tendon.
 
     Route points [m] (P, 3) are those of the geometric model by default.
     """
@@ -54,8 +57,11 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
         if np.linalg.norm(bone[1] - bone[0]) > SHORTEST_BONE
     ]
     shares = tension_share(robot, tension).tolist()
-    for share, route in zip(shares, robot.routes.drawn(theta, points), strict=True):
-        lines.append(Line('muscles', route, MUSCLE_WIDTH, (share, 1.0 - share, 0.0)))
+    owners, before = robot.routes.drawn_muscle.tolist(), -1
+    for m, route in zip(owners, robot.routes.drawn(theta, points), strict=True):
+        name, colour = robot.muscles[m] if m != before else '', (shares[m], 1.0 - shares[m], 0.0)
+        lines.append(Line('muscles', route, MUSCLE_WIDTH, colour, name))
+        before = m
     return lines
 
 

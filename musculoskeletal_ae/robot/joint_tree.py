@@ -7,9 +7,12 @@ The pose of a joint in its parent is its fixed placement times, by Rodrigues,
 
 or 1 + θ a for one that slides: a sum of constant matrices, the same operation for every joint.
 
-A coupled joint of the tree turns by q = ratio · θ_master + offset. With A = ∂q/∂θ, what pinocchio
-says of all joints of the tree becomes Aᵀ g, Aᵀ M A and J A.
+A coupled joint of the tree turns by a polynomial of the joint that it follows, q = Σ c_k θ_masterᵏ;
+most often that is a line. With A(θ) = ∂q/∂θ, what pinocchio says of all joints of the tree becomes
+Aᵀ g, Aᵀ M A and J A.
 """
+
+from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -31,27 +34,72 @@ class JointPoses(NamedTuple):
     axis: Array  # (N, J, 3); zero at index 0
 
 
+MOST_TERMS = 17  # of a coupling's polynomial: one of degree 4 that follows another of degree 4
+
+
 class Coupling(NamedTuple):
-    """A joint that follows another: q = ratio · θ_master + offset."""
+    """A joint that follows another: q = offset + ratio · θ_master + Σ higher_k · θ_masterᵏ⁺²."""
 
     master: str  # a joint that follows none
     ratio: float
     offset: float  # [rad] or [m]
+    higher: tuple[float, ...] = ()  # coefficients of the second power and those above
+
+    @classmethod
+    def of_terms(cls, master: str, terms: Sequence[float]) -> Coupling:
+        """Return a coupling by the coefficients of all powers, the constant first."""
+        offset, ratio, *higher = [*map(float, terms), 0.0, 0.0][: max(2, len(terms))]
+        while higher and higher[-1] == 0.0:
+            higher.pop()
+        return cls(master, ratio, offset, tuple(higher))
+
+    @property
+    def terms(self) -> tuple[float, ...]:
+        """The coefficients of all powers, the constant first."""
+        return self.offset, self.ratio, *self.higher
+
+    def value(self, master: Array | float) -> Array:
+        """Return where the joint is when its master is somewhere [rad] or [m]."""
+        return polyval(np.asarray(master), np.array(self.terms))
+
+    def __str__(self) -> str:
+        """Return the equation, as 'q = 0.5 · elbow +0.1'."""
+        powers = [f'{c:+g} · {self.master}^{k}' for k, c in enumerate(self.higher, 2) if c]
+        offset = [f'{self.offset:+g}'] if self.offset else []
+        return ' '.join([f'{self.ratio:g} · {self.master}', *powers, *offset])
 
 
 def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
     """Return couplings to joints that follow none; a ValueError names one that follows itself."""
     result = {}
-    for slave, (master, ratio, offset) in couplings.items():
-        seen = {slave}
+    for slave, coupling in couplings.items():
+        seen, terms, master = {slave}, np.polynomial.Polynomial(coupling.terms), coupling.master
         while master in couplings:
             if master in seen:
                 told = f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}'
                 raise ValueError(told)
             seen.add(master)
-            master, gear, shift = couplings[master]
-            ratio, offset = ratio * gear, ratio * shift + offset
-        result[slave] = Coupling(master, ratio, offset)
+            terms = terms(np.polynomial.Polynomial(couplings[master].terms))
+            master = couplings[master].master
+        if len(terms.coef) > MOST_TERMS:
+            told = f'joint {slave!r} follows {master!r} by a polynomial of degree'
+            raise ValueError(f'{told} {len(terms.coef) - 1}; legal: at most {MOST_TERMS - 1}')
+        result[slave] = Coupling.of_terms(master, terms.coef.tolist())
+    return result
+
+
+def polyval(x: Array, terms: Array) -> Array:
+    """Return Σ c_k xᵏ by Horner's rule; the coefficients stand in the last axis, constant first."""
+    result = np.broadcast_to(terms[..., -1], x.shape)
+    for k in range(terms.shape[-1] - 2, -1, -1):
+        result = result * x + terms[..., k]
+    return result
+
+
+def derivative(terms: Array) -> Array:
+    """Return the coefficients of the derivatives of polynomials, (..., K) gives (..., K)."""
+    result = np.zeros_like(terms)
+    result[..., :-1] = terms[..., 1:] * np.arange(1, terms.shape[-1])
     return result
 
 
@@ -76,10 +124,10 @@ class JointTree:
         first: The pose in the parent is placement + a(θ) · first + b(θ) · second, (J, 4, 4).
         second: See `first`.
         theta_index: Position in θ of what moves a joint, -1 for the root link, (J,).
-        ratio: Of q = ratio · θ + offset, (J,).
-        offset: See `ratio`.
-        transmission: A = ∂q/∂θ (J−1, D), rows in pinocchio's order; None where every joint is its
-            own master.
+        terms: Coefficients of q = Σ terms_k θᵏ, the constant first, (J, K).
+        is_coupled: Whether there are coupled joints.
+        is_bent: Whether some of them do not follow by a line.
+        moved_by: 1 where a joint of θ moves a joint of the tree, (J−1, D).
         hangs_on: hangs_on[i, j]: joint i is joint j, or hangs on it, (J, J).
     """
 
@@ -107,25 +155,26 @@ class JointTree:
             else:
                 self.first[i, :3, :3], self.second[i, :3, :3] = turn @ cross, turn @ cross @ cross
         self.theta_index = np.full(count, -1)
-        self.ratio, self.offset = np.ones(count), np.zeros(count)
         self.theta_index[ids] = np.arange(len(ids))
+        most = max([2, *(len(coupling.terms) for coupling in couplings.values())])
+        self.terms = np.zeros((count, most))
+        self.terms[:, 1] = 1.0
         for name, coupling in couplings.items():
             i = model.getJointId(name)
             self.theta_index[i] = list(joints).index(coupling.master)
-            self.ratio[i], self.offset[i] = coupling.ratio, coupling.offset
-        self.transmission: Array | None = None
-        if couplings:
-            self.transmission = np.zeros((count - 1, len(ids)))
-            self.transmission[np.arange(count - 1), self.theta_index[1:]] = self.ratio[1:]
+            self.terms[i] = [*coupling.terms, *[0.0] * (most - len(coupling.terms))]
+        self.is_coupled, self.is_bent = bool(couplings), most > 2
+        self.moved_by: Array = 1.0 * np.eye(len(ids))[self.theta_index[1:]]
         self.hangs_on = np.eye(count, dtype=bool)
         for i in range(1, count):
             self.hangs_on[i] |= self.hangs_on[self.parent[i]]
 
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
-        angle = theta[:, self.theta_index, None, None]
-        if self.transmission is not None:
-            angle = self.ratio[:, None, None] * angle + self.offset[:, None, None]
+        angle = theta[:, self.theta_index]
+        if self.is_coupled:
+            angle = polyval(angle, self.terms)
+        angle = angle[..., None, None]
         first, second = np.sin(angle), 1.0 - np.cos(angle)
         if self.prismatic.any():
             slides = self.prismatic[:, None, None]
@@ -149,11 +198,36 @@ class JointTree:
     def angles(self, theta: Array) -> Array:
         """Return q (..., J−1) of the tree's joints in pinocchio's order; θ (..., D)."""
         q: Array = theta[..., self.theta_index[1:]]
-        return q if self.transmission is None else self.ratio[1:] * q + self.offset[1:]
+        return polyval(q, self.terms[1:]) if self.is_coupled else q
 
-    def of_theta(self, values: Array) -> Array:
-        """Return what belongs to θ (..., D) of torques or derivatives for q (..., J−1)."""
-        if self.transmission is None:
+    def ratios(self, theta: Array) -> Array:
+        """Return dq/dθ of each joint of the tree, (..., J−1); θ (..., D)."""
+        return polyval(theta[..., self.theta_index[1:]], derivative(self.terms[1:]))
+
+    def curvatures(self, theta: Array) -> Array:
+        """Return d²q/dθ² of each joint of the tree, (..., J−1); θ (..., D)."""
+        terms = derivative(derivative(self.terms[1:]))
+        return polyval(theta[..., self.theta_index[1:]], terms)
+
+    def transmission(self, theta: Array) -> Array:
+        """Return A = ∂q/∂θ (J−1, D), rows in the order of the tree, at θ (D,)."""
+        return self.ratios(theta)[:, None] * self.moved_by
+
+    def of_theta(self, values: Array, theta: Array) -> Array:
+        """Return what belongs to θ of torques or derivatives for q.
+
+        At θ (*N, D), of values (*N, ..., J−1) that gives (*N, ..., D).
+        """
+        if not self.is_coupled:
             mine: Array = values[..., self.order]
             return mine
-        return values @ self.transmission
+        ratios = self.ratios(theta)
+        between = (1,) * (values.ndim - ratios.ndim)
+        return (values * ratios.reshape(*ratios.shape[:-1], *between, -1)) @ self.moved_by
+
+    def of_both(self, matrix: Array, theta: Array) -> Array:
+        """Return Aᵀ B A (D, D) of a matrix B (J−1, J−1), at θ (D,)."""
+        if not self.is_coupled:
+            return self.of_theta(self.of_theta(matrix, theta).T, theta).T
+        gear = self.transmission(theta)
+        return gear.T @ matrix @ gear

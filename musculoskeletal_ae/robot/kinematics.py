@@ -114,37 +114,48 @@ class Kinematics:
         """Return g(θ), the joint torque that holds the arm's own weight [N·m], shape (..., D)."""
         if theta.ndim > 1:
             return np.stack([self.holding_torque(row) for row in theta])
-        return self.tree.of_theta(
-            pin.computeGeneralizedGravity(self.model, self.data, self.tree.angles(theta))
-        )
+        return self.tree.of_theta(self._gravity(theta), theta)
+
+    def _gravity(self, theta: Array) -> Array:
+        """Return the torque of the weight on every joint of the tree [N·m], (J−1,), at θ (D,)."""
+        q = self.tree.angles(theta)
+        return np.array(pin.computeGeneralizedGravity(self.model, self.data, q))
 
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
         """Return M(θ) θ̈ + h(θ, θ̇), the joint torque of a motion [N·m], shape (D,)."""
-        rates = (
-            self.tree.ratio[1:] * np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
-        )
-        return self.tree.of_theta(pin.rnea(self.model, self.data, self.tree.angles(theta), *rates))
+        tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
+        if tree.is_coupled:
+            turning = rates[0] ** 2
+            rates = tree.ratios(theta) * rates
+            rates[1] += tree.curvatures(theta) * turning
+        torque = pin.rnea(self.model, self.data, tree.angles(theta), *rates)
+        return tree.of_theta(torque, theta)
 
     def gravity_gradient(self, theta: Array) -> Array:
         """Return ∂g/∂θ [N·m/rad], shape (D, D), at θ (D,)."""
-        q = self.tree.angles(theta)
+        tree, q = self.tree, self.tree.angles(theta)
         gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, q)
-        return self.tree.of_theta(self.tree.of_theta(gradient).T).T
+        result = tree.of_both(gradient, theta)
+        if tree.is_bent:
+            bent = self._gravity(theta) * tree.curvatures(theta)
+            result = result + np.diag(bent @ tree.moved_by)
+        return result
 
     def joint_inertia(self, theta: Array) -> Array:
         """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
         inertia = joint_space_inertia(self.model, self.data, self.tree.angles(theta))
-        return np.diag(self.tree.of_theta(self.tree.of_theta(inertia).T))
+        return np.diag(self.tree.of_both(inertia, theta))
 
     def end_effector_jacobian(self, theta: Array) -> Array:
         """Return J (6, D): rows linear [m/rad] then angular, at the end effector's origin.
 
         Axes are those of the root link, so a wrench F there is the joint torque Jᵀ F.
         """
-        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        q, frame = self.tree.angles(theta), self.end_effector_frame
+        axes, tree = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, self.tree
+        q, frame = tree.angles(theta), self.end_effector_frame
         jacobian = pin.computeFrameJacobian(self.model, self.data, q, frame, axes)
-        return self.tree.of_theta(jacobian.reshape(6, -1))
+        jacobian = jacobian.reshape(6, -1)
+        return jacobian @ tree.transmission(theta) if tree.is_coupled else jacobian[:, tree.order]
 
     def link_pose(self, theta: Array, link: str) -> pin.SE3:
         """Return the pose of a link in the root link's frame."""

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
 LARGEST = 1e8  # [SI units] of any number
@@ -52,13 +53,21 @@ class RouteEntry(Strict, frozen=True):
     axis: Vector | None = None
     radius: Positive | None = None
     side: Vector | None = None
+    side_link: Name | None = None  # in whose frame `side` is; default: `link`
+    divisor: Positive | None = None  # of a point at which another branch of the tendon begins
 
     def __post_init__(self) -> None:
         """Check which keys belong to which kind, and the geometry of a cylinder."""
         if self.wrap is None:
-            if any(value is not None for value in (self.axis, self.radius, self.side)):
-                raise ValueError('axis, radius and side need wrap: sphere or wrap: cylinder')
+            of_wraps = self.axis, self.radius, self.side, self.side_link
+            if any(value is not None for value in of_wraps):
+                legal = 'need wrap: sphere or wrap: cylinder'
+                raise ValueError(f'axis, radius, side and side_link {legal}')
             return
+        if self.divisor is not None:
+            raise ValueError('divisor: expected at a point, where a branch begins, not at a wrap')
+        if self.side_link is not None and self.side is None:
+            raise ValueError("side_link needs side; key 'side' is missing")
         if self.radius is None:
             raise ValueError("key 'radius' is missing")
         if self.wrap == 'sphere':
@@ -71,7 +80,7 @@ class RouteEntry(Strict, frozen=True):
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
             raise ValueError(f'axis: expected a direction, got {list(self.axis)}')
-        if self.side is not None:
+        if self.side is not None and self.side_link in (None, self.link):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))
             if beside < 1e-9 and np.linalg.norm(out) >= self.radius:
@@ -97,15 +106,26 @@ class MuscleEntry(Strict, frozen=True):
         is_wrap = [entry.wrap is not None for entry in self.route]
         if is_wrap[0] or is_wrap[-1] or any(map(all, pairwise(is_wrap))):
             raise ValueError('route: expected a point before and after each wrap')
+        begins = [entry.divisor is not None for entry in self.route]
+        if any(wrap and begin for wrap, begin in zip(is_wrap, begins[1:])):
+            raise ValueError('route: expected no wrap before a point with a divisor')
 
 
 class CouplingEntry(Strict, frozen=True):
-    """A joint that follows another: q = ratio · q_master + offset."""
+    """A joint that follows another: q = ratio · q_master + offset, or by a polynomial."""
 
     joint: Name
     master: Name
     ratio: Number = 1.0
     offset: Number = 0.0
+    polynomial: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=MOST_TERMS)] | None = (
+        None  # coefficients of q_master's powers, the constant first
+    )
+
+    def __post_init__(self) -> None:
+        """Check that only one of the two ways is used."""
+        if self.polynomial is not None and (self.ratio, self.offset) != (1.0, 0.0):
+            raise ValueError('expected polynomial, or ratio and offset, got both')
 
 
 class MuscleFile(Strict, frozen=True):

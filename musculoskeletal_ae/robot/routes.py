@@ -1,27 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscle lengths and the muscle Jacobian of routes: straight lines, and wires that wrap.
 
-    f_geo,abs(θ) = Σ over the route of |p_{i+1}(θ) − p_i(θ)|
+    f_geo,abs(θ) = Σ over the route of |p_{i+1}(θ) − p_i(θ)| / divisor
     f_geo(θ)     = f_geo,abs(θ) − f_geo,abs(0)
     G(θ)         = ∂f_geo/∂θ
 
 (paper, §III-B: start, relay and end points linearly connected.) G follows from
 the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines d between them. Of a
 segment that may wrap round a sphere or cylinder (`wrapping`) it is the velocity of the end points
-as seen from that object's link, projected on the directions in which the wire leaves them.
+as seen from that object's link, projected on the directions in which the wire leaves them. A
+tendon may have several branches, which pulleys join: the length of each counts 1/divisor, and it
+pulls with that share of the tension.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import wraps
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial, wraps
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap
+from musculoskeletal_ae.robot.description import Route, RoutePoint, Wrap, branches
 from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 ARC = 9  # points of a wrapped wire's arc that are drawn
 # Bounds the memory of one batched evaluation to a few tens of megabytes.
 CHUNK = 4096
+THREADED = 4  # more chunks are computed two at a time
 
 
 def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Array], Array]:
@@ -39,8 +43,12 @@ def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Ar
     @wraps(method)
     def chunked(self: Routes, theta: Array) -> Array:
         rows = theta.reshape(-1, theta.shape[-1])
-        starts = range(0, max(len(rows), 1), CHUNK)
-        values = np.concatenate([method(self, rows[i : i + CHUNK]) for i in starts])
+        parts = [rows[i : i + CHUNK] for i in range(0, max(len(rows), 1), CHUNK)]
+        if len(parts) > THREADED:
+            with ThreadPoolExecutor(2) as pool:  # numba and numpy let go of the interpreter
+                values = np.concatenate(list(pool.map(partial(method, self), parts)))
+        else:
+            values = np.concatenate([method(self, part) for part in parts])
         return values.reshape(*theta.shape[:-1], *values.shape[1:])
 
     return chunked
@@ -56,19 +64,25 @@ class Routes:
         hangs = [kinematics.tree.hangs_on[joints, 1:] for joints in links]
         # Joints of the tree: where two that turn together carry all of a route, it still changes.
         parted = np.array([some.any(axis=0) & ~some.all(axis=0) for some in hangs])
-        of_theta = np.eye(len(kinematics.lower), dtype=bool)[kinematics.tree.theta_index[1:]]
         #: joints that each muscle crosses: they or what follows them move some of it, (M, D)
-        self.crossed: Bools = parted @ of_theta
+        self.crossed: Bools = parted @ (kinematics.tree.moved_by > 0.0)
         pieces = [[item for item in route if isinstance(item, RoutePoint)] for route in routes]
-        attached = [kinematics.attach(*point) for points in pieces for point in points]
+        points = [point for points in pieces for point in points]
+        attached = [kinematics.attach(point.link, point.xyz) for point in points]
         #: joint of the tree that carries each point, (P,), and the point in its frame [m], (P, 3)
         self.joint = np.array([joint for joint, _ in attached])
         self.point: Array = np.array([point for _, point in attached], dtype=float)
         owner = np.repeat(np.arange(len(pieces)), [len(points) for points in pieces])
+        begins = np.array([point.divisor is not None for point in points])
+        divisor = np.array([point.divisor or 1.0 for point in points])
+        for p in np.flatnonzero(~begins & np.r_[False, owner[:-1] == owner[1:]]).tolist():
+            divisor[p] = divisor[p - 1]
         #: points where each segment starts and ends, and its muscle, (S,)
-        self.first = np.flatnonzero(owner[:-1] == owner[1:])
+        self.first = np.flatnonzero((owner[:-1] == owner[1:]) & ~begins[1:])
         self.second, self.muscle = self.first + 1, owner[self.first]
-        self._sum: Array = 1.0 * (np.arange(len(routes))[:, None] == self.muscle)
+        #: share of its length that counts, (S,)
+        self.weight: Array = 1.0 / divisor[self.first]
+        self._sum: Array = self.weight * (np.arange(len(routes))[:, None] == self.muscle)
         #: segments that may wrap, and round what
         self.wrapping, self.objects = self._attach_objects(routes)
         #: pulls of wires: of each segment on both its ends, where it may wrap of either alone;
@@ -83,11 +97,11 @@ class Routes:
             self._share = np.concatenate([self._share, *apart])
         own = self._sum[:, self.wrapping]
         self._gather = np.concatenate([self._sum, own, own], axis=1)
-        self._of_theta = kinematics.tree.ratio[1:, None] * of_theta
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
 
     def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
-        steps = [step for route in routes for step in pairwise(route)]
+        parts = [branch for route in routes for branch in branches(route)]
+        steps = [step for branch in parts for step in pairwise(branch)]
         # A segment is counted where it begins, at a point.
         segment = np.cumsum([isinstance(item, RoutePoint) for item, _ in steps]) - 1
         wraps = {s: end for s, (_, end) in zip(segment, steps) if isinstance(end, Wrap)}
@@ -108,7 +122,10 @@ class Routes:
         return wrapped_segments(self.objects, turned, moved, start, end)
 
     def drawn(self, theta: Array, points: Array | None = None) -> list[Array]:
-        """Return each muscle at θ (D,) as a polyline with its arcs, (K, 3) [m]; see `points`."""
+        """Return each branch of a muscle at θ (D,) as a polyline with its arcs, (K, 3) [m].
+
+        They stand in the order of `drawn_muscle`; see `points`.
+        """
         poses = self._kinematics.tree.joint_poses(theta[None])
         points = self.placed(poses)[0] if points is None else points
         arcs = {}
@@ -120,13 +137,29 @@ class Routes:
                 ends = points[self.first[s]], points[self.second[s]]
                 arcs[s] = touched(self.objects, i, ARC, *at, *ends)
         lines = []
-        for m in range(len(self._sum)):
-            own = np.flatnonzero(self.muscle == m)
+        for own in self._branches:
             parts = [points[self.first[own[:1]]]]
             for s in own.tolist():
                 parts += [arcs.get(s, points[:0]), points[self.second[s], None]]
             lines.append(np.concatenate(parts))
         return lines
+
+    @cached_property
+    def _branches(self) -> list[Ints]:
+        """The segments of each branch."""
+        gaps = np.flatnonzero(self.second[:-1] != self.first[1:]) + 1
+        return list(np.split(np.arange(len(self.first)), gaps))
+
+    @property
+    def pieces_drawn(self) -> Ints:
+        """How many straight pieces each polyline of `drawn` has at most."""
+        wraps = np.isin(np.arange(len(self.first)), self.wrapping)
+        return np.array([len(own) + ARC * wraps[own].sum() for own in self._branches])
+
+    @property
+    def drawn_muscle(self) -> Ints:
+        """The muscle of each polyline of `drawn`."""
+        return np.array([self.muscle[own[0]] for own in self._branches])
 
     def points(self, theta: Array) -> Array:
         """Return all route points in the root link's frame [m], shape (N, P, 3), θ (N, D)."""
@@ -190,4 +223,4 @@ class Routes:
         turn, shift = np.where(slides, 0.0, axis), np.where(slides, axis, np.cross(origin, axis))
         screw = np.concatenate([turn, shift], axis=-1).swapaxes(-1, -2)
         longer = np.concatenate([np.cross(at, pull), pull], axis=-1) @ screw
-        return self._gather @ (self._share * longer) @ self._of_theta
+        return kin.tree.of_theta(self._gather @ (self._share * longer), theta)

@@ -11,8 +11,10 @@ wraps where the straight line would cut the object, the short way round. With on
 object on that side; a side *inside* the object makes it a ring that the wire runs through. Which
 tangents, and when, is MuJoCo's choice (its `mju_wrap`), so that its models keep their lengths. At
 the points where the wire lifts off the arc is nil and tangents and straight line are the same, so
-that length and moment arm are continuous. Compiled by numba for one wire: the geometric model
-calls it for many, the emulator in each of its steps.
+that length and moment arm are continuous. A point on the rim of what the wire wraps round is tied
+to it: within a share RIM of the radius it counts as outside, where MuJoCo lets rounding decide.
+Compiled by numba for one wire: the geometric model calls it for many, the emulator in each of its
+steps.
 """
 
 import cmath
@@ -28,6 +30,7 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12
+RIM = 1e-6  # share of the radius
 Vector = tuple[float, float, float] | Array
 
 
@@ -37,23 +40,24 @@ class WrapObjects(NamedTuple):
     joint: Ints  # (S,)
     centre: Array  # [m], (S, 3)
     axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
-    side: Array  # from the centre [m], NaN for none, (S, 3)
+    #: [m], NaN for none, (S, 3): from the centre, or in the frame of another joint
+    side: Array
+    side_joint: Ints  # that carries the side; the object's own or another, (S,)
     radius: Array  # [m], 0 for no object, (S,)
 
 
 def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
     """Return what a description wraps segments round, one each, in the frames of tree joints."""
-    joints, poses = zip(*(kinematics.placement(wrap.link) for wrap in wraps))
-    rows = [
-        (
-            at.act(wrap.xyz),
-            np.zeros(3) if wrap.axis is None else at.rotation @ wrap.axis,
-            np.full(3, np.nan) if wrap.side is None else at.rotation @ (wrap.side - wrap.xyz),
-            wrap.radius,
-        )
-        for at, wrap in zip(poses, wraps)
-    ]
-    return WrapObjects(np.array(joints), *map(np.array, zip(*rows)))
+    rows = []
+    for wrap in wraps:
+        joint, at = kinematics.placement(wrap.link)
+        axis = np.zeros(3) if wrap.axis is None else at.rotation @ wrap.axis
+        centre, side, carrier = at.act(wrap.xyz), np.full(3, np.nan), joint
+        if wrap.side is not None:
+            carrier, place = kinematics.attach(wrap.side_link or wrap.link, wrap.side)
+            side = place - centre if carrier == joint else place
+        rows.append((joint, centre, axis, side, carrier, wrap.radius))
+    return WrapObjects(*map(np.array, zip(*rows)))
 
 
 @njit(cache=True)
@@ -82,8 +86,9 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
     """
     straight = False, 0.0, 0j, 0j
     d, far, near = b - a, abs(a), abs(b)
-    if far <= r or near <= r or abs(d) < TINY:
+    if min(far, near) < r * (1.0 - RIM) or abs(d) < TINY:
         return straight
+    far, near = max(far, r), max(near, r)
     share = min(1.0, max(0.0, -_product(d, a).real / _product(d, d).real))
     cosine = _product(a, b).real / (far * near)
     if abs(a + share * d) <= r or cosine <= TINY - 1.0:
@@ -103,6 +108,12 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
 
 
 @njit(cache=True)
+def _beyond_rim(distance: float, r: float) -> float:
+    """Return a distance from the centre; that of a point on the rim is the radius."""
+    return r if abs(distance - r) <= RIM * r else distance
+
+
+@njit(cache=True)
 def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float, complex, complex]:
     """Return whether it wraps in the plane, its length, and the unit pulls at a and at b.
 
@@ -110,15 +121,17 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
     """
     straight = False, 0.0, 0j, 0j
     d, sided = b - a, abs(side) > 0.5
-    if abs(a) < r or abs(b) < r or abs(d) < TINY:
+    far, near = _beyond_rim(abs(a), r), _beyond_rim(abs(b), r)
+    if far < r or near < r or abs(d) < TINY:
         return straight
     nearest = a + min(1.0, max(0.0, -_product(d, a).real / _product(d, d).real)) * d
-    if abs(nearest) > r and (not sided or _product(side, nearest).real >= 0.0):
+    passes = abs(nearest) > r * (1.0 - RIM) if min(far, near) == r else abs(nearest) > r
+    if passes and (not sided or _product(side, nearest).real >= 0.0):
         return straight
     best, result = -1e9, straight
     for way in (1.0, -1.0):
-        start = cmath.phase(a) + way * math.acos(r / abs(a))
-        end = cmath.phase(b) - way * math.acos(r / abs(b))
+        start = cmath.phase(a) + way * math.acos(r / far)
+        end = cmath.phase(b) - way * math.acos(r / near)
         u, v = cmath.rect(r, start), cmath.rect(r, end)
         good = _product(u + v, side).real / (abs(u + v) + TINY) if sided else -abs(u - v)
         crosses = _meet(a, u, b, v)
@@ -128,7 +141,7 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
             best, arc = good, (way * (end - start)) % (2.0 * math.pi)
             # An arc that rounding made just less than nothing is no turn round the object.
             wraps = not crosses and arc < 2.0 * math.pi - 1e-9
-            length = math.sqrt(abs(a) ** 2 - r * r) + math.sqrt(abs(b) ** 2 - r * r) + r * arc
+            length = math.sqrt(far**2 - r * r) + math.sqrt(near**2 - r * r) + r * arc
             # Where it meets the circle, the wire goes the way it turns.
             result = wraps, length, way * 1j * u / r, -way * 1j * v / r
     return result
@@ -171,6 +184,17 @@ def turned(rotation: Array, vector: Array) -> Vector:
 
 
 @njit(cache=True)
+def side_of(objects: WrapObjects, s: int, rotation: Array, translation: Array) -> Vector:
+    """Return the side of object s from its centre [m], in axes of the root link; NaN for none."""
+    j, k = objects.joint[s], objects.side_joint[s]
+    side = turned(rotation[k], objects.side[s])
+    if j == k:
+        return side
+    centre = plus(turned(rotation[j], objects.centre[s]), translation[j])
+    return plus(plus(side, translation[k]), centre, -1.0)
+
+
+@njit(cache=True)
 def wrapped_segment(
     objects: WrapObjects, s: int, rotation: Array, translation: Array, start: Array, end: Array,
     leave: Array, arrive: Array,
@@ -187,7 +211,7 @@ def wrapped_segment(
         arrive[k] = -leave[k]
     if radius <= 0.0:
         return straight
-    axis, side = turned(rotation[j], objects.axis[s]), turned(rotation[j], objects.side[s])
+    axis, side = turned(rotation[j], objects.axis[s]), side_of(objects, s, rotation, translation)
     centre, sided = turned(rotation[j], objects.centre[s]), not math.isnan(side[0])
     a = plus(plus(start, translation[j], -1.0), centre, -1.0)
     b = plus(plus(end, translation[j], -1.0), centre, -1.0)
@@ -217,7 +241,7 @@ def wrapped_segment(
     return length
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def wrapped_segments(
     objects: WrapObjects, rotation: Array, translation: Array, start: Array, end: Array
 ) -> tuple[Array, Array, Array]:
@@ -246,7 +270,8 @@ def touched(
     if np.linalg.norm(leave + arrive) < 1e-9:
         return np.zeros((0, 3))
     j, radius = objects.joint[s], objects.radius[s]
-    if objects.side[s] @ objects.side[s] < radius**2:
+    side = np.array(side_of(objects, s, rotation, translation))
+    if side @ side < radius**2:
         # A ring: the straight parts meet where the wire touches it.
         parts = np.linalg.lstsq(np.stack([leave, -arrive], axis=1), end - start, rcond=None)[0]
         return (start + parts[0] * leave)[None]

@@ -29,9 +29,8 @@ class Tree(NamedTuple):
     """Pinocchio's joints, joint 0 being the root link, and the bodies that they carry."""
 
     parent: Ints  # (J,)
-    master: Ints  # place in θ of what turns a joint, by q = ratio · θ + offset
-    ratio: Array
-    offset: Array
+    master: Ints  # place in θ of what turns a joint
+    terms: Array  # by q = Σ terms_k θᵏ, (J, K)
     slides: Bools
     #: pose in the parent = placement + sin q · first + (1 − cos q) · second, each (J, 4, 4);
     #: placement + q · first where it slides
@@ -61,6 +60,18 @@ def of(arm: int, vectors: Array) -> Vector:
 
 
 @njit(cache=True)
+def polynomial(terms: Array, order: int, x: float) -> float:
+    """Return the derivative of an order up to 2 of Σ terms_k xᵏ."""
+    value = 0.0
+    for k in range(len(terms) - 1, order - 1, -1):
+        factor = 1.0
+        for i in range(order):
+            factor *= k - i
+        value = value * x + factor * terms[k]
+    return value
+
+
+@njit(cache=True)
 def place(tree: Tree, theta: Array, pose: Array) -> None:
     """Fill the axes and origins of joints in the root link's frame, and vectors of theirs.
 
@@ -73,7 +84,7 @@ def place(tree: Tree, theta: Array, pose: Array) -> None:
     for i in range(1, len(tree.parent)):
         up, own, given = pose[tree.parent[i]], pose[i], theta[tree.master[i]]
         for n in range(arms):
-            angle = tree.ratio[i] * given[n] + tree.offset[i]
+            angle = polynomial(tree.terms[i], 0, given[n])
             sine[n], rest[n] = math.sin(angle), 1.0 - math.cos(angle)
             if tree.slides[i]:
                 sine[n], rest[n] = angle, 0.0
@@ -106,7 +117,10 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
     joints, arms = len(tree.parent), theta.shape[1]
     pose, bend = np.empty((joints, 6, 3, arms)), np.empty((3, arms))
     place(tree, theta, pose)
+    gears = np.empty((joints, arms))  # ∂q/∂θ
     for i in range(joints - 1, 0, -1):
+        for n in range(arms):
+            gears[i, n] = polynomial(tree.terms[i], 1, theta[tree.master[i], n])
         for r in range(3):
             for n in range(arms):
                 pose[tree.parent[i], 5, r, n] += pose[i, 5, r, n]
@@ -120,7 +134,8 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
     for k in range(1, joints):
         origins, axes, moments = pose[k, 3], pose[k, 4], pose[k, 5]
         master, weighs, slides = tree.master[k], tree.carried[k], tree.slides[k]
-        acting = wrench if tree.carries[k] else nothing
+        acting, angles, gear = wrench if tree.carries[k] else nothing, theta[master], gears[k]
+        is_bent = len(tree.terms[k]) > 2
         pushes, twists = acting[:3], acting[3:]
         for n in range(arms):
             at, axis = of(n, origins), of(n, axes)
@@ -133,15 +148,17 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
                 turning = plus(plus(cross(weight, down), cross(arm, push)), twist)
                 bending = cross(down, cross(weight, axis)), cross(push, cross(arm, axis))
                 torque, bent = dot(axis, turning), plus(bending[0], bending[1])
-            load[master, n] -= tree.ratio[k] * torque
+            load[master, n] -= gear[n] * torque
+            if is_bent:
+                gradient[master, master, n] -= polynomial(tree.terms[k], 2, angles[n]) * torque
             for r in range(3):
                 bend[r, n] = bent[r]
         j = k
         while j > 0:
             if not tree.slides[j]:
-                ratio, other, axes = tree.ratio[j] * tree.ratio[k], tree.master[j], pose[j, 4]
+                other, axes, geared = tree.master[j], pose[j, 4], gears[j]
                 for n in range(arms):
-                    slope = ratio * dot(of(n, axes), of(n, bend))
+                    slope = geared[n] * gear[n] * dot(of(n, axes), of(n, bend))
                     gradient[other, master, n] -= slope
                     if j != k:
                         gradient[master, other, n] -= slope
@@ -159,8 +176,7 @@ class Load:
         self.tree = Tree(
             parent=kin.tree.parent,
             master=kin.tree.theta_index,
-            ratio=kin.tree.ratio,
-            offset=kin.tree.offset,
+            terms=kin.tree.terms,
             slides=kin.tree.prismatic,
             placement=kin.tree.placements,
             first=kin.tree.first,

@@ -13,16 +13,22 @@ def main(argv: list[str] | None = None) -> int:
         'import_robot',
         'Makes a robot directory out of a MuJoCo model (MJCF), a cardsflow.xml beside its '
         'model.urdf or model.sdf, or a URDF (a skeleton to fill in). Says what it chose, dropped, '
-        "renamed or approximated, and how far lengths are from the source's own. An OpenSim model "
-        'becomes MJCF by MyoConverter. Exit status 0: the directory loads.',
+        'renamed or approximated, and how far lengths and moment arms are from those of the '
+        "source's own engine. An OpenSim model becomes MJCF by MyoConverter. Exit status 0: the "
+        'directory loads.',
     )
     parser.add_argument('file', type=Path, metavar='FILE', help='the model')
     parser.add_out('DIR', 'new or empty directory')
     for kind in ('joints', 'muscles'):
         text = f'{kind} to keep'
         parser.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=text)
+    text = 'muscles to leave out'
+    parser.add_argument('--without', type=names, default=[], metavar='NAME,…', help=text)
     parser.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
-    text = 'end effector; joints beside the way to it are held'
-    parser.add_argument('--end', metavar='LINK', help=text)
+    text = 'end effector, a link, a site, or LINK_tip: the far end of what is drawn of a link; '
+    text += 'joints beside the way to it are held'
+    parser.add_argument('--end', metavar='NAME', help=text)
+    text = 'play an MJCF file for a second and say how fast; exit status 3: not in real time'
+    parser.add_argument('--play', action='store_true', help=text)
     args = parser.parse_args(argv)
     return exit_status(lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args))

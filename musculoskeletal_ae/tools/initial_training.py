@@ -41,6 +41,7 @@ from musculoskeletal_ae.signals.friction import directions, end_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 UNSEEN = 5000  # states
+SAID_EVERY = 5.0  # [s] between lines of progress where there is no terminal
 ENTERED = {
     Mask.THETA_TENSION: '① (θ, T)',
     Mask.TENSION_LENGTH: '② (T, l)',
@@ -70,11 +71,23 @@ def train(args: Namespace) -> None:
         return
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
+        said, begun = start, 0.0
+        if bar.disable:
+            print(f'training: drawing states of the geometric model, {steps} mini-batches follow')
+            sys.stdout.flush()
 
         def progress(step: int, loss: float, *_: object) -> None:
+            nonlocal said, begun
             bar.update()
             if step % 100 == 0:
                 bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
+            now = time.perf_counter()
+            begun = begun or now
+            if bar.disable and now - said >= SAID_EVERY and step:
+                said, left = now, (steps - step) / step * (now - begun)
+                share = 100.0 * step / steps
+                print(f'training: {share:.0f} %, loss {loss:.4f}, about {left:.0f} s left')
+                sys.stdout.flush()
 
         trained = initial_mae(robot, args.preset, args.seed, progress, steps)
     checkpoint.save(trained.mae, args.out)  # before anything else can go wrong

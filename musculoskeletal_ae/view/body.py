@@ -160,7 +160,7 @@ def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dic
     """
     owner = pieces(robot)
     # As many pieces whether a wire wraps or not: those that it then lacks have no length.
-    drawn = zip(robot.routes.drawn(theta), np.bincount(owner).tolist(), strict=True)
+    drawn = zip(robot.routes.drawn(theta), robot.routes.pieces_drawn.tolist(), strict=True)
     lines = [
         line[np.linspace(0.0, len(line) - 1.0, n + 1).round().astype(int)] for line, n in drawn
     ]

@@ -62,7 +62,7 @@ def test_a_foreign_body_without_effects_is_the_described_body(robot, coupled, im
         theta = model.random_postures(20, np.random.default_rng(0))
         lengths, jacobian = true.absolute_lengths(theta), true.muscle_jacobian(theta)
         np.testing.assert_allclose(lengths, model.routes.absolute_lengths(theta), atol=1e-9)
-        if model.kinematics.tree.transmission is None or model is coupled:
+        if not model.kinematics.tree.is_coupled or model is coupled:
             slopes = model.routes.muscle_jacobian(theta)
             np.testing.assert_allclose(jacobian, slopes, atol=1e-6)
         tension = np.broadcast_to(model.tension.limit, lengths.shape)
@@ -314,15 +314,19 @@ def test_joints_held_by_an_equality_stay_where_import_robot_holds_them(tmp_path,
     np.testing.assert_allclose(arm.individual.absolute_lengths(theta), lengths, atol=1e-6)
 
 
-def test_a_ball_joint_is_refused_with_the_remedy_of_three_hinges(tmp_path):
+def test_a_ball_joint_becomes_the_three_hinges_that_it_is_imported_as(tmp_path):
     file, end = tmp_path / 'own.xml', ' ref="0.2" limited="true"/>'
     first = '<joint name="swing" axis="0 1 0" range="-1 1.2" pos="0 0 0.01"'
     second = '<joint name="lift" axis="1 0.1 0" range="-0.6 0.6" limited="true"/>'
     text = bodies.MJCF.replace(f'{first}{end}', '<joint name="ball" type="ball" range="0 0.6"/>')
     file.write_text(text.replace(second, ''), encoding='utf-8')
     robot = import_robot(file, tmp_path / 'own').robot
-    with pytest.raises(MusculoskeletalError, match=r"'ball' is a ball joint there, .*three"):
-        make_arm(robot, 0, str(file))
+    arm = make_arm(robot, 0, str(file))
+    assert arm.warnings == ()
+    assert robot.joints == ('ball_x', 'ball_y', 'ball_z', 'elbow')
+    theta = robot.random_postures(20, np.random.default_rng(0))
+    lengths = arm.individual.absolute_lengths(theta)
+    np.testing.assert_allclose(lengths, robot.routes.absolute_lengths(theta), atol=1e-9)
 
 
 def test_an_unknown_reality_is_refused_with_the_legal_ones(robot):

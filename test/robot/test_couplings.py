@@ -26,9 +26,12 @@ def coupled_arm(directory, **top):
     return write_muscles(directory, document)
 
 
-@pytest.fixture(scope='module')
-def robot(tmp_path_factory):
-    return Robot.load(coupled_arm(tmp_path_factory.mktemp('coupled'), couplings=[COUPLED]))
+CURVED = {'joint': 'finger', 'master': 'bend', 'polynomial': [0.2, -0.5, 0.1, 0.2, -0.05]}
+
+
+@pytest.fixture(scope='module', params=[COUPLED, CURVED], ids=['line', 'curve'])
+def robot(tmp_path_factory, request):
+    return Robot.load(coupled_arm(tmp_path_factory.mktemp('coupled'), couplings=[request.param]))
 
 
 def energy(robot, theta):
@@ -51,12 +54,25 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         lengths = slopes(robot.routes.absolute_lengths, theta)
         np.testing.assert_allclose(robot.routes.muscle_jacobian(theta), lengths, atol=1e-7)
         inertia = pin.crba(kin.model, kin.data, kin.tree.angles(theta))
-        whole = (
-            kin.tree.transmission.T
-            @ (np.triu(inertia) + np.triu(inertia, 1).T)
-            @ kin.tree.transmission
-        )
+        gear = kin.tree.transmission(theta)
+        whole = gear.T @ (np.triu(inertia) + np.triu(inertia, 1).T) @ gear
         np.testing.assert_allclose(kin.joint_inertia(theta), np.diag(whole))
+
+
+def test_a_motion_over_a_curved_coupling_takes_the_work_that_its_energy_gains(robot):
+    kin, rng = robot.kinematics, np.random.default_rng(1)
+    theta, velocity, acceleration = rng.uniform(-0.5, 0.5, (3, robot.joint_count))
+
+    def total(time):
+        at = theta + velocity * time + 0.5 * acceleration * time**2
+        rate = kin.tree.ratios(at) * (velocity + acceleration * time)[kin.tree.theta_index[1:]]
+        kinetic = pin.computeKineticEnergy(kin.model, kin.data, kin.tree.angles(at), rate)
+        return kinetic + energy(robot, at)
+
+    power = (total(1e-5) - total(-1e-5)) / 2e-5
+    assert kin.inverse_dynamics(theta, velocity, acceleration) @ velocity == pytest.approx(
+        power, 1e-6
+    )
 
 
 def test_a_muscle_at_a_coupled_joint_crosses_its_master(tmp_path):
@@ -89,7 +105,8 @@ def test_the_emulated_joint_follows_its_master(robot):
 MIMIC = '<mimic joint="bend" multiplier="-0.5" offset="0.2"/><axis xyz="0 0 1"/>'
 
 
-def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(robot, tmp_path):
+def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(tmp_path):
+    robot = Robot.load(coupled_arm(tmp_path / 'listed', couplings=[COUPLED]))
     coupled_arm(tmp_path)
     plain = Robot.load(tmp_path)
     assert plain.description.held_joints == ('finger',)
@@ -122,6 +139,8 @@ def test_a_mimic_is_followed_in_a_default_namespace_and_wheels_elsewhere_are_hel
         ([COUPLED, {'joint': 'bend', 'master': 'finger'}], 'follows itself'),
         ([{'joint': 'finger', 'master': 'toe'}], "unknown joint 'toe'"),
         ([{**COUPLED, 'ratio': 'x'}], r'couplings\[0\].ratio: expected float, got str'),
+        ([COUPLED | CURVED], 'expected polynomial, or ratio and offset, got both'),
+        ([{**CURVED, 'polynomial': []}], r'couplings\[0\].polynomial: '),
     ],
 )
 def test_a_wrong_coupling_is_refused(tmp_path, couplings, expected):

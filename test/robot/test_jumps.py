@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wires that slip to the other side of what they wrap round: found, and in no individual."""
 
+import re
+
 import numpy as np
 import pytest
 from robots import DRUM_ENDS, behind_a_drum
@@ -9,7 +11,7 @@ from musculoskeletal_ae.emulator import foreign, individual
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.robot.checks import check_robot
-from musculoskeletal_ae.robot.jumps import JUMP, jumps
+from musculoskeletal_ae.robot.jumps import JUMP, jump_choices, jumps
 
 
 def jumping(lengths, robot):
@@ -31,6 +33,17 @@ def test_check_robot_warns_of_a_muscle_whose_length_jumps(tmp_path):
     assert warning.kind == 'jumping_muscle'
     assert "'straightener' jumps by 17" in warning.message
     assert warning.message.endswith('wraps round, at bend -1.57')
+
+
+def test_the_choices_that_a_jumping_length_leaves_are_named(tmp_path):
+    robot = behind_a_drum(tmp_path, DRUM_ENDS['jumps'])
+    jumps_at, limit, choices = jump_choices(robot)
+    assert jumps_at == 'jumps: muscle straightener by up to 173 mm, at bend -1.57 to -1.57'
+    assert '(--without straightener), or accept' in choices
+    joint, low, high = re.search(r'limiting (\w+) to \[(.*), (.*)\] rad avoids it', limit).groups()
+    j = robot.joints.index(joint)
+    robot.lower[j], robot.upper[j] = float(low), float(high)
+    assert jump_choices(robot) == []
 
 
 @pytest.mark.parametrize(

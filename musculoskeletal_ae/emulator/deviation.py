@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How an individual deviates from the MJCF file that it is played from.
+
+A file says what a body should be; nobody builds exactly that. A seed draws what is different:
+
+    attachment points    σ = 10 % of the muscle's typical moment arm, at most 5 mm, each coordinate
+    slack                σ = 5 % of the same, at most 2 mm, of each tendon's length
+    elastic elements     up to 20 % stiffer or softer
+    tendon friction      15 to 20 % of the tension along the route, where the file has none
+    joint friction       1.1 to 1.5 % of the joint's largest load by weight and muscles at T_bias
+    masses               σ = 10 % of the mass of each body, with its inertia
+    tension sensors      σ = 2 % of the gain, 1 % of T_limit of the zero
+    joint sensors        σ = 1° of the zero
+
+The typical moment arm is the root mean square over the workspace, so that a finger deviates as much
+as a shoulder does. Without a seed the file is played as it is.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
+from musculoskeletal_ae.robot.robot import Robot
+
+ATTACHMENT, FARTHEST = 0.1, 0.005  # share of the typical moment arm; [m]
+SLACK, LONGEST = 0.05, 0.002  # share of the typical moment arm; [m]
+MASS = 0.1  # σ of the logarithm
+ZERO = 0.01  # of tension sensors, share of T_limit
+POSTURES = 200  # over which moment arms are typical
+
+
+def effects(robot: Robot) -> Effects:
+    """Return what sensors, springs and friction deviate by."""
+    return replace(
+        NONE,
+        stiffness=0.2,
+        guide_friction=0.2,
+        joint_friction=0.015,
+        tension_gain=0.02,
+        tension_zero=ZERO * float(np.median(robot.tension.limit)),
+        joint_zero=np.radians(1.0),
+    )
+
+
+def typical_arms(robot: Robot) -> Array:
+    """Return the root mean square moment arm of each muscle over the workspace [m], (M,)."""
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
+    arms = robot.routes.muscle_jacobian(theta) * robot.kinematics.radian
+    crossed = np.maximum(robot.routes.crossed.sum(axis=1), 1)
+    result: Array = np.sqrt((arms**2).sum(axis=2).mean(axis=0) / crossed)
+    return result
+
+
+def slack(robot: Robot, draw: Draw) -> Array:
+    """Return by how much each length sensor reads too much at the start [m], (M,)."""
+    sigma = np.minimum(SLACK * typical_arms(robot), LONGEST)
+    return sigma * draw.rng('slack').normal(size=len(sigma))
+
+
+class Attachments:
+    """Moves the sites of a model's tendons, and moves those of some muscles anew."""
+
+    def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
+        """Look at a model whose tendons have the names of the robot's muscles."""
+        self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
+        sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
+        self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]
+        #: of each site, the least of the muscles that pass it [m]
+        self._sigma = np.zeros(model.nsite)
+        for own, most in zip(self._sites, sigma.tolist()):
+            free = self._sigma[own] == 0.0
+            self._sigma[own] = np.where(free, most, np.minimum(self._sigma[own], most))
+        self.move(np.ones(len(self._sites), dtype=bool))
+
+    def move(self, muscles: Bools) -> None:
+        """Draw where the sites of some muscles (M,) are; none gets into what it wraps round."""
+        own = [self._sites[m] for m in np.flatnonzero(muscles)]
+        for s in np.unique(np.concatenate(own)).tolist():
+            shift = self._sigma[s] * self._rng.normal(size=3)
+            self._model.site_pos[s] = self._rest[s] + shift
+            if _is_inside(self._model, s):
+                self._model.site_pos[s] = self._rest[s]
+
+
+def _sites(model: Any, tendon: int) -> Array:
+    path = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+    of_sites = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
+    sites: Array = model.wrap_objid[path][of_sites]
+    return sites
+
+
+def _is_inside(model: Any, site: int) -> bool:
+    """Return whether a site lies in or on something of its own body that a tendon wraps round."""
+    kinds = mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER
+    for w in np.flatnonzero(np.isin(model.wrap_type, kinds)).tolist():
+        geom = model.wrap_objid[w]
+        if model.geom_bodyid[geom] != model.site_bodyid[site]:
+            continue
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+        away = turn.reshape(3, 3).T @ (model.site_pos[site] - model.geom_pos[geom])
+        if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_CYLINDER:
+            away[2] = 0.0
+        if np.linalg.norm(away) < 1.001 * model.geom_size[geom][0]:
+            return True
+    return False
+
+
+def change_masses(model: Any, draw: Draw) -> None:
+    """Make each body of a model heavier or lighter."""
+    factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
+    model.body_mass[:] *= factor
+    model.body_inertia[:] *= factor[:, None]
+    mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A learned body as an MJCF model, and how far it is from the network that it was made from.
+
+Links, joints, limits and masses are those of the robot directory; attachment points are as
+learned, by `fit`. An actuator of each tendon is the muscle's series elastic element in series with
+its motor, whose length is the control:
+
+    pull = k (L − u),   0 ≤ pull ≤ T_max,   k = dT/dx at T_mid = (T_bias + T_limit) / 2
+
+L is the tendon's length, u = l + offset for the motor's length l of this package. Tendon friction
+is a constant force of MuJoCo's, μ T_mid, and not the share of the tension that it really is.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.emulator import mjcf
+from musculoskeletal_ae.emulator.effects import NONE, Draw
+from musculoskeletal_ae.emulator.modules import joint_gear
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exporting.fit import FittedBody, fit
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.description import Route, RoutePoint
+from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES = 1000  # in which the model and the network are compared
+DAMPING = 0.05  # [N·m·s/rad] of a joint, or times joint_gear; chosen, so that it can be simulated
+THIN = 0.008  # [m] radius of the capsules that draw bones
+TIMESTEP = 0.002  # [s]
+LEGEND = """\
+length      root mean square difference of lengths, their mean apart
+moment arm  the same of dl/dq, over all joints, beside its size
+spring      largest error of the linear spring between T_bias and T_limit
+offset      control = l + offset, where l is the length in muscle_states
+Gravity torques of the network are those of the robot directory: masses are not learned.
+The model does not hold: what is left of lengths and moment arms (above), the bend of the springs,
+friction as a share of the tension, creep, sensor errors, heat.
+"""
+
+
+class Report(NamedTuple):
+    """How far an exported model is from the network, over the workspace."""
+
+    lengths: Array  # root mean square error of each muscle at T_mid, its mean apart [m], (M,)
+    arms: Array  # root mean square error of each muscle's moment arms [m], (M,)
+    arm_size: Array  # root mean square of the network's moment arms [m], (M,)
+    torque: Array  # largest difference of the torque that holds the weight [N·m], (D,)
+    stretch: Array  # largest error of the linear spring within [T_bias, T_limit] [m], (M,)
+    warnings: tuple[str, ...]  # of MuJoCo when it loads the model
+    mjx: str  # what MJX makes of it
+
+    def text(self, robot: Robot, offsets: Array) -> str:
+        """Return the report for people."""
+        counts = f'{robot.joint_count} joints, {robot.muscle_count} muscles, {POSTURES} postures'
+        units = f'{"":<28}{"[mm]":>10}{"[mm]":>12}{"[mm]":>8}{"[mm]":>9}{"[m]":>11}'
+        head = f'{"muscle":<28}{"length":>10}{"moment arm":>12}{"of":>8}{"spring":>9}{"offset":>11}'
+        lines = [f'{counts}, at T_mid = (T_bias + T_limit) / 2', '', head, units]
+        rows = zip(robot.muscles, self.lengths, self.arms, self.arm_size, self.stretch, offsets)
+        for name, length, arm, size, stretch, offset in rows:
+            numbers = f'{1e3 * length:>10.2f}{1e3 * arm:>12.2f}{1e3 * size:>8.1f}'
+            lines.append(f'{name:<28}{numbers}{1e3 * stretch:>9.2f}{offset:>11.5f}')
+        torques = ', '.join(
+            f'{name} {value:.2g} {unit.torque}'
+            for name, value, unit in zip(robot.joints, self.torque, robot.units)
+        )
+        warned = '; '.join(self.warnings) or 'of nothing'
+        lines += ['', f'gravity torque, largest difference: {torques}']
+        lines += [f'MuJoCo warns: {warned}', f'MJX {self.mjx}', '', LEGEND]
+        return '\n'.join(lines)
+
+
+def loads_in_mjx(model: Any) -> str:
+    """Say whether MJX takes a model."""
+    try:
+        from mujoco import mjx
+    except ImportError:
+        return 'was not asked: mujoco-mjx is not installed'
+    try:
+        mjx.put_model(model)
+    except Exception as error:  # noqa: BLE001 - mjx names what it lacks by errors of many kinds
+        return f'does not take it: {" ".join(str(error).split())}'
+    return 'takes it'
+
+
+def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
+    """Write `model.xml` and `report.txt` of a learned body into a new or empty directory.
+
+    Raises:
+        MusculoskeletalError: If the directory is in use, or MuJoCo does not load the model.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise MusculoskeletalError(f'{out}: expected a new or empty directory')
+    fitted = fit(robot, mae, seed)
+    moved = Robot(replace(robot.description, routes=_moved(robot, fitted.shift)))
+    springs = _springs(fitted)
+    spec = _spec(moved, mae, springs)
+    try:
+        spec.compile()
+        text = spec.to_xml()
+    except (ValueError, mujoco.FatalError) as error:
+        told = f'MuJoCo does not take the exported model: {" ".join(str(error).split())}'
+        raise MusculoskeletalError(f'{out}: {told}') from error
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / 'model.xml'
+    file.write_text(text, encoding='utf-8')
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    finally:
+        mujoco.set_mju_user_warning(lambda _: None)
+    report, offsets = _compare(robot, mae, model, springs, tuple(warnings))
+    text = report.text(robot, offsets)
+    (out / 'report.txt').write_text(text, encoding='utf-8')
+    return report
+
+
+class Springs(NamedTuple):
+    """Linear springs of M muscles, each (M,)."""
+
+    tension: Array  # T_mid [N]
+    elongation: Array  # there [m]
+    stiffness: Array  # [N/m]
+    error: Array  # the largest between T_bias and T_limit [m]
+
+
+def _springs(fitted: FittedBody) -> Springs:
+    body, robot = fitted.body, fitted.body.robot
+    low, high, at_zero = robot.tension.bias, robot.tension.limit, robot.routes.length_at_zero
+    mid = 0.5 * (low + high)
+    rows = []
+    for m in range(robot.muscle_count):
+        law = body.elastic(m)
+        tension = np.linspace(low[m], high[m], 50)
+        elongation = law.elongation(np.full(50, at_zero[m]), tension)
+        middle = float(law.elongation(at_zero[m], mid[m]))
+        stiffness = 1.0 / float(law.compliance(at_zero[m], mid[m]))
+        error = float(np.abs(middle + (tension - mid[m]) / stiffness - elongation).max())
+        rows.append((mid[m], middle, stiffness, error))
+    return Springs(*map(np.array, zip(*rows, strict=True)))
+
+
+def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
+    """Return the routes with points moved in the frames of their joints by (P, 3) [m]."""
+    left = iter(shift)
+
+    def item(part: Any) -> Any:
+        if not isinstance(part, RoutePoint):
+            return part
+        _, at = robot.kinematics.placement(part.link)
+        return part._replace(xyz=part.xyz + at.rotation.T @ next(left))
+
+    return tuple(tuple(item(part) for part in route) for route in robot.description.routes)
+
+
+def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
+    """Return the model of a robot whose route points are as learned."""
+    exact, once = Draw(0, NONE), np.zeros(robot.muscle_count, dtype=np.int64)
+    spec, bodies = mjcf.skeleton(robot, exact)
+    mjcf.add_routes(robot, exact, once, spec, bodies)
+    spec.modelname = robot.description.directory.name
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    kin, gear = robot.kinematics, joint_gear(robot.kinematics)
+    for i in range(1, kin.model.njoints):
+        joint = spec.joint(kin.model.names[i])
+        joint.damping, joint.armature = [float(gear[i]) * DAMPING, 0.0, 0.0], 0.0
+        bodies[i].name = f'{kin.model.names[i]} link'
+        reach = kin.tree.placement_translation[kin.tree.parent == i]
+        for end in reach[np.linalg.norm(reach, axis=1) > SHORTEST_BONE]:
+            _bone(bodies[i], end)
+    carrier, at = kin.placement(robot.description.end_effector)
+    bodies[carrier].add_site(name='hand', pos=at.translation, quat=_quaternion(at))
+    if np.linalg.norm(at.translation) > SHORTEST_BONE:
+        _bone(bodies[carrier], at.translation)
+    friction, most = np.abs(mae.friction) * springs.tension, robot.tension.max
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
+    lengths = robot.routes.absolute_lengths(theta)
+    for m, name in enumerate(robot.muscles):
+        spec.tendon(name).frictionloss = float(friction[m])
+        k = float(springs.stiffness[m])
+        gain, bias = np.zeros(10), np.zeros(10)
+        gain[0], bias[1] = k, -k  # force = k (u − L), which shortens where it is negative
+        reach = float(most[m]) / k
+        span = [float(lengths[:, m].min()) - reach, float(lengths[:, m].max()) + reach]
+        spec.add_actuator(
+            name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            gainprm=gain, biasprm=bias, ctrllimited=True, ctrlrange=span,
+            forcelimited=True, forcerange=[-float(most[m]), 0.0],
+        )  # fmt: skip
+    return spec
+
+
+def _bone(body: Any, end: Array) -> None:
+    free = {'contype': 0, 'conaffinity': 0, 'mass': 0.0, 'group': 1}
+    kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+    body.add_geom(type=kind, fromto=[0.0, 0.0, 0.0, *end], size=[THIN, 0.0, 0.0], **free)
+
+
+def _quaternion(at: pin.SE3) -> Array:
+    coefficients: Array = pin.Quaternion(at.rotation).coeffs()
+    return np.roll(coefficients, 1)
+
+
+def _compare(
+    robot: Robot, mae: Mae, model: Any, springs: Springs, warnings: tuple[str, ...]
+) -> tuple[Report, Array]:
+    """Compare a model with the network; return the report and the offsets of the controls [m]."""
+    theta = robot.random_postures(POSTURES, np.random.default_rng([1, 0xE2]))
+    tension = np.broadcast_to(springs.tension, (POSTURES, robot.muscle_count))
+    lengths, jacobian = mae.lengths(theta, tension), mae.muscle_jacobian(theta, tension)
+    state, data, kin = _posture(robot, model), mujoco.MjData(model), robot.kinematics
+    names = kin.model.names[1:]
+    tree = np.array([model.joint(name).dofadr[0] for name in names])
+    tendons = np.array([model.tendon(name).id for name in robot.muscles])
+    theirs, arms, torques = np.empty_like(lengths), np.empty_like(jacobian), np.empty_like(theta)
+    dense = np.zeros((model.ntendon, model.nv))
+    rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
+    for n, row in enumerate(theta):
+        state(data, row)
+        theirs[n] = data.ten_length[tendons]
+        mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
+        arms[n] = kin.tree.of_theta(dense[tendons][:, tree], row)
+        torques[n] = kin.tree.of_theta(data.qfrc_bias[tree], row)
+    # What the spring adds at T_mid is a constant.
+    off = theirs - springs.elongation - lengths
+    return Report(
+        lengths=off.std(axis=0),
+        arms=np.sqrt(((arms - jacobian) ** 2).sum(axis=2).mean(axis=0)),
+        arm_size=np.sqrt((jacobian**2).sum(axis=2).mean(axis=0)),
+        torque=np.abs(torques - kin.holding_torque(theta)).max(axis=0),
+        stretch=springs.error,
+        warnings=warnings,
+        mjx=loads_in_mjx(model),
+    ), off.mean(axis=0) + springs.elongation - springs.tension / springs.stiffness
+
+
+def _posture(robot: Robot, model: Any) -> Callable[[Any, Array], None]:
+    places = np.array([model.joint(name).qposadr[0] for name in robot.kinematics.model.names[1:]])
+
+    def put(data: Any, theta: Array) -> None:
+        data.qpos[places], data.qvel[:] = robot.kinematics.tree.angles(theta), 0.0
+        mujoco.mj_forward(model, data)
+
+    return put

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`export_mjcf`: writes a learned body as a MuJoCo model."""
+
+from argparse import Namespace
+from pathlib import Path
+
+from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.stop_signals import import_heavy
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Export one checkpoint; exit status 0 if the model was written and loads."""
+    parser = Parser(
+        'export_mjcf',
+        'Writes the body that a checkpoint has learned as an MJCF model: links, joints, limits and '
+        'masses of the robot, attachment points, springs and friction as learned. A report says '
+        'how far its lengths, moment arms and gravity torques are from those of the network.',
+    )
+    parser.add_argument('checkpoint', type=Path, metavar='CHECKPOINT', help='.safetensors file')
+    parser.add_robot(default=None)
+    parser.add_out('DIR', 'new or empty directory, for model.xml and report.txt')
+    args = parser.parse_args(argv)
+    return exit_status(lambda: _run(args))
+
+
+def _run(args: Namespace) -> int:
+    checkpoint = import_heavy('musculoskeletal_ae.mae.checkpoint')
+    exporting = import_heavy('musculoskeletal_ae.exporting.mjcf')
+    robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(args.robot)
+    exporting.export(robot, checkpoint.load(args.checkpoint, robot), args.out)
+    print((args.out / 'report.txt').read_text(encoding='utf-8'), end='')
+    print(f'model: {args.out / "model.xml"}')
+    return 0
