@@ -41,7 +41,7 @@ def imported(tmp_path_factory):
     folder = tmp_path_factory.mktemp('imported')
     file = folder / 'own.xml'
     file.write_text(bodies.MJCF, encoding='utf-8')
-    return file, import_robot(file, folder / 'own').robot
+    return file, import_robot(file, folder / 'own', end='finger').robot
 
 
 def drive(arm, seconds=0.3, tension=80.0):
