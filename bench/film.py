@@ -30,6 +30,7 @@ from threading import Thread
 from PIL import Image
 
 from bench.processes import end_processes
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser, whole
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -122,6 +123,8 @@ def main(argv: list[str]) -> int:
                 print(line, end='')
                 if ' s  error ' in line:
                     break
+            else:
+                raise MusculoskeletalError('bringup.sh ended before its first status line')
             # A pipe that nobody reads would stop the status line.
             Thread(target=system.communicate, daemon=True).start()
             frames, kept = record(options, Path(folder))
