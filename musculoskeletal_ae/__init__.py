@@ -5,9 +5,9 @@ import os
 
 from musculoskeletal_ae.pinocchio_wheel import prefer_wheel
 
-# Read when numpy is first imported. Matrices as small as a network's layers gain nothing from a
-# second BLAS thread, and lose much where another process has the core.
+# NumPy reads this variable on its first import. A second BLAS thread does not speed up products as
+# small as a network's layers, and slows them down if another process occupies the core.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-# Before any module of this package imports pinocchio.
+# This must happen before any module of this package imports pinocchio.
 prefer_wheel()

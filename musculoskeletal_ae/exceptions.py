@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of this package: one base, so that a caller can catch all of them."""
+"""The errors of this package, with a common base class."""
 
 import io
 import sys
@@ -9,52 +9,55 @@ LONGEST_TEXT = 4000
 
 
 def printable(text: object) -> str:
-    """Return a text that can do nothing to a terminal: what is not printable is escaped."""
+    """Return a text with non-printable characters escaped, at most LONGEST_TEXT of its characters.
+
+    Texts from files and messages could otherwise control the user's terminal.
+    """
     shown = str(text)[:LONGEST_TEXT]
     return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in shown)
 
 
 def replace_unprintable() -> None:
-    """Let what the terminal's encoding lacks, such as θ in ISO-8859-1, be replaced by "?"."""
+    """Print "?" for characters that the terminal's encoding lacks, such as θ in ISO-8859-1."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors='replace')
 
 
 class MusculoskeletalError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base class of every error that this package raises on purpose."""
 
-    reason = 'cannot be used'  # in a few words, what a rejected message is counted under
+    reason = 'cannot be used'  # short text under which rejected messages are counted
 
     def __str__(self) -> str:
         return printable(super().__str__())
 
 
 class RobotDescriptionError(MusculoskeletalError):
-    """A robot directory that cannot be used; names the file, the entry and what is legal."""
+    """A robot directory cannot be used; the text names the file, the entry and the legal values."""
 
 
 class CheckpointError(MusculoskeletalError):
-    """A checkpoint that is damaged or does not fit the robot."""
+    """A checkpoint is damaged or does not fit the robot."""
 
     reason = 'unfit checkpoint'
 
 
 class GateError(CheckpointError):
-    """A checkpoint that does not explain the arm; the one in use stays.
+    """A checkpoint failed checkpoint validation, and the current one stays in use.
 
-    `estimation/checkpoint_validation.py` has the rules.
+    `estimation/checkpoint_validation.py` defines the validation.
     """
 
     reason = 'does not explain the arm'
 
 
 class InfeasibleError(MusculoskeletalError):
-    """No muscle tension within its limits does what was asked."""
+    """No muscle tensions within the limits achieve the request."""
 
 
 class MessageError(MusculoskeletalError):
-    """A received message that breaks a rule of validity."""
+    """A received message is invalid; `reason` is the short text under which it is counted."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f'{reason}: {detail}')
@@ -62,7 +65,7 @@ class MessageError(MusculoskeletalError):
 
 
 class BagError(MusculoskeletalError):
-    """A recording that is damaged, or not what it says it is."""
+    """A recording is damaged or has an unexpected format."""
 
     def __init__(self, file: Path, problem: str, remedy: str) -> None:
         super().__init__(f'{file}: {problem}; {remedy}')
@@ -70,4 +73,4 @@ class BagError(MusculoskeletalError):
 
 
 class StateError(MusculoskeletalError):
-    """What a learner keeps on disk cannot be used or written."""
+    """The learner's state on disk cannot be used or written."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executables, one function each: setup.py lists them as console scripts.
+"""The executables, one function each; setup.py lists them as console scripts.
 
-This module imports nothing heavy, so that `--help` answers at once, and signals are handled before
-torch and rclpy are loaded. On Ctrl-C and SIGTERM a node ends with status 0. A tool ends with 130,
-but `record` and `replay`, whose ordinary end that is, with 0. None of them shows a traceback.
+This module imports nothing heavy. Hence `--help` answers at once, and signals are handled before
+torch and rclpy are loaded. On Ctrl-C or SIGTERM, nodes exit with status 0 and tools with 130.
+`record` and `replay` exit with 0, because Ctrl-C is how a user normally ends them. No executable
+prints a traceback.
 """
 
 import ast
@@ -20,9 +21,9 @@ from musculoskeletal_ae.stop_signals import INTERRUPTED, STOP, Reaction
 
 
 def _prepare_process() -> None:
-    """Make a native crash print where it happened, and let MuJoCo load no graphics library.
+    """Print a stack trace on a native crash, and keep MuJoCo from loading a graphics library.
 
-    With glfw, importing MuJoCo would start processes that look for a display.
+    Importing MuJoCo with glfw would start processes that look for a display.
     """
     replace_unprintable()
     os.environ.setdefault('MUJOCO_GL', 'disable')
@@ -31,7 +32,7 @@ def _prepare_process() -> None:
 
 
 def _run_node(name: str) -> int:
-    """Run a node, or several in one process; return the exit status."""
+    """Run one node, or several in one process, and return the exit status."""
     _prepare_process()
     STOP.install(Reaction.EXIT, exit_status=0)
     if {'--help', '-h'} & set(sys.argv[1:]):
@@ -46,10 +47,10 @@ def _run_node(name: str) -> int:
 
 
 def _end_process(status: int) -> None:
-    """End a process whose nodes, ROS context and child processes have ended already.
+    """Exit at once; nodes, ROS context and child processes must have ended already.
 
-    Python would first collect as garbage all that torch, numba and pinocchio have made. On a busy
-    machine that takes up to ten seconds, and whoever waits for the end takes the node to hang.
+    An ordinary exit would first garbage-collect the objects of torch, numba and pinocchio. On a
+    busy machine that takes up to ten seconds, during which the node appears to hang.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -57,7 +58,7 @@ def _end_process(status: int) -> None:
 
 
 def _node_help(name: str) -> str:
-    """Return the docstrings of the nodes, read without importing them, and their parameters."""
+    """Return the docstrings and parameters of the nodes without importing the nodes."""
     from musculoskeletal_ae.nodes.parameters import COMBINED, help_text
 
     parts = []
@@ -68,7 +69,7 @@ def _node_help(name: str) -> str:
 
 
 def _run_tool(module: str) -> int:
-    """Run the `main` of a tool; return the exit status."""
+    """Run the `main` function of a tool and return its exit status."""
     _prepare_process()
     STOP.install(Reaction.EXIT)
     main = import_module(f'musculoskeletal_ae.{module}').main

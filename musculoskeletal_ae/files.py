@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading files that a user names, and writing files whole.
+"""Read files that a user names, and write files atomically.
 
-Only regular files are read, and no more of them than a limit. All functions that read take
-`refuse`, which makes the error that they raise of a file and what is wrong with it.
+Only regular files up to a size limit are read. The argument `refuse(file, problem)` of every
+reading function returns the exception to raise.
 """
 
 import csv
@@ -19,20 +19,23 @@ import yaml
 T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
-LARGEST = 5_000_000  # [bytes] of a text
-LARGEST_YAML = 1 << 19  # [bytes]; it is slow to read
-LARGEST_CSV = 1 << 20  # [bytes]; each cell takes fifty
-MOST_ENTRIES = 100_000  # in a YAML file, what aliases stand for included
-DEEPEST = 50  # levels of a YAML file
+LARGEST = 5_000_000  # size limit of any file [bytes]
+LARGEST_YAML = 1 << 19  # [bytes]; parsing YAML is slow
+LARGEST_CSV = 1 << 20  # [bytes]; each cell takes fifty bytes of memory
+MOST_ENTRIES = 100_000  # entries of a YAML file after aliases are expanded
+DEEPEST = 50  # nesting levels of a YAML file
 
 _Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
-    """Open a regular file for reading: a pipe would block, and a device may never end."""
+    """Open a regular file for reading.
+
+    Other files are refused, because reading a pipe could block and a device may never end.
+    """
     try:
         if file.exists() and not file.is_file():
-            raise refuse(file, 'cannot be read: it is no regular file')
+            raise refuse(file, 'cannot be read: it is not a regular file')
         return file.open('rb')
     except OSError as error:
         raise refuse(file, f'cannot be read: {error.strerror}') from error
@@ -55,13 +58,14 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
     """Return the text of a UTF-8 file of at most `largest` bytes."""
     try:
-        return read_bytes(file, refuse, largest).decode('utf-8-sig')  # tables of Windows
+        # Windows programs put a byte-order mark before tables; 'utf-8-sig' removes it.
+        return read_bytes(file, refuse, largest).decode('utf-8-sig')
     except UnicodeDecodeError as error:
-        raise refuse(file, f'is not text in UTF-8 (byte {error.start})') from error
+        raise refuse(file, f'is not UTF-8 text (byte {error.start})') from error
 
 
 def read_yaml(file: Path, refuse: Refuse) -> Any:
-    """Return what a YAML file holds, by `parse_yaml`."""
+    """Return the content of a YAML file, parsed and checked by `parse_yaml`."""
     text = read_text(file, refuse, LARGEST_YAML)
     try:
         return parse_yaml(text)
@@ -72,60 +76,63 @@ def read_yaml(file: Path, refuse: Refuse) -> Any:
 def read_csv(
     file: Path, columns: Sequence[str], refuse: Refuse
 ) -> list[tuple[int, str, list[str]]]:
-    """Return (line number, line, cells) below a table's head, but of lines that begin with #."""
+    """Return (line number, line, cells) of each row below the header of a CSV table.
+
+    Empty lines and lines that begin with # are skipped.
+    """
     rows = []
     for number, line in enumerate(read_text(file, refuse, LARGEST_CSV).splitlines(), 1):
         if line.strip() and not line.startswith('#'):
             try:
                 cells = next(csv.reader([line]))
             except csv.Error as error:
-                raise refuse(file, f'line {number}: no line of a table: {error}') from error
+                raise refuse(file, f'line {number}: not valid CSV: {error}') from error
             rows.append((number, line, [cell.strip() for cell in cells]))
     if not rows or rows[0][2] != list(columns):
-        head = repr(rows[0][1][:80]) if rows else 'nothing'
-        raise refuse(file, f'expected the columns {",".join(columns)}, got {head}')
+        header = repr(rows[0][1][:80]) if rows else 'nothing'
+        raise refuse(file, f'expected the columns {",".join(columns)}, got {header}')
     return rows[1:]
 
 
 def read_table(code: str, name: str, kind: type[T]) -> T:
-    """Return the table of a YAML file that is beside the code that uses it."""
+    """Return the content of a YAML file that lies beside the Python file `code`."""
     return msgspec.yaml.decode(Path(code).with_name(name).read_bytes(), type=kind)
 
 
 def parse_yaml(text: str) -> Any:
-    """Return what one YAML document holds: strings, numbers, lists, mappings, dates.
+    """Return the content of one YAML document: strings, numbers, lists, mappings, dates.
 
     Raises:
-        ValueError: If it is not YAML, writes a key twice, or is larger or deeper than the limits
-            above once its aliases are replaced by what they stand for.
+        ValueError: If it is not valid YAML, repeats a key, or exceeds MOST_ENTRIES or DEEPEST
+            after aliases are expanded.
     """
     try:
         _check(text)
         return yaml.load(text, Loader=_Loader)  # noqa: S506 - a safe loader
-    # PyYAML lets TypeError, OverflowError and others out of dates and numbers that are none.
+    # PyYAML raises TypeError, OverflowError and others for malformed dates and numbers.
     except Exception as error:
         raise ValueError(' '.join(str(error).split())[:300] or type(error).__name__) from error
 
 
 @dataclass
 class _Collection:
-    """A list or mapping that is being read."""
+    """A list or mapping whose end has not been reached yet."""
 
     anchor: str
-    first: int  # entries of the text before it
+    first: int  # number of entries before it
     is_mapping: bool
     keys: set[str] = field(default_factory=set)
-    at_key: bool = True  # a key comes next
+    at_key: bool = True  # whether the next entry is a key
 
 
 def _check(text: str) -> None:
-    """Read the events of a YAML text, which builds nothing.
+    """Check a YAML text by its parser events, without building any object.
 
-    The loader would end the process where levels are too deep, take all memory where merge keys
-    multiply, and keep the last of two values of one key.
+    The loader alone is not safe: deep nesting crashes the process, nested merge keys exhaust the
+    memory, and of a repeated key it silently keeps the last value.
     """
     count = 0
-    sizes: dict[str, int] = {}  # entries that each alias stands for
+    sizes: dict[str, int] = {}  # entries that each anchor holds
     within: list[_Collection] = []
     for event in yaml.parse(text, Loader=_Loader):
         where = f'line {event.start_mark.line + 1 if event.start_mark else 0}'
@@ -144,33 +151,33 @@ def _check(text: str) -> None:
             mapping.at_key = not mapping.at_key
         if isinstance(event, yaml.AliasEvent):
             if anchor not in sizes:
-                raise ValueError(f'{where}: *{anchor[:60]} stands for nothing before it')
+                raise ValueError(f'{where}: alias *{anchor[:60]} has no anchor before it')
             count += sizes[anchor]
         else:
             count += 1
             sizes[anchor] = 1
         if isinstance(event, yaml.CollectionStartEvent):
-            del sizes[anchor]  # it cannot stand for itself
+            del sizes[anchor]  # an alias inside the collection must not refer to it
             is_mapping = isinstance(event, yaml.MappingStartEvent)
             within.append(_Collection(anchor, count - 1, is_mapping))
         if count > MOST_ENTRIES:
-            raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases included')
+            raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases expanded')
         if len(within) > DEEPEST:
-            raise ValueError(f'{where}: more than {DEEPEST} levels')
+            raise ValueError(f'{where}: nested more than {DEEPEST} levels')
 
 
 def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
-    """Write a file so that a reader sees the old one or the new one, never a part.
+    """Write a file atomically: a reader sees the old content or the new content, never a part.
 
-    The old one is kept as `previous`, where that is given. Between the two renames there is only
-    that one.
+    If `previous` is set, the old file is first renamed to it. For a moment between the two renames,
+    only `previous` exists.
     """
     descriptor, temporary = tempfile.mkstemp(dir=file.parent, prefix=f'.{file.name}.')
     try:
         with os.fdopen(descriptor, 'wb') as stream:
             stream.write(data)
             stream.flush()
-            os.fchmod(stream.fileno(), 0o644)  # mkstemp makes it private
+            os.fchmod(stream.fileno(), 0o644)  # mkstemp creates a file only its owner can read
             os.fsync(stream.fileno())
         if previous is not None and file.exists():
             file.replace(previous)
@@ -178,7 +185,7 @@ def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
-    # The new name survives a power cut only once the directory is on disk too.
+    # The new name survives a power failure only after the directory is on disk too.
     directory = os.open(file.parent, os.O_RDONLY)
     try:
         os.fsync(directory)

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust Gauss–Newton with a prior; unknowns that belong to one sample each are eliminated.
+"""Robust Gauss–Newton fit with a prior, which eliminates the unknowns of individual samples.
 
     min over w, θ_1 … θ_N of   Σ_nr ω_nr ρ_nr(θ_n, w)² / σ_r²  +  Σ_k ((w_k − w̄_k) / s_k)²
 
-w are the unknowns that all samples share (P of them), as the parameters of a body. θ_n are those of
-sample n alone (D of them), as the posture in which it was taken. With D = 0 this is an ordinary
-robust fit.
+w are the P unknowns that all samples share, such as the parameters of a body. θ_n are the D
+unknowns of sample n alone, such as the posture in which it was taken. With D = 0 this is an
+ordinary robust fit.
 
-Weights. The residuals ρ have a Student distribution with ν = `FREEDOM` degrees of freedom, so that
-outliers count little. Weights and noise come from the EM algorithm (Lange, Little and Taylor 1989,
-"Robust statistical modeling using the t distribution"), with a weak prior at the least noise σ₀:
+Weights. The residuals ρ have a Student distribution with ν = `FREEDOM` degrees of freedom, which
+gives outliers little weight. Weights and noise come from the EM algorithm (Lange, Little and Taylor
+1989, "Robust statistical modeling using the t distribution"), with a weak prior at the lowest noise
+σ₀:
 
     ω = (ν + 1) / (ν + (ρ/σ)²)
     σ² = (Σ ω ρ² + 4 σ₀²) / (f + 4),   f = number of residuals − number of unknowns they determine
 
-Step. With the weights as they are, a step (Δθ, Δw) solves the normal equations. A has one block
-for each sample, so that θ is eliminated and what remains has the size of w (Schur complement):
+Step. With the weights fixed, a step (Δθ, Δw) solves the normal equations. A has one block for each
+sample. Eliminating θ therefore leaves a system of the size of w (Schur complement):
 
     ⎡ A   B ⎤ ⎡ Δθ ⎤   ⎡ a ⎤        (C − Bᵀ A⁻¹ B) Δw = c − Bᵀ A⁻¹ a
     ⎣ Bᵀ  C ⎦ ⎣ Δw ⎦ = ⎣ c ⎦        Δθ = A⁻¹ (a − B Δw)
@@ -23,12 +24,12 @@ for each sample, so that θ is eliminated and what remains has the size of w (Sc
 A is (N, D, D), B is (N, D, P), C is (P, P) and contains the prior. The inverse of the Schur
 complement is the covariance of w at the solution.
 
-Damping. A + λ diag(e_θ), C + λ diag(e_w), where e is one over the square of a usual step. Of the λ
-in `DAMPING`, the smallest that lowers the cost is taken, beginning one below that of the last
-round.
+Damping. A + λ diag(e_θ), C + λ diag(e_w), where e is 1 over the square of a typical step. Each
+round takes the smallest λ in `DAMPING` that lowers the cost. It starts one level below that of the
+previous round.
 
-Stopping. The fit ends when a step lowers the cost, or is expected to lower it, by less than
-`enough`, or after a number of rounds.
+Stopping. The fit ends after a number of rounds, or when a step lowers the cost, or is predicted to
+lower it, by less than `enough`.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ from scipy.linalg import cho_solve, cholesky
 from musculoskeletal_ae.arrays import Array
 
 FREEDOM = 4.0  # ν of the Student distribution
-PRIOR_COUNT = 4.0  # residuals that the least noise counts for
+PRIOR_COUNT = 4.0  # number of residuals that the prior at σ₀ is worth
 WEIGHTINGS = 3  # steps of the EM algorithm in each round
 DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # λ
 SMALL = 1e-6  # added to the diagonal of C
 
 
 def student(score: Array) -> Array:
-    """Return the weights ω of residuals in units of their noise."""
+    """Return the weights ω of residuals ρ/σ, of the same shape."""
     weight: Array = (FREEDOM + 1.0) / (FREEDOM + score**2)
     return weight
 
@@ -57,17 +58,17 @@ def student(score: Array) -> Array:
 def noise_and_weight(
     residual: Array, known: Array, noise: Array, determined: Array, least: float
 ) -> tuple[Array, Array]:
-    """Return noise and weights of residuals by a few steps of the EM algorithm.
+    """Estimate noise and weights of residuals by a few steps of the EM algorithm.
 
     Args:
         residual: ρ of N samples in M columns, (N, M).
-        known: 1 where a sample says something, else 0, (N, M).
+        known: 1 where a residual was measured, else 0, (N, M).
         noise: σ of each column so far, (M,).
-        determined: How many unknowns each column determines, (M,).
+        determined: Number of unknowns that each column determines, (M,).
         least: σ₀, in the unit of the residuals.
 
     Returns:
-        σ (M,) and ω (N, M), which is 0 where a sample says nothing.
+        σ (M,) and ω (N, M), which is 0 where no residual was measured.
     """
     freedom = np.maximum(1.0, known.sum(axis=0) - determined)
     for _ in range(WEIGHTINGS):
@@ -78,10 +79,11 @@ def noise_and_weight(
 
 
 def determined(curvature: Array, precision: Array) -> float:
-    """Return how many unknowns residuals determine, beside a prior.
+    """Return the effective number of unknowns that the residuals determine, tr((H + S)⁻¹ H).
 
-    That is tr((H + S)⁻¹ H), with the curvature H (P, P) of the cost of the residuals and the
-    diagonal S (P,) of the prior.
+    Args:
+        curvature: H, the Hessian of the residuals' cost, (P, P).
+        precision: S, the diagonal of the prior's precision, (P,).
     """
     return float(np.trace(np.linalg.solve(curvature + np.diag(precision), curvature)))
 
@@ -95,7 +97,7 @@ class Equations(NamedTuple):
 
     @classmethod
     def of_common(cls, common: Array) -> Equations:
-        """Return those of a fit without unknowns of single samples."""
+        """Return the matrix of a fit whose unknowns are all shared."""
         return cls(np.zeros((0, 0, 0)), np.zeros((0, 0, len(common))), common)
 
 
@@ -107,7 +109,7 @@ class RightSides(NamedTuple):
 
     @classmethod
     def of_common(cls, common: Array) -> RightSides:
-        """Return those of a fit without unknowns of single samples."""
+        """Return the right sides of a fit whose unknowns are all shared."""
         return cls(np.zeros((0, 0)), common)
 
 
@@ -116,30 +118,30 @@ class Step(NamedTuple):
 
     samples: Array  # Δθ, (N, D)
     common: Array  # Δw, (P,)
-    decrease: float  # of the cost, as it is expected
+    decrease: float  # predicted decrease of the cost
 
 
 class Eliminated:
-    """Normal equations in which the unknowns of single samples are eliminated.
+    """Factorised normal equations with the unknowns of individual samples eliminated.
 
     Attributes:
-        root: R with Rᵀ R the Schur complement of w, upper triangular, (P, P).
+        root: Upper triangular R (P, P); Rᵀ R is the Schur complement of w.
     """
 
     def __init__(
         self, equations: Equations, sample_damping: Array | float, common_damping: Array | float
     ) -> None:
-        """Factorise.
+        """Factorise the matrix.
 
         Args:
-            equations: The matrix; A and the Schur complement have to be positive definite.
+            equations: The matrix; A and the Schur complement must be positive definite.
             sample_damping: Added to the diagonals of A, (D,) or (N, D).
             common_damping: Added to the diagonal of C, (P,).
         """
         samples, mixed, common = equations
         eye = np.eye(samples.shape[-1])
         damped = samples + np.asarray(sample_damping)[..., None] * eye
-        # A⁻¹ = Lᵀ L with L the inverse of the Cholesky factor: products with it are cheaper.
+        # A⁻¹ = Lᵀ L. Products with the explicit inverse L are cheaper than triangular solves.
         self._inverse = np.linalg.inv(np.linalg.cholesky(damped))
         self._reduced = self._inverse @ mixed  # L B
         tall = self._reduced.reshape(-1, len(common))
@@ -147,7 +149,7 @@ class Eliminated:
         self.root: Array = cholesky(common + np.diag(diagonal) - tall.T @ tall)
 
     def solve(self, right: RightSides) -> Step:
-        """Return the step."""
+        """Return the step that solves the equations for these right sides."""
         inverse, reduced = self._inverse, self._reduced
         last = (inverse @ right.samples[:, :, None])[:, :, 0]
         common = cho_solve((self.root, False), right.common - np.tensordot(last, reduced, 2))
@@ -160,25 +162,25 @@ Point = TypeVar('Point')
 
 
 class Problem(Protocol[Point]):
-    """What is to be fitted. A point is a value of all unknowns, with its residuals."""
+    """A problem to fit. A point holds the values of all unknowns and their residuals."""
 
-    #: e_θ (D,) and e_w (P,): 1 over the square of a usual step
+    #: e_θ (D,) and e_w (P,): 1 over the square of a typical step
     usual: tuple[Array, Array]
 
     def weigh(self, point: Point) -> None:
-        """Take noise and weights from the residuals at a point."""
+        """Update noise and weights from the residuals at a point."""
         ...
 
     def cost(self, point: Point) -> float:
-        """Return what is to be minimised, with the weights as they are."""
+        """Return the cost to minimise, with the current weights."""
         ...
 
     def equations(self, point: Point) -> Equations:
-        """Return the normal equations at a point, with the weights as they are."""
+        """Return the matrix of the normal equations at a point, with the current weights."""
         ...
 
     def right_sides(self, point: Point) -> RightSides:
-        """Return their right sides; derivatives may be those of the last `equations`."""
+        """Return the right sides at a point; derivatives may be those of the last `equations`."""
         ...
 
     def moved(self, point: Point, step: Step) -> Point:
@@ -188,13 +190,13 @@ class Problem(Protocol[Point]):
 
 @dataclass(frozen=True)
 class Result(Generic[Point]):
-    """Where a fit is.
+    """State of a fit after a round.
 
     Attributes:
         point: The unknowns and their residuals.
-        eliminated: The normal equations as they were solved last; None before the first round.
-        level: Which of `DAMPING` they have.
-        decrease: By how much the last step lowered the cost; 0 if no step was worth it.
+        eliminated: The normal equations solved last; None before the first round.
+        level: Index into `DAMPING` of the damping in `eliminated`.
+        decrease: Decrease of the cost by the last step; 0 if no step was taken.
     """
 
     point: Point
@@ -204,22 +206,22 @@ class Result(Generic[Point]):
 
 
 def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) -> Result[Point]:
-    """Fit from a point on.
+    """Fit a problem, beginning at a point.
 
     Args:
-        problem: What is to be fitted.
-        start: Where to begin.
-        rounds: How many steps to go at most.
-        enough: The decrease of cost that is not worth a step.
+        problem: The problem to fit.
+        start: The first point.
+        rounds: Largest number of steps.
+        enough: The fit ends when a step lowers the cost by less than this.
 
     Returns:
-        Where it ended. The weights of the problem are those of that point.
+        The last point. The weights of the problem are then those of this point.
     """
     fit = Result(start)
     for _ in range(rounds):
         problem.weigh(fit.point)
         if fit.eliminated is not None and fit.level == 0:
-            # By the equations of the last round, which hardly differ.
+            # The equations of the previous round predict the decrease well enough.
             right = problem.right_sides(fit.point)
             if fit.eliminated.solve(right).decrease < enough:
                 break
@@ -231,7 +233,7 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
 
 
 def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Result[Point]:
-    """Go the step with the least damping that lowers the cost, or none."""
+    """Take the least damped step that lowers the cost, or none."""
     before = problem.cost(fit.point)
     equations = problem.equations(fit.point)
     right = problem.right_sides(fit.point)

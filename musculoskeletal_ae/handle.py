@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays handed to compiled code once: numba unpacks those of an argument anew at every call.
+"""Pass many arrays to compiled code as one argument.
 
-An arm has some sixty of them, and they took it longer than its physics. Who hands over makes the
-handle in compiled code, in the file of what is handed over: numba keeps its code, and asks only
-that file whether it is still right.
+At every call, numba unpacks each array of each argument. An emulated arm has about sixty arrays;
+unpacking them took longer than its physics. A compiled function creates the `Handle`; it belongs in
+the file that defines the types of the arrays. numba discards cached code only when the file of that
+code changes.
 """
 
 from typing import Any
@@ -14,13 +15,13 @@ from numba.experimental import structref
 
 @structref.register
 class HandleType(types.StructRef):  # type: ignore[misc]
-    """What numba calls a Handle."""
+    """numba's type of a Handle."""
 
 
 class Handle(structref.StructRefProxy):  # type: ignore[misc]
-    """Arrays, in tuples, as one argument: what is written into them later is seen through it."""
+    """Tuples of arrays as one argument. The arrays are shared, not copied."""
 
-    held: Any  # for compiled code only
+    held: Any  # only compiled code may read it
 
 
 structref.define_proxy(Handle, HandleType, ['held'])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refuse a version of MuJoCo that this package does not work with."""
+"""Check that the installed version of MuJoCo is supported."""
 
 import re
 
@@ -7,14 +7,14 @@ import mujoco
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-#: First version that works, and first one that no longer does. MuJoCo 3.9 lacks what the emulator
-#: uses. MuJoCo 4.0 routes a tendon another way where its side site lies on the axis of a cylinder.
-#: The same range is in setup.cfg.
+#: First supported version, and first unsupported one after it; setup.cfg has the same range.
+#: MuJoCo 3.9 lacks functions that the emulator uses. MuJoCo 4.0 routes a tendon differently if its
+#: side site lies on the axis of a cylinder.
 RANGE = (3, 10), (4,)
 
 
 def check_mujoco(version: str = mujoco.__version__) -> None:
-    """Raise a MusculoskeletalError if the installed MuJoCo is outside the range."""
+    """Raise a MusculoskeletalError if the MuJoCo version is not supported."""
     first, end = RANGE
     numbers = tuple(map(int, re.findall(r'\d+', version)[:3]))
     if not first <= numbers < end:

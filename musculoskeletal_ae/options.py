@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command lines of all tools: one parser, the arguments they share, and how they end.
+"""Command lines of all tools: the parser, the arguments they share, and their exit status.
 
-A tool writes only what is its own, as `tools/import_robot.py` does. A wrong option is one line that
-names the option, the value and what is legal, and status 2; so is `parser.error('--hold-out goes
-with --from-bag')`. What the package refuses (a robot, a file) is one line and status 1. Help shows
-defaults by itself. Types raise `ArgumentTypeError`, before which argparse puts the option.
+A tool adds only its own arguments (see `tools/import_robot.py`). An invalid option prints one line
+with the option, the value and the legal values, and ends with status 2. `parser.error` does the
+same for combinations of options. An error of this package, such as an unusable robot or file,
+prints one line and ends with status 1.
 """
 
 import argparse
@@ -25,14 +25,16 @@ PICTURES = ('.png', '.svg', '.pdf', '.jpg')
 T = TypeVar('T')
 
 
-def _type(convert: Callable[[str], T], legal: Callable[[T], bool], told: str) -> Callable[[str], T]:
-    """Return a type that takes what `convert` makes of a text, where that is legal."""
+def _type(
+    convert: Callable[[str], T], is_legal: Callable[[T], bool], expected: str
+) -> Callable[[str], T]:
+    """Return an argparse type that converts a text and rejects values that are not legal."""
 
     def checked(text: str) -> T:
         with suppress(ValueError):
-            if legal(value := convert(text)):
+            if is_legal(value := convert(text)):
                 return value
-        raise argparse.ArgumentTypeError(f'{text!r}: expected {told}')
+        raise argparse.ArgumentTypeError(f'{text!r}: expected {expected}')
 
     return checked
 
@@ -55,7 +57,7 @@ not_negative = _type(float, lambda value: 0.0 <= value < math.inf, 'a number of 
 positive = _type(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
 minutes = number(0.2, 600.0)  # of robot time
 seed = whole(0, 2**63 - 1)
-#: lists separated by commas: different seeds, finite numbers, different names
+# Lists separated by commas.
 seeds = _type(
     lambda text: tuple(map(int, _listed(text))),
     lambda values: min(values) >= 0 and len(set(values)) == len(values),
@@ -69,33 +71,33 @@ numbers = _type(
 picture = _type(
     Path,
     lambda file: file.suffix.lower() in PICTURES and file.parent.is_dir(),
-    f'a file in a directory that exists, with one of the endings {", ".join(PICTURES)}',
+    f'a file in an existing directory that ends in one of {", ".join(PICTURES)}',
 )
 names = _type(lambda text: [*filter(None, dict.fromkeys(_listed(text)))], bool, 'a name')
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes are one line and exit status 2."""
+    """A parser that reports an error in one line and exits with status 2."""
 
     def __init__(self, prog: str, description: str, epilog: str | None = None) -> None:
         super().__init__(prog, description=description, epilog=epilog)
 
     def add_argument(self, *names: Any, **options: Any) -> argparse.Action:
-        """Add an argument; its default, if there is one, stands at the end of its help."""
+        """Add an argument, and append its default to its help."""
         default = options.get('default')
-        nothing = default is None or default is False or default in ([], argparse.SUPPRESS)
-        if not nothing:
-            shown = ','.join(map(str, default)) if isinstance(default, list | tuple) else default
-            options['help'] = f'{options.get("help", "")} (default: {shown})'.strip()
+        has_default = not (default is None or default is False)
+        if has_default and default not in ([], argparse.SUPPRESS):
+            text = ','.join(map(str, default)) if isinstance(default, list | tuple) else default
+            options['help'] = f'{options.get("help", "")} (default: {text})'.strip()
         return super().add_argument(*names, **options)
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong and end with status 2."""
+        """Print the error and exit with status 2."""
         print(f'{self.prog}: error: {message} (see {self.prog} --help)', file=sys.stderr)
         sys.exit(2)
 
     def add_robot(self, flag: str = '--robot', default: str | None = DEFAULT_ROBOT) -> None:
-        """Add the robot; without a default it must be given, and 'robot' makes it positional."""
+        """Add the robot: required without a default; positional if the flag is 'robot'."""
         text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
         kind: dict[str, Any] = {'metavar': 'NAME|DIR', 'required': default is None}
         self.add_argument(
@@ -107,24 +109,28 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--preset', choices=tuple(PRESETS), default='default', help=text)
 
     def add_seed(self, text: str) -> None:
-        """Add `--seed`; the text says what it is the random seed of."""
+        """Add `--seed`; the text completes "random seed …" in the help."""
         self.add_argument('--seed', type=seed, default=0, help=f'random seed {text}')
 
-    def add_seeds(self, default: tuple[int, ...] | None, text: str = 'individual arms') -> None:
-        """Add `--seeds`, the individual arms."""
+    def add_seeds(
+        self, default: tuple[int, ...] | None, text: str = 'seeds of the emulated individuals'
+    ) -> None:
+        """Add `--seeds`, one for each emulated individual."""
         self.add_argument('--seeds', type=seeds, default=default, metavar='N,…', help=text)
 
     def add_reality(self) -> None:
-        """Add `--reality`, the body of the individual arms."""
-        text = 'the first body, or a second one, of MuJoCo, whose mechanics are foreign too'
+        """Add `--reality`, the emulator model."""
+        text = (
+            'emulator model: kin shares our mechanics; foreign is MuJoCo with mechanics of its own'
+        )
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:
-        """Add `--minutes` of robot time; the text says what happens in them."""
+        """Add `--minutes` of robot time; the text is its help."""
         self.add_argument('--minutes', type=minutes, default=default, help=text)
 
     def add_quick(self, text: str) -> None:
-        """Add `--quick`; the text says what is left out."""
+        """Add `--quick`; the text says what the tool then skips."""
         self.add_argument('--quick', action='store_true', help=text)
 
     def add_out(
@@ -134,29 +140,29 @@ class Parser(argparse.ArgumentParser):
         default: Path | None = None,
         read: Callable[[str], Path] = Path,
     ) -> None:
-        """Add `--out`, a file or directory; without a default it must be given."""
+        """Add `--out`, a file or directory; it is required unless it has a default."""
         required = default is None
         self.add_argument(
             '--out', type=read, metavar=metavar, default=default, required=required, help=text
         )
 
     def add_plot(self, text: str) -> None:
-        """Add `--plot`, a picture that `save_plot` saves where it is asked for."""
+        """Add `--plot`, the file of a picture that `save_plot` saves."""
         self.add_argument('--plot', type=picture, metavar='FILE.png', help=f'draw {text}')
 
 
 def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:
-    """Save the figure that `draw` returns, if one is wanted, and say where."""
+    """Save the figure that `draw` returns and print its file; does nothing without a file."""
     if file is not None:
         save_figure(draw(), file)
         print(f'plot: {file}')
 
 
 def save_figure(figure: Any, file: Path) -> None:
-    """Save a figure of matplotlib.
+    """Save a matplotlib figure.
 
     Raises:
-        MusculoskeletalError: If it cannot be written.
+        MusculoskeletalError: If the file cannot be written.
     """
     try:
         figure.savefig(file, dpi=110)
@@ -165,9 +171,9 @@ def save_figure(figure: Any, file: Path) -> None:
 
 
 def exit_status(work: Callable[[], int | None], *also: type[Exception]) -> int:
-    """Do a tool's work and return its exit status, without a traceback; None of `work` is 0.
+    """Run a tool's work and return its exit status; None counts as 0.
 
-    Errors of this package, of files and of the kinds in `also` are one line and status 1.
+    MusculoskeletalError, OSError and the exceptions in `also` print one line and give status 1.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     try:

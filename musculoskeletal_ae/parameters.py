@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a parameter is: default, meaning, unit, legal values. Nothing here knows ROS.
+"""Parameters with default, meaning, unit and legal values, independent of ROS.
 
-Settings that a user may choose are a frozen dataclass whose fields say all of this:
+Settings that a user may choose are a frozen dataclass whose fields are parameters:
 
     @dataclass(frozen=True)
     class Settings:
-        hold_time: float = Parameter(0.5, 'how long a stop holds', 's', (0.0, 60.0)).field()
+        hold_time: float = Parameter(0.5, 'minimum duration of a stop', 's', (0.0, 60.0)).field()
 
-`nodes/parameters.py` collects them into the tables of the nodes.
+`nodes/parameters.py` assembles the parameters of each node from such classes.
 """
 
 import sys
@@ -21,31 +21,31 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
 from musculoskeletal_ae.presets.registry import DEFAULT, PRESETS
 
-#: where networks are trained
+#: torch devices on which networks can be trained
 DEVICES = 'cpu', 'cuda'
-UNBOUNDED = 2**63 - 1  # the greatest whole number that a ROS parameter holds
+UNBOUNDED = 2**63 - 1  # largest integer of a ROS parameter
 
 
 @dataclass(frozen=True)
 class Parameter:
     """A value that a user may choose."""
 
-    default: Any  # also says its type; a tuple for a list of numbers or names
-    meaning: str  # in a phrase
+    default: Any  # also determines the type; a tuple for a list of numbers or names
+    meaning: str  # one phrase
     unit: str = ''  # such as 'rad/s'
-    within: tuple[float, float] | None = None  # least and greatest legal value of a number
-    legal: tuple[str, ...] = ()  # the words that it may be; empty for any
-    settable: bool = False  # while a node runs; else it is read once, at the start
+    within: tuple[float, float] | None = None  # lowest and highest legal value of a number
+    legal: tuple[str, ...] = ()  # legal words; empty for any
+    settable: bool = False  # whether it may change while a node runs
 
     @property
     def description(self) -> str:
-        """What `ros2 param describe` says above the range: meaning, unit, legal words."""
+        """Description for `ros2 param describe`: meaning, unit and legal words."""
         unit = f' [{self.unit}]' if self.unit else ''
         return f'{self.meaning}{unit}' + (f'; {self.legal_values}' if self.legal else '')
 
     @property
     def legal_values(self) -> str:
-        """Legal words, or range and unit, for people to read; '' for any."""
+        """Legal words, or range and unit, as text; '' if every value is legal."""
         if self.legal:
             return f'one of: {", ".join(self.legal)}'
         if self.within is None:
@@ -56,24 +56,28 @@ class Parameter:
 
     @property
     def is_number_list(self) -> bool:
-        """Whether it is a list of numbers."""
+        """Whether the value is a list of numbers."""
         values = self.default if isinstance(self.default, tuple) else ('',)
         return not any(isinstance(value, str) for value in values)
 
     def field(self) -> Any:
-        """Return the dataclass field that this parameter sets."""
+        """Return a dataclass field with this parameter as metadata."""
         return field(default=self.default, metadata={'parameter': self})
 
     def checked(self, value: Any) -> Any:
-        """Return a value as it is used, if it is legal: lists as tuples, without empty names."""
+        """Return a legal value with lists as tuples and without empty names.
+
+        Raises:
+            MusculoskeletalError: If the value is not legal.
+        """
         if self.legal and value not in self.legal:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
         if self.is_number_list:
             low, high = self.within or (-sys.float_info.max, sys.float_info.max)
             legal = f'a list of finite numbers, {self.legal_values}'.removesuffix(', ')
-            # ROS makes the byte array b'' of an empty list.
+            # ROS represents an empty list as the byte array b''.
             numbers = [] if value == b'' else value
-            if hasattr(numbers, 'tolist'):  # ROS keeps lists of numbers as arrays
+            if hasattr(numbers, 'tolist'):  # ROS represents lists of numbers as arrays
                 numbers = numbers.tolist()
             try:
                 kind = tuple[Annotated[float, Meta(ge=low, le=high)], ...]
@@ -99,9 +103,11 @@ def parameters_of(settings: type) -> dict[str, Parameter]:
 ROBOT = Parameter(DEFAULT_ROBOT, 'a shipped robot, or a directory with robot.urdf and muscles.yaml')
 RATE = Parameter(100.0, 'rate of the muscle modules', 'Hz', (1.0, 1000.0))
 CHECKPOINT = Parameter(
-    '', 'file of a trained network (empty: wait for one by topic)', settable=True
+    '', 'file of a trained network (empty: wait for one on the topic)', settable=True
 )
 PRESET = Parameter(
-    DEFAULT, 'the best we can measure, or as printed in the paper', legal=tuple(PRESETS)
+    DEFAULT, 'the most accurate methods, or those printed in the paper', legal=tuple(PRESETS)
 )
-SEED = Parameter(0, 'random seed: which arm is emulated, exploration, learning', '', (0, UNBOUNDED))
+SEED = Parameter(
+    0, 'random seed of the emulated individual, exploration and learning', '', (0, UNBOUNDED)
+)

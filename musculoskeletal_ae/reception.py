@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a message, live or of a bag: used, or rejected and counted by reason."""
+"""Accept messages, live or from a bag, or reject them and count the reasons."""
 
 import math
 import time
@@ -10,28 +10,29 @@ from typing import Any
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
-SHOWN = 10.0  # [s] for which the last refusal is shown
-# A source time that lies further back than this is another publisher's clock, not a reordering.
+SHOWN = 10.0  # [s] for which `refusal` reports the last refusal
+# A source time that lies further back than this comes from another clock, not from reordering.
 REORDERING = 1_000_000_000  # [ns]
 
 
 class Reception:
-    """Counts what is received."""
+    """Counts received, rejected and ignored messages."""
 
     def __init__(self, warn: Callable[[str], object]) -> None:
-        """Nothing has come yet; `warn` is told of the first rejection for each reason."""
+        """Start with empty counters; `warn` receives the first rejection for each reason."""
         self._warn = warn
-        self.last_rejected = ''  # what was wrong with the last one of them
-        self.rejected: Counter[str] = Counter()  # messages, by topic and reason
-        #: parts of messages that were not used though the rest was, by topic and what it was
+        self.last_rejected = ''  # source and fault of the last rejected message
+        self.rejected: Counter[str] = Counter()  # messages by topic and reason
+        #: unused parts of messages that were otherwise used, by topic and part
         self.ignored: Counter[str] = Counter()
-        #: topics by which somebody asks for something: who asks is to see that it was refused
+        #: topics that carry requests, whose senders must see a refusal
         self.commands: set[str] = set()
-        self._refusal = '', -math.inf  # the last one of a command, and when it was refused [s]
+        self._refusal = '', -math.inf  # text of the last refusal, and its time [s]
         self._received: Counter[str] = Counter()
-        self.numbers: Counter[str] = Counter()  # of the newest message, by topic; 0: not known
-        #: how often a message was numbered lower than the one before, by topic: once where a
-        #: publisher starts anew, all the time where two take turns
+        #: sequence number of the newest message by topic; 0: unknown
+        self.numbers: Counter[str] = Counter()
+        #: how often the sequence number decreased, by topic: once when a publisher restarts,
+        #: continually when two publishers alternate
         self.turns: Counter[str] = Counter()
 
     def of(
@@ -41,15 +42,20 @@ class Reception:
         publishers: Callable[[], int],
         is_used_at_once: bool = True,
     ) -> Callable[[Any, dict[str, Any]], None]:
-        """Return what to subscribe with: calls `callback` unless the message comes twice or late.
+        """Return a subscription callback that skips repeated and reordered messages.
 
-        That is, of one publisher, one sent no later than the last that was taken, and numbered no
-        higher: numbers go on when its clock steps back. 0 is not known. The callback raises a
-        `MusculoskeletalError` to reject the message. If the message is not used at once, whoever
-        uses it calls `note_used`. `publishers` counts who publishes there: a message does not say
-        who sent it, and two clocks or counters cannot be compared.
+        A message is skipped if neither its source time nor its sequence number is higher than that
+        of the message before. Both are checked, because only the numbers keep rising when the
+        publisher's clock steps back. The check needs a single publisher: a message does not name
+        its sender, and two clocks or counters cannot be compared.
+
+        Args:
+            topic: The name under which messages are counted.
+            callback: Receives the message; raises a MusculoskeletalError to reject it.
+            publishers: Returns the number of publishers on the topic.
+            is_used_at_once: If false, the user of the message calls `note_used` later.
         """
-        before, last = 0, 0  # when the last one was sent [ns], and its number
+        before, last = 0, 0  # source time [ns] and sequence number of the message before
 
         def is_new(info: dict[str, Any]) -> bool:
             nonlocal before, last
@@ -80,7 +86,7 @@ class Reception:
         self._received[topic] += 1
 
     def reject(self, source: str, reason: str, detail: str) -> bool:
-        """Count a message or request; say whether it is the first for this reason."""
+        """Count a rejected message or request; return whether it is the first for this reason."""
         self.last_rejected = f'{source}: {detail}'[:LONGEST_TEXT]
         self.rejected[f'{source}: {reason}'] += 1
         if source in self.commands:
@@ -91,28 +97,28 @@ class Reception:
         return first
 
     def refuse(self, text: str) -> None:
-        """Note that something which somebody asked for is not done, and why."""
+        """Record that a request is refused; the text includes the reason."""
         self._refusal = text[:LONGEST_TEXT], time.monotonic()
 
     @property
     def refusal(self) -> str:
-        """What was refused in the last seconds, with the reason; ''."""
+        """The request refused in the last SHOWN seconds, with the reason; '' if there is none."""
         text, refused_at = self._refusal
         return text if time.monotonic() - refused_at < SHOWN else ''
 
     def ignore(self, source: str, part: str) -> None:
-        """Count a part of a message that is not used, such as one joint's position."""
+        """Count an unused part of a message, such as one joint's position."""
         self.ignored[f'{source}: {part}'] += 1
         if self.ignored[f'{source}: {part}'] == 1:
             self._warn(f'ignored {source}: {part}')
 
     def reject_error(self, source: str, error: Exception) -> bool:
-        """Count what a callback let out; say whether it is the first of its kind."""
+        """Count an exception that escaped a callback; return whether its type is new."""
         kind = type(error).__name__
         return self.reject(source, kind, f'{kind}: {printable(error)}')
 
     def take_received(self) -> dict[str, int]:
-        """Return how many messages were used since the last call, by topic."""
+        """Return the number of messages used since the last call, by topic."""
         received = dict(self._received)
         self._received = Counter(dict.fromkeys(received, 0))
         return received

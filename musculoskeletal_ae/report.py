@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a part of the system says of itself, for people and for /diagnostics."""
+"""Status reports for /diagnostics and for people, and numbers as readable text."""
 
 import math
 from typing import Literal, NamedTuple
 
-MOST_DIGITS = 17  # that a double has
+MOST_DIGITS = 17  # significant digits that identify a double
 Level = Literal['ok', 'warn', 'error']
 
 
 class Report(NamedTuple):
-    """How it is, in one line and in named values."""
+    """Status of a component: level, one line of text and named values."""
 
     level: Level
     message: str
@@ -17,14 +17,14 @@ class Report(NamedTuple):
 
 
 def whole(value: float, unit: str = '') -> str:
-    """Return a whole number and its unit for people to read, or that it is not known: NaN."""
+    """Return a value, rounded to a whole number, with its unit; "–" for NaN (unknown)."""
     return '–' if math.isnan(value) else f'{value:.0f} {unit}'.rstrip()
 
 
 def distinct(value: float, *limits: float, digits: int = 3) -> tuple[str, ...]:
-    """Return a value and the limits that it is compared with, in as many digits as tell them apart.
+    """Return a value and its limits as texts with enough digits to tell them apart.
 
-    At least `digits` significant ones. Numbers that are equal are written alike.
+    Each text has at least `digits` significant digits. Equal numbers give equal texts.
     """
     numbers = [float(number) for number in (value, *limits)]
     for precision in range(digits, MOST_DIGITS + 1):

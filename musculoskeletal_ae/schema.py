@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File formats as types: msgspec checks a value, and its errors are explained here.
+"""File formats as types, which msgspec checks, and readable texts for msgspec's errors.
 
-A format is a class derived from `Strict`; ranges and lengths stand in its annotations. What the
-annotations cannot express raises a ValueError in `__post_init__`.
+A format is a class derived from `Strict`, with ranges and lengths in its annotations. Its
+`__post_init__` checks rules that annotations cannot express and raises a ValueError.
 """
 
 import re
@@ -15,7 +15,7 @@ from msgspec import Struct, inspect
 
 T = TypeVar('T')
 
-#: "Expected `float`, got `str` - at `$.muscles[3].stiffness`"
+#: Matches, for example, "Expected `float`, got `str` - at `$.muscles[3].stiffness`".
 _MESSAGE = re.compile(
     r'(?P<problem>.*?)( - at (?P<key>`key` in )?`(?P<place>\$[^`]*)`)?', re.DOTALL
 )
@@ -24,14 +24,14 @@ _UNKNOWN_FIELD, _INVALID_WORD = 'unknown field', 'Invalid enum value'
 
 
 class Strict(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of the formats: a key that the format does not have is an error."""
+    """Base class of file formats; unknown keys are errors."""
 
 
 def convert(value: Any, kind: type[T], refuse: Callable[[str], Exception]) -> T:
-    """Return a value of a file as the given type, if it has that type.
+    """Convert a value from a file to a type.
 
-    `refuse` makes the error from a text that names the place, the problem, the value and, of keys
-    and words, the legal ones.
+    If the value does not fit, raises the exception that `refuse` returns for a text. The text names
+    the place, the problem, the value and the legal keys or words.
     """
     try:
         return msgspec.convert(value, kind)
@@ -40,11 +40,11 @@ def convert(value: Any, kind: type[T], refuse: Callable[[str], Exception]) -> T:
 
 
 def explanation(error: msgspec.ValidationError, value: Any, kind: Any) -> str:
-    """Return what is wrong with a value that is not of the given type."""
+    """Return a readable text for msgspec's error about a value that does not fit a type."""
     message = _MESSAGE.fullmatch(str(error))
     assert message is not None  # the pattern matches every text
     place, problem = message['place'] or '$', message['problem'].replace('`', '')
-    if isinstance(error.__cause__, ValueError):  # raised by a `__post_init__`, complete as it is
+    if isinstance(error.__cause__, ValueError):  # `__post_init__` raised it with a complete text
         return f'{place}: {problem}'
     steps = [match.groupdict() for match in _STEP.finditer(place)]
     legal = ', '.join(_legal_words(kind, steps))
@@ -58,7 +58,7 @@ def explanation(error: msgspec.ValidationError, value: Any, kind: Any) -> str:
         return f'{place}: wrong key: {problem}' + f'; legal: {legal}' * bool(legal)
     if _INVALID_WORD in problem:
         return f'{place}: expected one of {legal}, got {problem.removeprefix(_INVALID_WORD)[1:]}'
-    # A number of more digits than Python prints has no `repr`.
+    # `repr` raises a ValueError for integers with more digits than Python prints.
     try:
         shown = reprlib.repr(_value_at(value, steps))
     except (LookupError, ValueError):
@@ -72,7 +72,7 @@ def explanation(error: msgspec.ValidationError, value: Any, kind: Any) -> str:
 
 
 def _value_at(value: Any, steps: list[dict[str, str | None]]) -> Any:
-    """Return the value at a place, or the mapping that holds it where msgspec names no key."""
+    """Return the value at a place, or the mapping that contains it if msgspec names no key."""
     for step in steps:
         if step['field'] is not None:
             value = value[step['field']]
@@ -84,10 +84,10 @@ def _value_at(value: Any, steps: list[dict[str, str | None]]) -> Any:
 
 
 def _legal_words(kind: Any, steps: list[dict[str, str | None]]) -> list[str]:
-    """Return the keys of the mapping, or the words, that are legal at a place of a format."""
+    """Return the legal keys or words at a place of a format."""
     types = [inspect.type_info(kind)]
     for step in [*steps, None]:
-        # Of `X | None` that is X.
+        # Replace a union such as `X | None` by its members.
         types = [part for each in types for part in getattr(each, 'types', [each])]
         if step is not None:
             types = [inner for each in types for inner in _inner_types(each, step)]
@@ -103,7 +103,7 @@ def _legal_words(kind: Any, steps: list[dict[str, str | None]]) -> list[str]:
 
 
 def _inner_types(kind: inspect.Type, step: dict[str, str | None]) -> Iterator[inspect.Type]:
-    """Yield the types that a value has one step below a value of some type."""
+    """Yield the legal types of a field or item of a type."""
     if isinstance(kind, inspect.StructType):
         yield from (field.type for field in kind.fields if field.encode_name == step['field'])
     elif isinstance(kind, inspect.ListType | inspect.VarTupleType):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a process answers SIGINT (Ctrl-C) and SIGTERM.
+"""Reactions of a process to SIGINT (Ctrl-C) and SIGTERM.
 
-rclpy's own signal handlers are not installed (`SignalHandlerOptions.NO`). They shut the ROS context
-down from a native thread, at any moment: a node under construction then fails with "context is
-invalid", a publisher is dead before its last message, and removing the handlers while that thread
-runs can crash. Instead one Python handler, which runs in the main thread, does what suits the work
-in progress (`Reaction`). Nodes and tools then end their work and destroy what they made, in order.
+rclpy's own signal handlers are not installed (`SignalHandlerOptions.NO`), because they shut the ROS
+context down from a native thread at any moment. A node under construction then fails with "context
+is invalid", and a publisher cannot send its last message. Removing the handlers while that thread
+runs can crash. Instead, one Python handler in the main thread reacts as the current work requires
+(`Reaction`). Nodes and tools then end their work and destroy their objects in order.
 """
 
 import os
@@ -17,29 +17,28 @@ from importlib import import_module
 from types import ModuleType
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-INTERRUPTED = 130  # exit status of a tool
-GRACE = 2  # [s] that `Reaction.EXIT_SOON` leaves
+INTERRUPTED = 130  # exit status of an interrupted tool
+GRACE = 2  # [s] from the signal to the exit under `Reaction.EXIT_SOON`
 
 
 class Reaction(Enum):
-    """What a stop signal does."""
+    """Effect of a stop signal."""
 
-    #: End the process at once. For imports: a KeyboardInterrupt inside the initialisation of an
-    #: extension module turns into other errors.
+    #: End the process at once. Used during imports, because extension modules turn a
+    #: KeyboardInterrupt during their initialisation into other errors.
     EXIT = auto()
-    #: Remember the signal, and end the process if it still works on the same after `GRACE`. For
-    #: the construction of nodes, which takes a second, but a minute while numba compiles.
+    #: Remember the signal, and end the process if the work lasts longer than `GRACE`. Used while
+    #: nodes are constructed, which takes a second, or a minute if numba has to compile.
     EXIT_SOON = auto()
-    #: Remember the signal; whoever works looks at `received`. For everything that runs inside
-    #: rclpy, which turns a KeyboardInterrupt that is raised while it converts a message into
-    #: other errors.
+    #: Remember the signal; the running code checks `received`. Used for all code inside rclpy,
+    #: which turns a KeyboardInterrupt during message conversion into other errors.
     REMEMBER = auto()
-    #: Raise KeyboardInterrupt. For the Python code of a tool.
+    #: Raise KeyboardInterrupt. Used for the Python code of tools.
     RAISE = auto()
 
 
 class StopSignals:
-    """The handler of both signals; it belongs to the process, so that there is one (`STOP`)."""
+    """Handler of both signals; the only instance, `STOP`, serves the whole process."""
 
     def __init__(self) -> None:
         self.received = False
@@ -47,20 +46,25 @@ class StopSignals:
         self._exit_status = INTERRUPTED
 
     def install(self, reaction: Reaction, exit_status: int = INTERRUPTED) -> None:
-        """Handle the signals from now on; `exit_status` is that of `Reaction.EXIT`."""
+        """Begin to handle the signals.
+
+        Args:
+            reaction: Effect of a signal outside `reacting` blocks.
+            exit_status: Exit status under `Reaction.EXIT` and `Reaction.EXIT_SOON`.
+        """
         self.received, self._reaction, self._exit_status = False, reaction, exit_status
         for number in STOP_SIGNALS:
             signal.signal(number, self._on_signal)
         signal.signal(signal.SIGALRM, lambda *_: os._exit(exit_status))
 
     def ignore(self) -> None:
-        """Ignore further signals: nothing that Python does at its end should be interrupted."""
+        """Ignore further signals, so that they do not interrupt Python's shutdown."""
         for number in STOP_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
     @contextmanager
     def reacting(self, reaction: Reaction) -> Iterator[None]:
-        """React in another way within a `with` block; without `install` it changes nothing."""
+        """Use another reaction within a `with` block; without `install` this has no effect."""
         before, self._reaction = self._reaction, reaction
         try:
             yield
@@ -88,6 +92,6 @@ STOP = StopSignals()
 
 
 def import_heavy(module: str) -> ModuleType:
-    """Import a module that takes a while; a stop signal meanwhile ends the process at once."""
+    """Import a slow module; a stop signal during the import ends the process at once."""
     with STOP.reacting(Reaction.EXIT):
         return import_module(module)

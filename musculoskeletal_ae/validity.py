@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check messages as doc/reference/topics_and_services.md describes: one function for each kind.
+"""Validate messages and read their values, one function for each kind of message.
 
-A function takes a message by its fields alone, a live one or one of a bag, and returns numbers.
-A message that breaks a rule raises a `MessageError` with a short reason; the caller counts it and
-goes on.
+doc/reference/topics_and_services.md lists the rules. The functions access only the fields of a
+message, which may be live or from a bag. An invalid message raises a `MessageError` with a short
+reason; the caller counts it and continues.
 """
 
 import math
@@ -19,21 +19,21 @@ from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 
-MOST_ENTRIES = 10_000  # far more than any arm has; a longer message is refused unread
+MOST_ENTRIES = 10_000  # far more than any arm needs; longer messages are rejected unread
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)  # [N], [N·m] at the end effector
-MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # [m/s], [rad/s] asked of the end effector
-LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0  # [m/s²] that an accelerometer reads on an arm
-LAST_VELOCITY = 1e-6  # [rad/s] at which a trajectory ends
-MOST_EFFORT = 1000.0  # [N·m] asked of one joint
-MOST_ISOLATED = 1e6  # of a value of an isolated muscle; powers of a larger one overflow
-UNIT_TOLERANCE = 0.01  # of a quaternion's length
+MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # commanded [m/s], [rad/s] of the end effector
+LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0  # [m/s²] plausible accelerometer readings on an arm
+LAST_VELOCITY = 1e-6  # [rad/s] highest velocity at the end of a trajectory
+MOST_EFFORT = 1000.0  # [N·m] requested of one joint
+MOST_ISOLATED = 1e6  # highest value of an isolated muscle; powers of larger ones overflow
+UNIT_TOLERANCE = 0.01  # deviation of a quaternion's norm from 1
 QUANTITIES = ('length', 'tension', 'temperature')
 
 
 def read_array(message: Any, rows: int, columns: int) -> Array:
-    """Return the data of a Float64MultiArray, all finite, as (rows, columns).
+    """Return the finite data of a Float64MultiArray as (rows, columns), or (columns,) for one row.
 
-    One row gives (columns,). The layout may be empty; what it states must match.
+    The layout may be empty; otherwise it must match.
     """
     values = _values(message, rows, columns)
     finite = np.isfinite(values)
@@ -45,10 +45,10 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
 def read_muscle_states(
     message: Any, muscles: int, isolated: Sequence[int] | Ints = (), unknown: float = 0.0
 ) -> Array:
-    """Return the rows `QUANTITIES` of a Float64MultiArray, (3, M).
+    """Return length [m], tension [N] and temperature of a Float64MultiArray, (3, M).
 
-    A temperature that is not measured is NaN. What isolated muscles say does not count: what is
-    not finite there, or beyond MOST_ISOLATED, is returned as `unknown`, a temperature as NaN.
+    A temperature of NaN means that it is not measured. Isolated muscles may have any values:
+    those not finite or beyond ±MOST_ISOLATED are replaced by `unknown`, temperatures by NaN.
     """
     values = _values(message, len(QUANTITIES), muscles)
     usable = np.isfinite(values)
@@ -66,7 +66,7 @@ def read_muscle_states(
 
 
 def _values(message: Any, rows: int, columns: int) -> Array:
-    """Return the data of a Float64MultiArray (rows, columns) whose size and layout are right."""
+    """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked."""
     count = len(message.data)
     if count > MOST_ENTRIES:
         raise MessageError('oversized', f'{count} values, at most {MOST_ENTRIES}')
@@ -88,11 +88,12 @@ def _values(message: Any, rows: int, columns: int) -> Array:
 
 
 def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
-    """Return θ [rad] (D,) of a measured JointState; joints are matched by name, others ignored.
+    """Return θ [rad] (D,) of a measured JointState.
 
-    All listed joints must be there; with `some` one is enough, and the others are NaN, as are those
-    whose position is not finite (`joints_not_finite` names them). Velocities and efforts do not
-    count: drivers say NaN where they measure none.
+    Joints are matched by name, and unknown joints are ignored. All listed joints need a finite
+    position; with `some`, one is enough and the others are NaN (`joints_not_finite` lists those
+    present but not finite). Velocities and efforts are not checked, because drivers publish NaN for
+    quantities that they do not measure.
     """
     names = _joint_names(message)
     index = {name: i for i, name in enumerate(names)}
@@ -114,7 +115,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
 
 
 def joints_not_finite(message: Any, joints: Sequence[str]) -> list[str]:
-    """Return which of the listed joints a JointState gives a position that is not finite."""
+    """Return the listed joints whose position in a JointState is not finite."""
     return [
         name
         for name, position in zip(message.name, message.position)
@@ -127,9 +128,9 @@ def _positions_of(names: Sequence[str]) -> str:
 
 
 def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return name → (position, effort) of a JointState that asks for a posture of some joints.
+    """Return name → (position, effort) of a JointState that commands some of the joints.
 
-    Without efforts they are 0.
+    A message without efforts gives efforts of 0.
     """
     names = _joint_names(message)
     listed = set(joints)
@@ -152,7 +153,7 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
 
 
 def _joint_names(message: Any) -> list[str]:
-    """Return the names in a JointState whose arrays have matching lengths."""
+    """Return the joint names of a JointState after checking the lengths of its arrays."""
     names = list(message.name)
     counts = len(names), len(message.position), len(message.effort), len(message.velocity)
     if max(counts) > MOST_ENTRIES:
@@ -167,12 +168,12 @@ def _joint_names(message: Any) -> list[str]:
 
 
 def read_names(message: Any) -> list[str]:
-    """Return the names in a String: separated by commas, with spaces only inside a name."""
+    """Return the names in a String, which are separated by commas and stripped of spaces."""
     return [name for part in message.data.split(',') if (name := part.strip())]
 
 
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
-    """Return the link and the acceleration [m/s²] (3,) of an Imu, whose frame is that link."""
+    """Return the link of an Imu, which is its frame, and its acceleration [m/s²] (3,)."""
     link, vector = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
     if link not in links:
         problem = f'{message.header.frame_id!r}; legal: {", ".join(links)}'
@@ -182,12 +183,15 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
         raise MessageError('not finite', 'an acceleration')
     norm = float(np.linalg.norm(acceleration))
     if not LEAST_GRAVITY <= norm <= MOST_GRAVITY:
-        raise MessageError('no gravity', f'{norm:.3g} m/s², an arm at rest has 9.81')
+        raise MessageError('no gravity', f'{norm:.3g} m/s², an IMU at rest measures 9.81')
     return link, acceleration
 
 
 def read_wrench(message: Any, root_link: str) -> Array:
-    """Return force [N] and torque [N·m] (6,) of a WrenchStamped; no frame means the root link."""
+    """Return force [N] and torque [N·m] (6,) of a WrenchStamped in the root link's frame.
+
+    An empty frame means the root link.
+    """
     if message.header.frame_id not in ('', root_link):
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
     wrench = message.wrench
@@ -195,7 +199,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def _six(first: Any, second: Any, most: Array, what: str) -> Array:
-    """Return two vectors as one (6,), all finite and no larger than `most` (6,)."""
+    """Return two vectors as one (6,), after checking that it is finite and within ±`most` (6,)."""
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
         raise MessageError('not finite', what)
@@ -205,9 +209,9 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
 
 
 def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
-    """Return the points of a JointTrajectory, or None if it has none: come to rest.
+    """Return the points of a JointTrajectory; None if it is empty, which commands the arm to stop.
 
-    Velocities and accelerations are given at all points or at none.
+    Velocities and accelerations must be present at all points or at none.
     """
     names, points = list(message.joint_names), list(message.points)
     if len(names) * max(len(points), 1) > MOST_ENTRIES:
@@ -253,7 +257,7 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
 
 
 def read_twist(message: Any, frame: str) -> Array:
-    """Return the linear [m/s] and angular velocity [rad/s] (6,) of a TwistStamped in `frame`."""
+    """Return linear [m/s] and angular velocity [rad/s] (6,) of a TwistStamped in `frame`."""
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
     twist = message.twist
@@ -261,13 +265,13 @@ def read_twist(message: Any, frame: str) -> Array:
 
 
 def without_orientation(message: Any) -> bool:
-    """Whether a PoseStamped asks for a position only: its quaternion is all zeros."""
+    """Return whether a PoseStamped commands a position only: its quaternion is all zeros."""
     turn = message.pose.orientation
     return not any((turn.x, turn.y, turn.z, turn.w))
 
 
 def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
-    """Return the pose of a PoseStamped that is given in `frame`, or its position alone."""
+    """Return the pose of a PoseStamped in `frame`; with `position_only`, without its rotation."""
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
     position, turn = message.pose.position, message.pose.orientation

@@ -55,11 +55,11 @@ def forbidden(file):
 
 
 UNREADABLE = {
-    fifo: 'no regular file',
-    endless: 'no regular file',
+    fifo: 'not a regular file',
+    endless: 'not a regular file',
     missing: 'No such file',
-    folder: 'no regular file',
-    latin: 'is not text in UTF-8 (byte 6)',
+    folder: 'not a regular file',
+    latin: 'is not UTF-8 text (byte 6)',
     large: 'is larger than 1048576 bytes',
     forbidden: 'Permission denied',
 }
@@ -114,7 +114,7 @@ def test_a_table_is_its_rows_with_their_lines(text, rows, tmp_path):
     [
         ('', 'columns a,b, got nothing'),
         ('b,a\n1,2\n', "columns a,b, got 'b,a'"),
-        ('a,b\n1,' + 'x' * 200_000, 'line 2: no line of a table: field larger'),
+        ('a,b\n1,' + 'x' * 200_000, 'line 2: not valid CSV: field larger'),
     ],
 )
 def test_what_is_no_table_is_refused(text, problem, tmp_path):
@@ -155,7 +155,7 @@ def bomb(step):
 REFUSED_YAML = {
     'nine to the sixteenth entries': (bomb('[{}]'), 'line 6: more than 100000 entries'),
     'as many merged keys': (bomb('{{<<: [{}]}}'), 'line 6: more than 100000 entries'),
-    'a list within itself': ('a: &a [*a]', '*a stands for nothing before it'),
+    'a list within itself': ('a: &a [*a]', 'alias *a has no anchor before it'),
     'a key twice': ('a: {b: 1, c: 2, b: 3}', "line 1: key 'b' is written twice"),
     'too deep': ('[' * 100_000, 'more than 50 levels'),
     'an object of Python': ('!!python/object/apply:os.abort []', 'could not determine'),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in a recording, and whether it is whole and fits a robot: `replay --check`."""
+"""Check a recording: contents, completeness and fit to a robot (`replay --check`)."""
 
 from array import array
 from dataclasses import dataclass, field
@@ -16,10 +16,10 @@ from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printa
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 
-# Another muscle must explain a column this much better before the order of muscles is questioned:
-# bodies differ from their model, and neighbouring muscles are similar.
+# A column counts as misplaced only if another muscle fits it this many times better, because bodies
+# differ from their model and neighbouring muscles are similar.
 _BETTER_FIT = 2.5
-_LEAST_MOTION = 0.005  # [m] spread of a muscle's length below which its column is not judged
+_LEAST_MOTION = 0.005  # [m]; a column whose length varies less is not checked
 _MOST_SAMPLES = 2000
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
@@ -28,8 +28,8 @@ _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 class BagCheck:
     """The report on a recording."""
 
-    lines: list[str] = field(default_factory=list)  # what is in it
-    faults: list[str] = field(default_factory=list)  # why it is not whole or does not fit
+    lines: list[str] = field(default_factory=list)  # the contents
+    faults: list[str] = field(default_factory=list)  # why it is incomplete or does not fit
 
     def __str__(self) -> str:
         lines = [*self.lines, *(f'fault: {fault}' for fault in self.faults)]
@@ -37,10 +37,12 @@ class BagCheck:
 
 
 def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:
-    """Read a recording from end to end, every message, and report.
+    """Read every message of a recording and report on it.
 
-    Without a robot (shipped name or directory) the report says which of the shipped ones fit; the
-    namespace is the one that is meant where the bag has several.
+    Args:
+        path: The bag.
+        robot: A shipped robot or a directory; None: report which of the shipped robots fit.
+        namespace: The namespace to check; required only if the bag has several.
     """
     check = BagCheck()
     try:
@@ -65,9 +67,10 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
 
 
 def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
-    """Return (muscle of the column, muscle that it behaves like) where these differ.
+    """Return (muscle of the column, muscle that it behaves like) for each misplaced column.
 
-    Arrays carry no names. But the true body is like the nominal one, so muscle i must follow
+    Arrays carry no names. However, the body resembles its geometric model. Hence the length in
+    column i must follow
 
         l̂_j = f_geo(θ) − L_e(f_geo,abs(θ), T)
 
@@ -80,9 +83,9 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     theta = pairs.theta[rows].clip(robot.lower, robot.upper)
     length, tension = pairs.length[rows], pairs.tension[rows]
     moved = length.std(axis=0) > _LEAST_MOTION
-    moved &= ~(pairs.isolated == 1).any(axis=0)  # their readings may be anything
+    moved &= ~(pairs.isolated == 1).any(axis=0)  # isolated muscles may have any readings
     columns = range(robot.muscle_count)
-    # The tension of the column stretches whichever muscle it is.
+    # Whichever muscle a column belongs to, the tension in the same column stretches it.
     tensions = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]
     modelled = [robot.muscle_lengths(theta, stretching) for stretching in tensions]
     errors = np.array([(length[:, [i]] - modelled[i]).std(axis=0) for i in columns])
@@ -105,7 +108,7 @@ def _contents(bag: Bag) -> list[str]:
     has_checksums = all(file.has_checksums for file in bag.files)
     lines = [
         f'{bag.path}: {bag.message_count} messages, {length}',
-        f'checksums: {"of all messages" if has_checksums else "none, or not of all messages"}',
+        f'checksums: {"for all messages" if has_checksums else "none, or not for all messages"}',
         '',
         f'{"topic":<44} {"messages":>9} {"Hz":>9} {"gap s":>8}  type',
     ]
@@ -119,7 +122,7 @@ def _contents(bag: Bag) -> list[str]:
 
 
 def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], list[str]]:
-    """Return why a bag does not fit a robot, and a line for each reason to leave messages out."""
+    """Return the reasons why a bag does not fit a robot, and notes on unused messages."""
     try:
         robot = Robot.load(name)
         streams = read_streams(bag, robot, namespace)
@@ -131,10 +134,10 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], list[st
     left_out += streams.notes
     left_out += [f'used in part {n}: {why}' for why, n in streams.ignored.items()]
     if not len(streams.muscles.time) and not len(streams.joints.time):
-        problem = f'nothing says whether it fits {name}: no joint_states or muscle_states is in it'
+        problem = f'cannot check the fit to {name}: the bag has no joint_states or muscle_states'
         return [problem], left_out
     misplaced = [
-        f'the order of muscles is not that of {name}: {muscle} behaves like {like}'
+        f'muscles are not in the order of {name}: {muscle} behaves like {like}'
         for muscle, like in misplaced_muscles(streams.pairs(), robot)
     ]
     return misplaced, left_out

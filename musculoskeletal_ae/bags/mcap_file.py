@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An mcap file, read by the library mcap within bounds of size and order."""
+"""Read mcap files with the library mcap, with limits on size and disorder."""
 
 from __future__ import annotations
 
@@ -31,32 +31,36 @@ from musculoskeletal_ae.bags.storage import (
 from musculoskeletal_ae.exceptions import BagError
 
 MAGIC = b'\x89MCAP0\r\n'  # first and last bytes of a file
-# No record, and no chunk once decompressed, may be larger.
-LARGEST_RECORD = 64 << 20  # [bytes]
-# A file may not decompress to more than this: a few kB can hold hours of work.
-MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100  # [bytes], and times the size of the file
+LARGEST_RECORD = 64 << 20  # [bytes] of a record or a decompressed chunk
+# A file may decompress to at most MOST_EXPANDED bytes plus LARGEST_EXPANSION times its size. A
+# malicious file of a few kB could otherwise take hours to read.
+MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100
 
 _JUMP = 'record again, without --loop, a second /clock or another jump of time'
 _LONGEST_QOS = 10_000  # [characters] of YAML
 
 
 class _Span(NamedTuple):
-    """What is in a chunk, so that it need not be decompressed in vain."""
+    """Times and topics of a chunk, which tell whether it needs decompression."""
 
     start: int  # earliest log time [ns]
     end: int  # latest log time [ns]
     topics: frozenset[str]
 
     def has_any(self, topics: Collection[str], start: int, stop: int) -> bool:
-        """Return whether it may have messages of some topics from start to stop [ns]."""
+        """Return whether the chunk may have messages of these topics from start to stop [ns]."""
         return self.start <= stop and self.end >= start and not self.topics.isdisjoint(topics)
 
 
 class McapFile:
-    """An mcap file; one that a killed recorder left is read up to its last complete record."""
+    """An mcap file; a file of a killed recorder is read up to its last complete record."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file from end to end, checksums included, or raise a BagError."""
+        """Read the whole file and verify its checksums.
+
+        Raises:
+            BagError: If the file is damaged.
+        """
         self.path = path
         self.topics: dict[str, BagTopic] = {}
         self.start, self.end = LATEST, 0
@@ -66,15 +70,15 @@ class McapFile:
         self._chunks: list[_Span] = []
         self._size = path.stat().st_size
         self._expanded = 0  # bytes of decompressed chunks so far
-        self._complete = 0  # bytes of complete records from the start of the file
-        self._newest: dict[str, int] = {}  # log time so far [ns], by topic
+        self._complete = 0  # end of the last complete record [bytes]
+        self._newest: dict[str, int] = {}  # latest log time so far [ns], by topic
         with reading(path), open_file(path) as file:
             self._survey(_ExactStream(file))
 
     def messages(
         self, topics: Collection[str], start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages of some topics from start to stop [ns], both included."""
+        """Yield messages of these topics from start to stop [ns], both included."""
         chunks = iter(self._chunks)
         with reading(self.path), open_file(self.path) as file:
             stream = _ExactStream(file)
@@ -97,18 +101,18 @@ class McapFile:
                     return
 
     def _survey(self, stream: _ExactStream) -> None:
-        """Find topics, times and the end of what is complete; check sizes, order and checksums."""
+        """Find topics, times and the last complete record; check sizes, order and checksums."""
         records = _record_reader(stream, validate_crcs=True).records
         schemas: dict[int, Schema] = {}
         statistics = None
-        in_data = True  # before the summary, which repeats schemas and channels
+        in_data = True  # false in the summary, which repeats schemas and channels
         while True:
             try:
                 record = next(records)
             except StopIteration:
                 break
             except EndOfFile:
-                self._note_cut()
+                self._note_truncation()
                 return
             if isinstance(record, Statistics):
                 statistics = record
@@ -122,17 +126,17 @@ class McapFile:
         if statistics is not None and statistics.message_count != count:
             raise ValueError(f'its summary counts {statistics.message_count} messages, not {count}')
 
-    def _note_cut(self) -> None:
-        """Take note that the file ends within a record."""
+    def _note_truncation(self) -> None:
+        """Record that the file ends within a record."""
         if self._complete == 0:
             raise ValueError('it ends within its first record')
         with open_file(self.path) as file:
             file.seek(-len(MAGIC), 2)
-            if file.read() == MAGIC:  # the file was ended, so a length within it is wrong
+            if file.read() == MAGIC:  # the file was closed, so the length of a record is wrong
                 raise ValueError('a record reaches beyond the end of the file')
         self.unfinished = (
             f'{self.path.name} ends within a record at byte {self._size}; '
-            f'what follows byte {self._complete} is lost'
+            f'the data after byte {self._complete} are lost'
         )
 
     def _survey_record(self, record: McapRecord, schemas: dict[int, Schema]) -> None:
@@ -177,18 +181,18 @@ class McapFile:
         topic.message_count += 1
         time = message.log_time
         if max(time, message.publish_time) > LATEST:
-            raise ValueError('a message has a time beyond all ROS times')
+            raise ValueError('a message has a time beyond the range of ROS time')
         newest = self._newest[topic.name] = max(self._newest.get(topic.name, 0), time)
         self.start, self.end = min(self.start, time), max(self.end, time)
         if newest - time > LONGEST_DISORDER:
             problem = f'the log times of {topic.name} go back by {(newest - time) / 1e9:.3g} s'
             raise BagError(self.path, problem, _JUMP)
         if self.end - time > LONGEST_DISORDER:
-            raise BagError(self.path, 'its topics are not in the order of time', CONVERT)
+            raise BagError(self.path, 'its messages are not in chronological order', CONVERT)
 
 
 class _ExactStream:
-    """Returns as many bytes as the library asks for, or raises EndOfFile."""
+    """A stream whose `read` returns exactly the requested bytes or raises EndOfFile."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self.position = 0
@@ -196,7 +200,7 @@ class _ExactStream:
 
     def read(self, size: int) -> bytes:
         if size < 0:
-            raise ValueError('the lengths in a record do not fit')
+            raise ValueError('the lengths in a record are inconsistent')
         data = self._stream.read(size)
         self.position += len(data)
         if len(data) < size:
@@ -211,10 +215,10 @@ def _record_reader(stream: Any, validate_crcs: bool) -> StreamReader:
 
 
 def _contents(record: McapRecord) -> list[McapRecord]:
-    """Return the records in a chunk; another record as it is."""
+    """Return the records in a chunk, or any other record unchanged."""
     if not isinstance(record, Chunk):
         return [record]
-    # The library decompresses whatever comes out. Here it is no more than the chunk announces.
+    # The library would decompress any amount, but `_decompress` stops at the stated size.
     data = _decompress(record)
     if len(data) != record.uncompressed_size:
         raise ValueError(f'a chunk does not decompress to {record.uncompressed_size} bytes')
@@ -237,10 +241,10 @@ def _decompress(chunk: Chunk) -> bytes:
 
 
 def _qos(text: str) -> list[Qos]:
-    """Return the offered profiles in a channel's metadata; [] if they cannot be read."""
+    """Return the offered QoS profiles in a channel's metadata, [] if they cannot be read."""
     if len(text) > _LONGEST_QOS:
         return []
     try:
         return parse_qos(text)
-    except Exception:  # noqa: BLE001 - the library raises many kinds; profiles are only a hint
+    except Exception:  # noqa: BLE001 - the library raises many types; profiles are only a hint
         return []

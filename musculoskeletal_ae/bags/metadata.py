@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a rosbag2 directory: written in version 9, read for the names of its files.
+"""Write metadata.yaml of a rosbag2 directory in version 9, and read the names of its files.
 
-It is written when recording starts and replaced when it ends. Reading never depends on what it says
-of times and counts: the storage files know that themselves.
+The recorder writes it when recording starts and replaces it when recording ends. Reading a bag does
+not rely on its times and counts, because the storage files contain them as well.
 """
 
 import os
@@ -29,16 +29,16 @@ FILE = 'metadata.yaml'
 VERSION = 9
 SUFFIXES = ('.mcap', '.db3')
 
-_NO_TIME = (1 << 63) - 1  # [ns] rosbag2's starting time of a bag without messages
+_NO_TIME = (1 << 63) - 1  # [ns]; rosbag2's starting time of a bag without messages
 _FOREVER = QosTime(9223372036, 854775807)
 
 
 class Contents(NamedTuple):
-    """What a bag directory says that it holds."""
+    """Contents of a bag directory according to its metadata.yaml."""
 
     files: list[Path]
-    message_count: int | None  # None if it does not say
-    problem: str  # why the files may not be all of the recording; '' if they are
+    message_count: int | None  # None if unknown
+    problem: str  # why the list of files may be incomplete; '' if it is complete
 
 
 class _Information(Struct):
@@ -52,7 +52,7 @@ class _Document(Struct):
 
 
 def offered_qos(latched: bool, reliable: bool = True) -> Qos:
-    """Return a QoS profile as a publisher offers it."""
+    """Return the QoS profile that a publisher offers."""
     return Qos(
         history=QosHistory.KEEP_LAST,
         depth=1 if latched else 10,
@@ -67,7 +67,7 @@ def offered_qos(latched: bool, reliable: bool = True) -> Qos:
 
 
 def qos_text(profiles: Sequence[Qos]) -> str:
-    """Return QoS profiles as rosbag2 writes them into a channel's metadata."""
+    """Return QoS profiles in rosbag2's format for a channel's metadata."""
     return yaml.encode(dump_qos_v9(list(profiles))).decode() if profiles else ''
 
 
@@ -78,14 +78,15 @@ def write_metadata(
     times: tuple[int, int] | None,
     finished: bool,
 ) -> None:
-    """Write metadata.yaml in one step: a reader sees the old one or the new one.
+    """Write metadata.yaml atomically.
 
     Args:
-        directory: Of the bag.
-        name: Of its one mcap file.
-        topics: With the hash of their type, '' if it is not known.
+        directory: The bag directory.
+        name: Name of its only mcap file.
+        topics: Each topic with the hash of its type, '' if unknown.
         times: The earliest and the latest log time [ns]; None without messages.
-        finished: Whether the recording has ended, so that the file must survive a power cut.
+        finished: Whether the recording has ended; the file is then synchronised to disk, to
+            survive a power failure.
     """
     start, end = times or (_NO_TIME, _NO_TIME)
     duration = {'nanoseconds': end - start}
@@ -133,23 +134,20 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
 
 
 def read_metadata(directory: Path) -> Contents:
-    """Return the storage files of a bag directory.
-
-    They are those that metadata.yaml names, or all that are there if it cannot be used.
-    """
+    """Return the storage files that metadata.yaml names, or all of them if it cannot be used."""
     try:
         metadata = convert(read_yaml(directory / FILE, _unusable), _Document)
     except ValueError as error:
         with reading(directory):
             files = sorted(file for file in directory.iterdir() if file.suffix in SUFFIXES)
         if not files:
-            problem = f'has neither a usable {FILE} nor mcap or sqlite3 files'
+            problem = f'has neither a readable {FILE} nor mcap or sqlite3 files'
             raise BagError(directory, problem, 'name a bag directory or a .mcap') from error
-        problem = f'{FILE} cannot be used ({error}); all files of the directory are read'
+        problem = f'{FILE} cannot be used ({error}); reading all files of the directory'
         return Contents(files, None, problem)
     information = metadata.rosbag2_bagfile_information
     if (information.compression_mode or 'none').lower() != 'none':
-        raise BagError(directory, 'rosbag2 compressed its files or messages one by one', CONVERT)
+        raise BagError(directory, 'its files or messages are compressed individually', CONVERT)
     names = dict.fromkeys(Path(name).name for name in information.relative_file_paths)
     return Contents([directory / name for name in names], information.message_count, '')
 

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Playing a recording: the messages of one lap, and recorded time against the steady clock.
+"""Play a recording: its messages, the time line, and demonstrated motions as trajectories.
 
-    recorded(t) = anchor_recorded + rate · (t − anchor_steady),  standing still while paused
+While playback is not paused, recorded time advances with the steady clock t:
 
-Or the motion that a hand taught an arm, as a trajectory that the arm can follow: smoothed, evenly
-spaced.
+    recorded(t) = anchor_recorded + rate · (t − anchor_steady)
+
+A motion that was demonstrated by hand becomes a smoothed, evenly spaced trajectory.
 """
 
 import math
@@ -23,22 +24,29 @@ from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
 
-# A player that was suspended goes on instead of catching up on more than this.
+# After a longer interruption, playback resumes instead of catching up.
 LONGEST_LAG = 1.0  # [s]
 
 TAUGHT_TOPIC = 'estimated_joint_states'
-SMOOTHING = 0.15  # [s] standard deviation: a hand is slower, noise of the estimate is faster
+# Standard deviation of the smoothing [s]; a hand moves more slowly, noise varies faster.
+SMOOTHING = 0.15
 SPACING = 0.1  # [s] between points
 LEAD_TIME = 3.0  # [s] to reach the first posture
 SHORTEST_MOTION = 0.5  # [s]
-LONGEST_GAP = 1.0  # [s] between two messages; over a longer gap, the motion is unknown
+LONGEST_GAP = 1.0  # [s] between two messages; the motion within a longer gap is unknown
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
-    """Return from when to when [ns, recorded] a bag is played: `duration` [s] from `start` [s]."""
+    """Return the recorded times [ns] at which playback begins and ends.
+
+    Args:
+        bag: The recording.
+        start: Where to begin, from the start of the bag [s].
+        duration: How long to play [s]; None: to the end.
+    """
     length = (bag.end - bag.start) / 1e9
     if start > length:
-        raise BagError(bag.path, f'is {length:.3f} s long', 'give a smaller --start')
+        raise BagError(bag.path, f'is {length:.3f} s long', 'choose a smaller --start')
     first = bag.start + round(start * 1e9)
     if duration is None or duration > length:
         return first, bag.end
@@ -46,53 +54,55 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 
 
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
-    """Yield what is published from start to stop [ns, recorded].
+    """Yield the messages to publish from start to stop [ns, recorded].
 
-    What was latched before the start comes first, as it would reach a late joiner. A message that
-    cannot be decoded ends the replay with a BagError: it does not reach the nodes.
+    The first are the last latched messages before the start, which a late joiner would receive.
+
+    Raises:
+        BagError: If a message cannot be decoded; replay must not publish it.
     """
-    held: dict[str, BagMessage] = {}
+    latched: dict[str, BagMessage] = {}
     if start > bag.start:
         for message in bag.messages(latched_topics(bag) & set(topics), stop=start - 1):
-            held[message.topic] = message._replace(log_time=start - 1)
-    for message in chain(held.values(), bag.messages(topics, start, stop)):
+            latched[message.topic] = message._replace(log_time=start - 1)
+    for message in chain(latched.values(), bag.messages(topics, start, stop)):
         bag.decode(message)
         yield message
 
 
 class Timeline:
-    """Which recorded time it is, `rate` recorded seconds in one second; may stand still."""
+    """Recorded time, which advances by `rate` seconds per second unless it is paused."""
 
     def __init__(self, start: int, rate: float, now: float) -> None:
-        """Begin at `start` [ns, recorded] when the steady clock says `now` [s]."""
+        """Begin at `start` [ns, recorded] when the steady clock reads `now` [s]."""
         self.paused = False
         self._rate, self._recorded, self._steady = rate, start, now
 
     def recorded(self, now: float) -> int:
-        """Return the recorded time [ns]."""
+        """Return the recorded time [ns] when the steady clock reads `now` [s]."""
         passed = 0.0 if self.paused else now - self._steady
         return self._recorded + int(passed * self._rate * 1e9)
 
     def wait(self, recorded: int, now: float) -> float:
         """Return the seconds until a recorded time [ns] is due, infinite if paused before it.
 
-        It is negative for what should have been published before.
+        The result is negative if the time has passed.
         """
         if self.paused:
             return math.inf if recorded > self._recorded else 0.0
         return (recorded - self._recorded) / (self._rate * 1e9) - (now - self._steady)
 
     def jump(self, recorded: int, now: float) -> None:
-        """Make it this recorded time [ns] now; paused, everything up to it is due."""
+        """Set the recorded time [ns]; while paused, all messages up to this time are due."""
         self._recorded, self._steady = recorded, now
 
     def hold(self, paused: bool, now: float) -> None:
-        """Stand still, or go on from where it stands."""
+        """Pause, or resume from the current recorded time."""
         self.jump(self.recorded(now), now)
         self.paused = paused
 
     def catch_up(self, recorded: int, now: float) -> None:
-        """Go on from `recorded` if it should have been published long ago."""
+        """Continue from `recorded` [ns] if it was due more than LONGEST_LAG ago."""
         if self.wait(recorded, now) < -LONGEST_LAG:
             self.jump(recorded, now)
 
@@ -101,21 +111,23 @@ class TaughtMotion(NamedTuple):
     """N points of a trajectory."""
 
     joints: tuple[str, ...]
-    time: Array  # from the start of the motion that leads there [s], (N,)
+    time: Array  # including LEAD_TIME to reach the first posture [s], (N,)
     theta: Array  # [rad], (N, D)
-    velocity: Array  # [rad/s], at rest at both ends, (N, D)
+    velocity: Array  # [rad/s], zero at both ends, (N, D)
 
 
 def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
-    """Return the motion on a recorded topic of JointState, from start to stop [ns, recorded].
+    """Return the motion on a recorded JointState topic from start to stop [ns, recorded].
 
-    It is of the joints that most messages name. A BagError says that there is none, or none that a
-    controller could follow.
+    Messages may name different joints; the motion is that of the most frequent set of joints.
+
+    Raises:
+        BagError: If there is no motion, or none that a controller could follow.
     """
     postures = defaultdict[tuple[str, ...], list[tuple[float, Array]]](list)
     for message in bag.messages([topic], start, stop):
         joint_state = bag.decode(message)
-        with suppress(MessageError):  # left out, as a node would
+        with suppress(MessageError):  # skip invalid messages, as a node does
             names = sorted(joint_state.name)
             values = read_target(joint_state, names)
             theta = np.array([values[name][0] for name in names])
@@ -126,7 +138,7 @@ def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
     recorded, theta = map(np.array, zip(*postures[joints]))
     _check_motion(bag, topic, recorded, len(joints))
     time = np.linspace(recorded[0], recorded[-1], max(2, round(np.ptp(recorded) / SPACING)) + 1)
-    # Messages that are further away than the longest gap have no weight.
+    # Messages further away than LONGEST_GAP get no weight.
     ends = np.searchsorted(recorded, [time - LONGEST_GAP, time + LONGEST_GAP]).T
     smooth: Array = np.empty((len(time), len(joints)))
     for n, (first, last) in enumerate(ends):
@@ -152,5 +164,5 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
 
 
 def _no_motion(bag: Bag, topic: str) -> BagError:
-    problem = f'{topic} holds no motion of at least {SHORTEST_MOTION:g} s'
-    return BagError(bag.path, problem, 'record it while the arm is taught a motion')
+    problem = f'{topic} contains no motion of at least {SHORTEST_MOTION:g} s'
+    return BagError(bag.path, problem, 'record it while you demonstrate a motion')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens recordings of rosbag2: all messages in the order of their time, or an error.
+"""Open rosbag2 recordings and read their messages in chronological order.
 
 bag = Bag.open('my_bag')
 for message in bag.messages(): …
@@ -27,14 +27,13 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-# Messages that may be held at once to bring them into order.
-MOST_HELD = 64 << 20  # [bytes]
-_OVERHEAD = 100  # [bytes] that a message counts beside its data
+MOST_HELD = 64 << 20  # [bytes] of messages held in memory to sort them
+_OVERHEAD = 100  # [bytes] counted for a message in addition to its data
 
 
 @dataclass
 class Bag:
-    """A recording: a directory of rosbag2, or one mcap or sqlite3 file."""
+    """A recording: a rosbag2 directory, or one mcap or sqlite3 file."""
 
     path: Path
     files: list[StorageFile]
@@ -43,10 +42,10 @@ class Bag:
 
     @classmethod
     def open(cls, path: str | Path) -> Bag:
-        """Read a recording from end to end.
+        """Read and check a whole recording.
 
-        What a killed recorder left is read up to its last complete record, and `unfinished` says
-        so.
+        A recording of a killed recorder is read up to its last complete record, and `unfinished`
+        then has the reason.
 
         Raises:
             BagError: If it is damaged or not a recording.
@@ -82,16 +81,20 @@ class Bag:
     def messages(
         self, topics: Collection[str] | None = None, start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages on topics (None: all) from start to stop [ns, log time], both included.
+        """Yield messages of topics (None: all) from start to stop [ns, log time], both included.
 
-        They come in the order of their log times; equal times keep the order of the file.
+        They are sorted by log time; messages of equal time keep the order of the file.
         """
         wanted = frozenset(self.topics if topics is None else topics)
         ordered = (_in_order(file.messages(wanted, start, stop)) for file in self.files)
         return heapq.merge(*ordered, key=lambda message: message.log_time)
 
     def decode(self, message: BagMessage) -> Any:
-        """Return the deserialized message; a BagError says that it is not what its type says."""
+        """Deserialize a message.
+
+        Raises:
+            BagError: If it does not fit the type of its topic.
+        """
         topic = self.topics[message.topic]
         with reading(message.file):
             if topic.problem:
@@ -99,16 +102,16 @@ class Bag:
             try:
                 return message_types.decode(message.data, topic.type)
             except Exception as error:
-                problem = f'a message of {topic.name} is not a {topic.type}: {error}'
+                problem = f'a message of {topic.name} is not a valid {topic.type}: {error}'
                 raise ValueError(problem) from error
 
 
 def _open_file(path: Path) -> StorageFile:
-    """Read an mcap or a sqlite3 file from end to end, or raise a BagError."""
+    """Open an mcap or sqlite3 file, or raise a BagError."""
     with open_file(path) as stream:
         head = stream.read(max(len(mcap_file.MAGIC), len(sqlite3_file.MAGIC)))
     if not head:
-        raise BagError(path, 'the file is empty', 'nothing was recorded: record again')
+        raise BagError(path, 'the file is empty', 'record again')
     if head.startswith(sqlite3_file.MAGIC):
         return sqlite3_file.Sqlite3File(path)
     if head.startswith(mcap_file.MAGIC):
@@ -117,7 +120,7 @@ def _open_file(path: Path) -> StorageFile:
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Sort messages by log time that are at most LONGEST_DISORDER out of order."""
+    """Sort messages, at most LONGEST_DISORDER out of order, by log time."""
     waiting: list[tuple[int, int, BagMessage]] = []
     newest = held = 0
     for number, message in enumerate(messages):

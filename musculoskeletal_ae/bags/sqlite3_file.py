@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sqlite3 file of rosbag2, read by the library rosbags."""
+"""Read sqlite3 files of rosbag2 with the library rosbags."""
 
 from __future__ import annotations
 
@@ -32,12 +32,16 @@ _DEFINITION_ENCODINGS = {
 
 
 class Sqlite3File:
-    """A sqlite3 file of rosbag2, read by the library rosbags; it holds no checksums."""
+    """A sqlite3 file of rosbag2; the format has no checksums."""
 
     has_checksums = False
 
     def __init__(self, path: Path) -> None:
-        """Read the file from end to end, or raise a BagError."""
+        """Read and check the whole file.
+
+        Raises:
+            BagError: If the file is damaged.
+        """
         self.path = path
         self.topics: dict[str, BagTopic] = {}
         self.start, self.end = LATEST, 0
@@ -45,7 +49,7 @@ class Sqlite3File:
         for journal in ('-wal', '-journal'):
             file = path.with_name(f'{path.name}{journal}')
             if file.exists() and file.stat().st_size:
-                self.unfinished = f'{path.name} was not closed: what {file.name} holds is not read'
+                self.unfinished = f'{path.name} was not closed: {file.name} is not read'
         with reading(path), Reader(path) as reader:
             self._check_integrity()
             for connection in reader.connections:
@@ -76,13 +80,13 @@ class Sqlite3File:
     def messages(
         self, topics: Collection[str], start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages of some topics from start to stop [ns], both included."""
+        """Yield messages of these topics from start to stop [ns], both included."""
         with reading(self.path), Reader(self.path) as reader:
             wanted = [c for c in reader.connections if absolute(c.topic) in topics]
             if not wanted:
                 return
             for connection, time, data in reader.messages(wanted):
                 if not isinstance(time, int) or not isinstance(data, bytes) or time < 0:
-                    raise ValueError('a row of its table of messages is not a message')
+                    raise ValueError('a row in its table of messages is not a valid message')
                 if start <= time <= stop:
                     yield BagMessage(absolute(connection.topic), time, 0, data, self.path)

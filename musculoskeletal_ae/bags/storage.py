@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the storage files of a recording have in common: topics, messages, and their errors.
+"""Common parts of the storage formats: topics, messages and errors.
 
-A file is read once from end to end when it is opened. After that its topics, its times and how much
-of it is complete are known, and `messages` reads it again.
+Opening a file reads it completely once, which yields its topics, its times and the end of its
+complete part. `messages` then reads it again.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from musculoskeletal_ae.bags.message_types import CDR, mismatch
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import open_regular
 
-# A topic's log times may go back by this much. More is a jump of the recorder's clock.
+# The log times of a topic may go back by this much; more is a jump of the recorder's clock.
 LONGEST_DISORDER = 1_000_000_000  # [ns]
-LATEST = (1 << 63) - 1  # [ns]; ROS time is signed
+LATEST = (1 << 63) - 1  # [ns]; the largest ROS time
 
 DAMAGED = 'use a copy or another recording'
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
@@ -34,10 +34,10 @@ _LONGEST_NAME = 256  # [characters]
 
 @contextmanager
 def reading(file: Path) -> Iterator[None]:
-    """Translate every error that reading a recording raises into a BagError.
+    """Turn every exception that reading a recording raises into a BagError.
 
-    Damaged bytes make the libraries raise almost any kind of exception, from struct.error to
-    MemoryError. This is the one place where they become a message to the user.
+    With damaged files, the libraries raise almost any type of exception, from struct.error to
+    MemoryError.
     """
     try:
         yield
@@ -57,24 +57,24 @@ class BagTopic:
     type: str
     qos: list[Qos] = field(default_factory=list)  # offered profiles
     encoding: str = CDR  # of its messages
-    schema: Schema | None = None  # the recorded definition, to be copied and never used
+    schema: Schema | None = None  # the recorded definition, which is only copied
     problem: str = ''  # why its messages cannot be used; '' if they can
     message_count: int = 0
 
     @property
     def is_latched(self) -> bool:
-        """Whether its last message reaches late joiners."""
+        """Whether late joiners receive its last message."""
         return any(profile.durability == QosDurability.TRANSIENT_LOCAL for profile in self.qos)
 
 
 class BagMessage(NamedTuple):
-    """A message as it was recorded."""
+    """A recorded message."""
 
     topic: str  # absolute name
-    log_time: int  # when it was received [ns]
-    publish_time: int  # when it was sent [ns]; 0 if not recorded
+    log_time: int  # time of reception [ns]
+    publish_time: int  # time of publication [ns]; 0 if not recorded
     data: bytes  # serialized
-    file: Path  # the storage file it is from
+    file: Path  # the storage file that contains it
 
 
 class StorageFile(Protocol):
@@ -84,21 +84,25 @@ class StorageFile(Protocol):
     topics: dict[str, BagTopic]  # by recorded name
     start: int  # earliest log time [ns]; LATEST without messages
     end: int  # latest log time [ns]; 0 without messages
-    unfinished: str  # what is known to be missing at its end; '' if nothing is
-    has_checksums: bool  # whether these protect all messages
+    unfinished: str  # why its end is missing; '' if the file is complete
+    has_checksums: bool  # whether checksums protect all messages
 
     def messages(
         self, topics: Collection[str], start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages of some topics from start to stop [ns], both included.
+        """Yield messages of these topics from start to stop [ns], both included.
 
-        They come in the order of the file, which is that of time within LONGEST_DISORDER.
+        They keep the order of the file, which is chronological within LONGEST_DISORDER.
         """
         ...
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a regular file for reading, or raise a BagError."""
+    """Open a regular file for reading.
+
+    Raises:
+        BagError: If it cannot be opened.
+    """
 
     def refuse(file: Path, problem: str) -> BagError:
         return BagError(file, problem, 'name another bag directory or .mcap')
@@ -114,7 +118,7 @@ def absolute(name: str) -> str:
 def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
     """Return why messages of a topic cannot be used; '' if they can."""
     if len(topic.name) > _LONGEST_NAME or not _TOPIC_NAME.fullmatch(topic.name):
-        return 'has a name that no topic of ROS can have'
+        return 'has a name that is not legal in ROS'
     if topic.encoding != CDR:
         return f'is encoded as {topic.encoding[:40]!r}, not cdr'
     definition = topic.schema or Schema(0, b'', '', topic.type)
@@ -122,10 +126,10 @@ def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
 
 
 def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTopic:
-    """Add a topic or find it among those that are there; return it with their messages summed."""
+    """Add a topic, or add its messages to the topic of the same name; return the topic."""
     first = topics.setdefault(topic.name, replace(topic, message_count=0))
     if (first.type, first.problem) != (topic.type, topic.problem):
         problem = f'topic {topic.name} has the types {first.type[:80]}, {topic.type[:80]}'
-        raise BagError(file, problem, 'record one type on a topic')
+        raise BagError(file, problem, 'record a topic with one type only')
     first.message_count += topic.message_count
     return first

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The streams of a recording as arrays, by the rules of validity: what offline training reads."""
+"""The valid messages of a recording as arrays, for offline training."""
 
 import heapq
 import math
@@ -29,9 +29,10 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-#: a topic of this many messages is judged: its delays differ by so much [ns], and so many of its
-#: messages were written with the one before
-FEW, BUNCHED, MANY = 20, 50_000_000, 0.3
+# Conditions for a topic whose log times are bunched.
+FEW = 20  # shorter topics are not checked
+BUNCHED = 50_000_000  # [ns]; the delays of its messages differ by more than this
+MANY = 0.3  # at least this share of its messages was written together with the one before
 
 
 class Series(NamedTuple):
@@ -42,38 +43,38 @@ class Series(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """θ and (T, l) that belong together."""
+    """P pairs of simultaneous θ and (T, l)."""
 
     time: Array  # [s], (P,)
-    theta: Array  # θ [rad], (P, D); NaN of joints without a sensor
+    theta: Array  # θ [rad], (P, D); NaN for joints without a sensor
     length: Array  # l [m], (P, M)
     tension: Array  # T [N], (P, M)
-    isolated: Ints  # 1 of isolated muscles, 0 of others, -1 where that was not recorded, (P, M)
+    isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
     def first(self, count: int) -> 'Pairs':
-        """Return the first so many pairs."""
+        """Return the first `count` pairs."""
         time, theta, length, tension, isolated = self
         return Pairs(time[:count], theta[:count], length[:count], tension[:count], isolated[:count])
 
 
 class Streams(NamedTuple):
-    """What one arm measured and was commanded; a topic that the bag lacks is an empty series."""
+    """Sensor data and commands of one arm; missing topics are empty series."""
 
-    joints: Series  # θ [rad], (N, D); NaN of joints without a sensor
+    joints: Series  # θ [rad], (N, D); NaN for joints without a sensor
     muscles: Series  # length [m], tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
-    isolated: Series  # 1 of isolated muscles, else 0, (N, M)
-    rejected: Counter[str]  # messages left out, by topic and reason
-    ignored: Counter[str]  # parts of messages left out, by topic and what it was
-    notes: tuple[str, ...]  # what else is to be known
+    isolated: Series  # 1 for isolated muscles, else 0, (N, M)
+    rejected: Counter[str]  # rejected messages by topic and reason
+    ignored: Counter[str]  # unused parts of messages by topic and part
+    notes: tuple[str, ...]  # further remarks for the user
 
     def pairs(self) -> Pairs:
-        """Pair θ and (T, l) as a live learner does (`musculoskeletal_ae.signals.pairing`)."""
+        """Pair θ and (T, l) by the same rule as the live learner (`signals/pairing.py`)."""
         time = self.muscles.time
         pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
-        # A muscle message at the end of time gives out the last one.
+        # A muscle message at time ∞ makes `Pairing` return the last one.
         muscles = ((came, 1, row) for row, came in enumerate([*time, math.inf]))
         theta, muscle = [], []  # θ, and the row of the muscle message
         for came, kind, row in heapq.merge(joints, muscles):
@@ -94,28 +95,33 @@ class Streams(NamedTuple):
 
 @dataclass
 class _Stream:
-    """A topic that is being read, and the shape of its values."""
+    """Values of a topic while it is being read."""
 
-    shape: tuple[int, ...]
-    read: Callable[[Any, float], Array]  # of a message and when it came [s]
+    shape: tuple[int, ...]  # of the values of a message
+    read: Callable[[Any, float], Array]  # converts a message and its time [s] to values
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
 
     def take(self, message: tuple[float, Any]) -> None:
-        """Take the time and the content of a message."""
+        """Add a message, a pair of time [s] and content."""
         came, content = message
         self.values.append(self.read(content, came))
         self.times.append(came)
 
 
 def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
-    """Read the sensors and commands of one arm; `namespace` is its own where the bag has several.
+    """Read sensor data and commands of one arm.
 
-    Muscle states pass the same `MuscleStream` as on a robot: messages that are not plausible are
-    left out and counted. The offsets of the last `muscle_length_zeros` are subtracted from lengths,
-    and those of its first message also from what came before, if they are known. Messages that
-    came while offsets were being found are left out. Values of isolated muscles that are not finite
-    become 0, temperatures NaN.
+    Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
+    implausible messages. Lengths are corrected by the length offsets that `muscle_length_zeros` had
+    published at that time. Its first offsets, if known, also correct the earlier lengths. Messages
+    received while offsets were unknown are rejected. For isolated muscles, values that are not
+    finite become 0, and temperatures NaN.
+
+    Args:
+        bag: The recording.
+        robot: The robot, whose joints and muscles the messages must have.
+        namespace: The namespace of the arm; required only if the bag has several.
 
     Raises:
         BagError: If no message of a topic fits the robot, or the bag is damaged.
@@ -158,11 +164,11 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     late = _bunched(bag, list(topics))
     reception = Reception(warnings.append)
     receive = dict[tuple[str, ...], Callable[[Any, dict[str, Any]], Any]]()
-    # The body state comes first: the recorder may have received it later than the readings.
+    # The body state is read first, because the recorder may have received it after the readings.
     early = [name for name, topic in topics.items() if topic is isolated or topic is offsets]
     for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
         decoded = bag.decode(message)
-        # Publishers of different joints on one topic have clocks of their own.
+        # Publishers of different joints on one topic may have different clocks.
         sender = message.topic, *getattr(decoded, 'name', ())
         if sender not in receive:
             take = topics[message.topic].take
@@ -176,28 +182,30 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         reasons = [text.partition(f' {topic}: ')[2] for text in warnings if f' {topic}: ' in text]
         if reasons and not stream.values:
             problem = f'no message of {topic} fits the robot ({reasons[-1]})'
-            raise BagError(bag.path, problem, 'choose the robot it was recorded from')
+            raise BagError(bag.path, problem, 'choose the robot that was recorded')
     joint_states, states, lengths, tensions, isolated_series, _ = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
         for stream in streams.values()
     )
     use = np.array(has_offsets, dtype=bool)
     if not use.all():
-        reception.rejected[f'{recorded["muscle_states"]}: zeros unknown'] += int((~use).sum())
+        reason = f'{recorded["muscle_states"]}: length offsets unknown'
+        reception.rejected[reason] += int((~use).sum())
         states = Series(states.time[use], states.values[use])
     series = joint_states, states, lengths, tensions, isolated_series
     notes = [
-        f'{topic}: the recorder wrote late and in bunches; messages count from when they were sent'
+        f'{topic}: the recorder wrote messages late and in bunches; their publish times are used'
         for topic in late
     ]
     return Streams(*series, reception.rejected, reception.ignored, tuple(notes))
 
 
 def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
-    """Return the topics whose log times are bunched, and what to add to their publish times [ns].
+    """Return the topics with bunched log times, and the offsets of their publishers' clocks [ns].
 
-    A recorder that is held up for a moment writes many messages with one log time. The clock of
-    the publisher may be another one: the message that was written soonest has no delay.
+    A recorder that was blocked for a moment writes many messages with the same log time. Publish
+    times are then better, but the publisher's clock may differ. Its offset is the shortest delay
+    between publication and writing.
     """
     times = {topic: (array('q'), array('q')) for topic in topics}
     for message in bag.messages(topics):
@@ -216,19 +224,24 @@ def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:
-    """Return which message was the last at some times; the first was latched before it came."""
+    """Return the index of the last message at each time; before the first, that of the first.
+
+    The first message of a latched topic was published before it was recorded.
+    """
     return np.maximum(np.searchsorted(times, when, side='right') - 1, 0)
 
 
 def _body_at(time: float, before: BodyState, isolated: _Stream, offsets: _Stream) -> BodyState:
-    """Return the body state at a time; `before` if it is still that one."""
+    """Return the body state at a time [s], or `before` if it has not changed."""
     body = before
     if isolated.values:
         body = body.with_isolated(np.flatnonzero(isolated.values[_latched(isolated.times, time)]))
     if offsets.values:
-        number = int(np.searchsorted(offsets.times, time, side='right'))  # 0: nothing known yet
+        # Number of offsets published so far. Known first offsets were published before the bag
+        # began; the recorder received the latched message a little late.
+        number = int(np.searchsorted(offsets.times, time, side='right'))
         if number == 0 and LengthOffsets(*offsets.values[0]).known:
-            number = 1  # latched before the bag: the recorder heard the estimator a little late
+            number = 1
         newest = offsets.values[number - 1] if number else np.zeros_like(offsets.values[0])
         if not (newest == [body.offsets.offset, body.offsets.deviation]).all():
             body = body.with_offsets(LengthOffsets(*newest))

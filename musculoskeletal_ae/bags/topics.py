@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of doc/reference/topics_and_services.md, and which topics of a bag they are."""
+"""The topics of doc/reference/topics_and_services.md, and their names in a bag."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -13,11 +13,11 @@ class Topic(NamedTuple):
     """One row of the table in doc/reference/topics_and_services.md."""
 
     type: str
-    latched: bool = False  # the last message reaches late joiners
-    sent: bool = False  # by hardware, vision, user or controller: not computed from the rest
+    latched: bool = False  # whether late joiners receive the last message
+    sent: bool = False  # whether hardware, vision, user or controller send it; else it is computed
 
 
-DIAGNOSTICS = '/diagnostics'  # the one absolute name
+DIAGNOSTICS = '/diagnostics'  # the only absolute name
 DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
@@ -27,8 +27,12 @@ SENT = [name for name, topic in TOPICS.items() if topic.sent]
 def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
-    `namespace` is the one that is meant where the bag has several; a BagError asks for it, or says
-    that a topic has a type other than the interface's.
+    Args:
+        bag: The recording.
+        namespace: The namespace of the arm; required only if the bag has several.
+
+    Raises:
+        BagError: If the namespace is ambiguous, or a topic has another type than the interface.
     """
     names = _relative_names(bag, namespace)
     ours = {relative: name for name, relative in names.items() if relative in TOPICS}
@@ -40,14 +44,20 @@ def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
 def select(
     bag: Bag, wanted: Sequence[str], namespace: str | None, keep_names: bool
 ) -> dict[str, str]:
-    """Return the name to publish each wanted topic on, by its recorded name.
+    """Select topics to replay; return the name to publish on by recorded name.
 
-    Wanted are `default` (what hardware, vision, user and controller sent), `all` (every topic of
-    the interface), or relative or recorded names, which may be foreign to the interface.
-    `namespace` is the one that is meant where the bag has several.
+    Args:
+        bag: The recording.
+        wanted: ['default'] for topics that hardware, vision, user and controller sent, ['all'] for
+            every topic of the interface, or relative or recorded names of any topics.
+        namespace: The namespace of the arm; required only if the bag has several.
+        keep_names: Whether to publish on the recorded names.
+
+    Raises:
+        BagError: If the namespace is ambiguous, or a topic is missing or cannot be replayed.
     """
     if keep_names and namespace is None:
-        # Several namespaces are no problem when all names stay as they are.
+        # With the recorded names, several namespaces are not ambiguous.
         names = {name: interface_name(name) for name in bag.topics}
     else:
         names = _relative_names(bag, namespace)
@@ -69,9 +79,9 @@ def select(
 
 
 def latched_topics(bag: Bag) -> set[str]:
-    """Return the recorded names of topics whose last message reaches late joiners.
+    """Return the recorded names of latched topics.
 
-    Those of the interface are latched even if the recorder took no note of it.
+    Latched topics of the interface are included even if the recorder did not store their QoS.
     """
     ours = {name for name, topic in TOPICS.items() if topic.latched}
     return {
@@ -82,10 +92,10 @@ def latched_topics(bag: Bag) -> set[str]:
 
 
 def namespaces(names: Iterable[str]) -> list[str]:
-    """Return the namespaces ('' or '/left_arm') under which topics were recorded; foreign are none.
+    """Return the namespaces, '' or such as '/left_arm', of the interface's topics in a recording.
 
-    `/sim/joint_states` alone may be the joint_states of a namespace `/sim`: of the namespaces that
-    explain all topics of the interface, the shortest is meant. Only if none does there are several.
+    A name can be ambiguous: `/sim/joint_states` may be `joint_states` in the namespace `/sim`. If
+    one namespace explains all topics, only the shortest such namespace is returned.
     """
     readings = [
         {name[: -len(topic) - 1] for topic in TOPICS if name.endswith(f'/{topic}')}
@@ -97,20 +107,20 @@ def namespaces(names: Iterable[str]) -> list[str]:
 
 
 def interface_name(name: str) -> str:
-    """Return the longest name of the interface that a recorded name ends in, or the name."""
+    """Return the longest name of the interface with which a recorded name ends, or the name."""
     endings = [topic for topic in TOPICS if name.endswith(f'/{topic.lstrip("/")}')]
     return max(endings, key=len, default=name)
 
 
 def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
-    """Return each recorded name without the namespace; names outside it stay absolute."""
+    """Return the relative name of each recorded name; names outside the namespace stay absolute."""
     if namespace is None:
         namespace, *others = namespaces(bag.topics)
         if others and (nested := _innermost(bag.topics, [namespace, *others])) is not None:
             namespace = nested
         elif others:
             several = ', '.join(name or '/' for name in (namespace, *others))
-            problem = f'topics of the interface lie under several namespaces: {several}'
+            problem = f'topics of the interface are in several namespaces: {several}'
             remedy = 'choose one with --from-namespace (or replay all with --keep-names)'
             raise BagError(bag.path, problem, remedy)
     prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
@@ -120,7 +130,7 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
     names = {
         name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics
     }
-    # What the namespace lacks may lie in one around it, as joint_states of a driver in the root.
+    # Missing topics may be in an enclosing namespace, such as a driver's joint_states in the root.
     for outer in _around(namespace):
         for name in bag.topics:
             relative = name.removeprefix(f'{outer}/')
@@ -130,15 +140,15 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
 
 
 def _around(namespace: str) -> list[str]:
-    """Return the namespaces around one, the nearest first; '' is the root."""
+    """Return the namespaces that enclose a namespace, the innermost first; '' is the root."""
     parts = [part for part in namespace.split('/') if part]
     return [''.join(f'/{part}' for part in parts[:n]) for n in reversed(range(len(parts)))]
 
 
-def _innermost(topics: Iterable[str], found: Sequence[str]) -> str | None:
-    """Return the namespace that all others lie around, if no topic is in two of them."""
-    innermost = max(found, key=len)
-    if not set(found) <= {innermost, *_around(innermost)}:
+def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
+    """Return the namespace that all others enclose, unless a topic is in two of them."""
+    innermost = max(nested, key=len)
+    if not set(nested) <= {innermost, *_around(innermost)}:
         return None
     relative = [interface_name(name) for name in topics if interface_name(name) in TOPICS]
     ours = [name for name in relative if name != DIAGNOSTICS]
@@ -150,6 +160,6 @@ def _compare_type(bag: Bag, name: str, relative: str) -> None:
     expected = TOPICS[relative].type if relative in TOPICS else topic.type
     if topic.type != expected:
         problem = f'topic {name} has the type {topic.type[:80]!r}, not {expected!r}'
-        raise BagError(bag.path, problem, 'rename the topic where it is recorded')
+        raise BagError(bag.path, problem, 'rename the topic before recording')
     if topic.problem:
-        raise BagError(bag.path, f'topic {name} {topic.problem}', 'leave it out')
+        raise BagError(bag.path, f'topic {name} {topic.problem}', 'choose other topics')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a rosbag2 directory that can be read to the last second if the writer is killed."""
+"""Write a rosbag2 directory that remains readable up to the last flush if the writer is killed."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from musculoskeletal_ae.bags.storage import BagTopic
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
-# A chunk is also closed when it has grown to this size.
-_LARGEST_CHUNK = 1 << 20  # [bytes]
+_LARGEST_CHUNK = 1 << 20  # [bytes]; a chunk of this size is closed
 
 
 class BagWriter:
-    """Writes messages to `DIR/DIR_0.mcap` and metadata.yaml.
+    """Writes messages to `DIR/DIR_0.mcap`, and metadata.yaml.
 
-    What was written before the last `flush` survives the death of the process.
+    Messages written before the last `flush` survive a crash of the process.
     """
 
     def __init__(self, directory: Path, compression: str = 'zstd') -> None:
-        """Create the directory; one that exists must be empty, or there is a BagError.
+        """Create the directory.
 
-        metadata.yaml names the file after it, so its name must be UTF-8.
+        Raises:
+            BagError: If it exists and is not empty, cannot be written, or has a name that is not
+                UTF-8, which metadata.yaml could not contain.
         """
         self.directory = Path(directory)
         self.topics: dict[str, BagTopic] = {}
         self._name = f'{self.directory.resolve().name}_0.mcap'
         try:
             self._name.encode()
-        except UnicodeEncodeError as error:  # Python's substitutes for other bytes
+        except UnicodeEncodeError as error:  # Python represents other bytes by surrogates
             problem = 'the name is not UTF-8'
             raise BagError(self.directory, problem, 'choose another name') from error
         self._hashes: dict[str, str] = {}  # of types, by topic
@@ -45,7 +46,7 @@ class BagWriter:
         self._schemas: dict[str, int] = {}  # by type
         self._pending: list[tuple[int, str, int, bytes]] = []
         self._pending_size = 0
-        self._times: tuple[int, int] | None = None  # the earliest and the latest [ns]
+        self._times: tuple[int, int] | None = None  # earliest and latest log time [ns]
         with self._writing():
             is_new = not self.directory.exists()
             self.directory.mkdir(parents=True, exist_ok=True)
@@ -53,7 +54,7 @@ class BagWriter:
                 raise BagError(self.directory, 'is not empty', 'name a new directory to record to')
             try:
                 self._file = (self.directory / self._name).open('xb')
-            except OSError:  # the file's name may be too long where the directory's is not
+            except OSError:  # the file name can be too long although the directory's name is not
                 if is_new:
                     self.directory.rmdir()
                 raise
@@ -70,9 +71,13 @@ class BagWriter:
     def add_topic(
         self, name: str, type_name: str, qos: Sequence[Qos] = (), schema: Schema | None = None
     ) -> None:
-        """Add a topic by its absolute name.
+        """Add a topic.
 
-        The schema is a definition to copy as it is, of a type that ROS 2 Jazzy does not define.
+        Args:
+            name: Absolute name.
+            type_name: Message type.
+            qos: Offered QoS profiles.
+            schema: Definition to copy if ROS 2 Jazzy does not define the type.
         """
         type_hash = ''
         if message_types.is_known(type_name):
@@ -93,15 +98,15 @@ class BagWriter:
         self._write_metadata(finished=False)
 
     def write(self, topic: str, log_time: int, publish_time: int, data: bytes) -> None:
-        """Add a serialized message to a topic; the next `flush` puts it into the file."""
+        """Add a serialized message to a topic; the next `flush` writes it to the file."""
         self._pending.append((log_time, topic, publish_time, data))
         self._pending_size += len(data)
         if self._pending_size > _LARGEST_CHUNK:
             self.flush()
 
     def flush(self) -> None:
-        """Close the chunk and give it to the operating system."""
-        # Callbacks of several topics come a little out of order; readers like files in order.
+        """Close the chunk and pass it to the operating system."""
+        # Callbacks of several topics run slightly out of order, but readers expect ordered files.
         pending = sorted(self._pending, key=lambda entry: entry[0])
         self._pending, self._pending_size = [], 0
         with self._writing():
@@ -114,11 +119,11 @@ class BagWriter:
 
     @property
     def message_count(self) -> int:
-        """Messages in the file."""
+        """Number of messages in the file."""
         return sum(topic.message_count for topic in self.topics.values())
 
     def close(self) -> None:
-        """End the file and its metadata.yaml."""
+        """Complete the file and metadata.yaml."""
         self.flush()
         with self._writing():
             self._mcap.finish()
@@ -129,11 +134,11 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """End the bag; after an error it stays unfinished."""
+        """Complete the bag; after an exception, leave it unfinished."""
         if kind is None:
             self.close()
         else:
-            with suppress(OSError):  # of what Python still buffers: the first error says why
+            with suppress(OSError):  # flushing may fail again; the first error has the reason
                 self._file.close()
 
     def _write_metadata(self, finished: bool) -> None:
@@ -147,15 +152,14 @@ class BagWriter:
             yield
         except OSError as error:
             problem = f'cannot be written: {error.strerror or error}'
-            raise BagError(self.directory, problem, 'name another place') from error
+            raise BagError(self.directory, problem, 'choose another directory') from error
 
 
 def recover(path: Path, target: Path, compression: str = 'zstd') -> tuple[int, list[str]]:
-    """Write all messages of a recording that can be read into a new, finished bag.
+    """Write all readable messages of a recording to a new, finished bag.
 
     Returns:
-        The number of messages, and the topics that are left out: a bag as we write it holds
-        messages in CDR only.
+        The number of messages, and the omitted topics, whose messages are not encoded in CDR.
     """
     bag = Bag.open(path)
     with BagWriter(target, compression) as writer:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network, its units and masks, checkpoint and initial training."""
+"""The network, its units and masks, checkpoints and initial training."""

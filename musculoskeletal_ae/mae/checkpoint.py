@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained network as safetensors bytes: for files, and for the topic `mae_checkpoint`.
+"""Checkpoints: a trained network as safetensors bytes, in files and on the topic `mae_checkpoint`.
 
-Nothing of a checkpoint is used before all of it has been checked, and every fault is a
-`CheckpointError` that names the source, the value, what is legal and what to do. Never pickle.
+A checkpoint is checked completely before any part of it is used. Every fault raises a
+`CheckpointError` that names the source, the value, the legal values and the remedy. Pickle is never
+used, because unpickling can run arbitrary code.
 """
 
 import json
@@ -30,28 +31,29 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
 FORMAT_VERSION = 1
-MAX_BYTES = 64 * 1024 * 1024  # a hundred times the shipped arms' networks
+MAX_BYTES = 64 * 1024 * 1024  # a hundred times the networks of the shipped arms
 MAX_HEADER_BYTES = 1024 * 1024
-# A weight or spread beyond these is no trained network, and could overflow where they are folded.
+# No trained network has values beyond these limits. Larger ones could overflow when `Mae` folds
+# units and standardisation into the layers.
 LARGEST = 1e9
 SMALLEST_STD = 1e-9
-LARGEST_FRICTION = 5.0  # a factor of 150 between the ends of a wire
-SMALLEST_EIGENVALUE = 1e-12  # of the largest one
-#: beyond what a trained network says of a posture at rest: θ [rad], T [N], l [m], G [m/rad]
+LARGEST_FRICTION = 5.0  # μ; a factor of 150 between the tensions at the ends of a tendon
+SMALLEST_EIGENVALUE = 1e-12  # of a covariance, relative to the largest eigenvalue
+#: limits of a trained network's estimate of a rest posture: θ [rad], T [N], l [m], G [m/rad]
 ABSURD = (100.0, 1e5, 100.0, 1e5)
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
 Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-#: entries of the metadata that the network has under the same name
+#: entries of the metadata that are attributes of `Mae` with the same name
 SHARED = (
     'joints', 'muscles', 'groups', 'isolated', 'activation', 'preset', 'version', 'training',
 )  # fmt: skip
 
 
 class Metadata(Strict, frozen=True):
-    """What a checkpoint says of its network; safetensors holds each entry as JSON text."""
+    """Metadata of a checkpoint; safetensors stores each entry as JSON text."""
 
     format_version: int
     units: str
@@ -59,23 +61,23 @@ class Metadata(Strict, frozen=True):
     muscles: Names
     layer_sizes: Annotated[tuple[Units, ...], Meta(min_length=3, max_length=21_000)]
     groups: Annotated[tuple[Group, ...], Meta(min_length=1, max_length=1000)]
-    isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)]  # places of muscles
+    isolated: Annotated[tuple[Count, ...], Meta(max_length=1000)]  # indices of muscles
     activation: ActivationName
     preset: str
     version: Count
     training: Annotated[str, Meta(max_length=10_000)]
-    anomaly_calibrated: bool | None  # None: there are no anomaly statistics
+    anomaly_calibrated: bool | None  # None: no anomaly statistics
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None  # None: no touch statistics
-    uncertain: bool  # whether it holds the covariance of its estimates
+    uncertain: bool  # whether the covariance of the estimates is included
 
     def __post_init__(self) -> None:
-        """Check what types cannot express."""
+        """Check the rules that types cannot express."""
         for key, names in (('joints', self.joints), ('muscles', self.muscles)):
             if len(set(names)) < len(names) or not all(n and n.isprintable() for n in names):
-                raise ValueError(f'{key} {names}; legal: different names, printable')
+                raise ValueError(f'{key} {names}; legal: different printable names')
         for key, word, legal in (('units', self.units, [UNITS]), ('preset', self.preset, PRESETS)):
             if word not in legal:
                 raise ValueError(f'{key} {word!r}; legal: {", ".join(legal)}')
@@ -84,8 +86,8 @@ class Metadata(Strict, frozen=True):
                 raise ValueError(f'groups {self.groups}; legal: each joint and muscle in one group')
         known, muscles = set(self.isolated), range(len(self.muscles))
         if len(known) < len(self.isolated) or not known <= {*muscles}:
-            raise ValueError(f'isolated {self.isolated}; legal: different places of muscles')
-        # Encoder and decoder have the same hidden layers, with the latent one in the middle.
+            raise ValueError(f'isolated {self.isolated}; legal: different indices of muscles')
+        # Encoder and decoder have the same hidden layers; the latent layer is in the middle.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))
         for group, sizes in zip(self.groups, self.sizes_by_group(), strict=True):
             d, m = len(group.joints), len(group.muscles)
@@ -101,14 +103,16 @@ class Metadata(Strict, frozen=True):
         return [self.layer_sizes[g * depth :][:depth] for g in range(len(self.groups))]
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return name and shape of every tensor of such a network."""
+        """Return the name and shape of every tensor that belongs to this metadata."""
         values = len(self.joints) + 2 * len(self.muscles)
         shapes: dict[str, tuple[int, ...]] = {'mean': (values,), 'std': (values,)}
         for g, sizes in enumerate(self.sizes_by_group()):
             depth = len(sizes) // 2
             for i, (into, out) in enumerate(pairwise(sizes)):
-                name, layer = ('decoder', 'encoder')[i < depth], g * depth + i % depth
-                shapes |= {f'{name}.{layer}.weight': (out, into), f'{name}.{layer}.bias': (out,)}
+                stack = 'encoder' if i < depth else 'decoder'
+                layer = g * depth + i % depth
+                shapes[f'{stack}.{layer}.weight'] = out, into
+                shapes[f'{stack}.{layer}.bias'] = (out,)
         if self.anomaly_calibrated is not None:
             muscles = 2 * len(self.muscles)
             shapes |= {'anomaly.mean': (muscles,), 'anomaly.covariance': (muscles, muscles)}
@@ -122,7 +126,7 @@ class Metadata(Strict, frozen=True):
 
 
 def to_bytes(mae: Mae) -> bytes:
-    """Return a network as safetensors bytes; `from_bytes` gives back the same bits."""
+    """Return a network as safetensors bytes; `from_bytes` restores it bit by bit."""
     anomaly = mae.anomaly
     tensors: dict[str, Array] = {'mean': mae.mean, 'std': mae.std}
     for name, stack in (('encoder', mae.encoder), ('decoder', mae.decoder)):
@@ -155,11 +159,16 @@ def to_bytes(mae: Mae) -> bytes:
 
 
 def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoint') -> Mae:
-    """Return the network of safetensors bytes, checked; messages call them `source`.
+    """Check safetensors bytes and return their network.
+
+    Args:
+        data: The bytes.
+        robot: If present, the network must have its joints and muscles in the same order, and
+            must estimate a rest posture with sensible values.
+        source: Name of the checkpoint in error messages.
 
     Raises:
-        CheckpointError: If anything is wrong, or it does not fit the robot: not the same joints and
-            muscles in the same order, or values that cannot be computed with.
+        CheckpointError: If the checkpoint is invalid or does not fit the robot.
     """
     try:
         meta = _metadata(data)
@@ -176,7 +185,7 @@ def _refused(source: str | Path, problem: str) -> CheckpointError:
 
 
 class _Header(msgspec.Struct, frozen=True):
-    """What safetensors puts before the tensors; it checks what it says of these itself."""
+    """Header of safetensors bytes; safetensors itself checks the entries of the tensors."""
 
     metadata: dict[str, str] = msgspec.field(name='__metadata__')
 
@@ -197,10 +206,10 @@ def _metadata(data: bytes) -> Metadata:
         problem = f'no metadata ({error}); this is not a checkpoint of musculoskeletal_ae'
         raise CheckpointError(problem) from error
     values = {key: _json(text, key) for key, text in entries.items()}
-    # First of all: another format may differ in everything that the schema checks.
+    # The version is checked first, because another version may violate the whole schema.
     version = values.get('format_version')
     if version is True or version != FORMAT_VERSION:
-        problem = f'format_version {version!r:.100}; this program reads {FORMAT_VERSION}'
+        problem = f'format_version {version!r:.100}; legal: {FORMAT_VERSION}'
         raise CheckpointError(problem)
     return convert(values, Metadata, lambda problem: CheckpointError(f'metadata: {problem}'))
 
@@ -213,7 +222,7 @@ def _json(text: str, key: str) -> Any:
 
 
 def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
-    """Return the tensors that the metadata announces, all finite and in range."""
+    """Return the tensors that belong to the metadata, after checking shapes and values."""
     try:
         tensors: dict[str, Array] = load_tensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
@@ -223,19 +232,19 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
         raise CheckpointError(f'tensors missing or unknown: {", ".join(sorted(odd))[:200]}')
     for name, value in tensors.items():
         if value.dtype != np.float64:
-            raise CheckpointError(f'tensor {name} is of {value.dtype}; legal: float64')
+            raise CheckpointError(f'tensor {name} has type {value.dtype}; legal: float64')
         if value.shape != shapes[name]:
             raise CheckpointError(f'tensor {name} has shape {value.shape}; legal: {shapes[name]}')
         if not (np.abs(value) <= LARGEST).all():
-            raise CheckpointError(f'tensor {name} holds a value beyond ±{LARGEST:g}, or not finite')
+            raise CheckpointError(f'tensor {name} has a value beyond ±{LARGEST:g} or not finite')
     for name in ('std', 'touch.spread'):
         if name in tensors and (least := tensors[name].min()) < SMALLEST_STD:
-            found, legal = distinct(least, SMALLEST_STD)
-            problem = f'tensor {name} holds {found}; at least {legal} is legal'
+            value_text, limit = distinct(least, SMALLEST_STD)
+            problem = f'tensor {name} has the value {value_text}; legal: at least {limit}'
             raise CheckpointError(problem)
     if (most := np.abs(tensors.get('touch.friction', np.zeros(1))).max()) > LARGEST_FRICTION:
-        found, legal = distinct(most, LARGEST_FRICTION)
-        problem = f'tensor touch.friction holds ±{found}; at most {legal} is legal'
+        value_text, limit = distinct(most, LARGEST_FRICTION)
+        problem = f'tensor touch.friction has a value of ±{value_text}; legal: at most {limit}'
         raise CheckpointError(problem)
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
@@ -247,13 +256,13 @@ def _check_covariance(name: str, covariance: Array) -> None:
     if not np.array_equal(covariance, covariance.T):
         raise CheckpointError(f'tensor {name} is not symmetric')
     try:
-        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # the same one, of one joint
+        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # equal if there is only one
     except np.linalg.LinAlgError as error:
-        raise CheckpointError(f'tensor {name} has no eigenvalues') from error
-    # Nearer to singular it could not be inverted, as the detector does.
+        raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
+    # The detector inverts the matrix, so it must not be close to singular.
     if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
-            f'tensor {name} has eigenvalues from {least:g} to {most:g}; the least must '
+            f'tensor {name} has eigenvalues from {least:g} to {most:g}; the smallest must '
             f'be positive and above {SMALLEST_EIGENVALUE:g} times the largest'
         )
 
@@ -290,23 +299,25 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
 
 
 def _check_fit(mae: Mae, robot: Robot) -> None:
-    """Refuse other names, and a network whose answer for the middle posture is no use."""
-    for what in ('joints', 'muscles'):
-        ours, theirs = getattr(mae, what), getattr(robot, what)
-        if ours != theirs:
-            had, needed = ', '.join(ours), ', '.join(theirs)
-            raise CheckpointError(f'made for {what} {had}; this robot has {needed}, in this order')
+    """Check that the names fit, and that the estimate of the middle posture is sensible."""
+    for kind in ('joints', 'muscles'):
+        network_names, robot_names = getattr(mae, kind), getattr(robot, kind)
+        if network_names != robot_names:
+            raise CheckpointError(
+                f'made for {kind} {", ".join(network_names)}; '
+                f'this robot has {", ".join(robot_names)}, in this order'
+            )
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)
     with np.errstate(all='ignore'):
         state = mae.estimate(tension, robot.muscle_lengths(theta, tension))
         answers = (*state, mae.muscle_jacobian(theta, tension))
         if not all(np.abs(part).max() <= most for part, most in zip(answers, ABSURD, strict=True)):
-            raise CheckpointError('does not restore a posture at rest to finite, sensible values')
+            raise CheckpointError('estimates of a rest posture are not finite or far out of range')
 
 
 def save(mae: Mae, path: str | Path) -> None:
-    """Write a checkpoint so that a reader sees the old file or the new one, never a part.
+    """Write a checkpoint file atomically.
 
     Raises:
         OSError: If the file cannot be written.
@@ -315,5 +326,9 @@ def save(mae: Mae, path: str | Path) -> None:
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Mae:
-    """Read a checkpoint file as `from_bytes` does, with a CheckpointError if it cannot be read."""
+    """Read and check a checkpoint file (see `from_bytes`).
+
+    Raises:
+        CheckpointError: If the file cannot be read, is invalid or does not fit the robot.
+    """
     return from_bytes(read_bytes(Path(path), _refused, MAX_BYTES), robot, str(path))

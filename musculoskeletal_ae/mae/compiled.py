@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Activations with their slopes, compiled by numba: numpy's take as long as a layer's products.
+"""Activations and their derivatives, compiled by numba.
 
     tanh u ≈ u P(u²) / Q(u²),  |u| ≤ 7.9
 
-a rational function that is as exact as single precision can tell (as in Eigen), and that a core
-computes for eight units at once.
+This rational function, taken from Eigen, is exact to single precision, and a core evaluates it for
+eight units at once. NumPy's activations would take as long as the matrix products of a layer.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Singles
 
-# numba would compute in double precision with Python's numbers.
+# With Python's numbers, numba would compute in double precision.
 ONE, TWO, LARGEST = np.float32(1.0), np.float32(2.0), np.float32(7.9)
 P0, P1, P2, P3, P4, P5, P6 = np.array(
     [4.89352455891786e-3, 6.37261928875436e-4, 1.48572235717979e-5, 5.12229709037114e-8,
@@ -33,7 +33,7 @@ def _tanh(u: np.float32) -> np.float32:
 
 @njit(cache=True, fastmath=True, error_model='numpy', nogil=True)
 def tanh_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
-    """Return tanh(u + bias) in the place of u (N, units), and its derivative."""
+    """Overwrite u (N, units) with tanh(u + bias); return it and its derivative."""
     slope = np.empty_like(u)
     for n in range(u.shape[0]):
         for i in range(u.shape[1]):
@@ -44,7 +44,7 @@ def tanh_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
 
 @njit(cache=True, fastmath=True, error_model='numpy', nogil=True)
 def silu_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
-    """Return h = 2 v σ(2 v), v = u + bias, in the place of u (N, units), and dh/du."""
+    """Overwrite u (N, units) with h = 2 v σ(2 v), v = u + bias; return h and dh/du."""
     slope = np.empty_like(u)
     for n in range(u.shape[0]):
         for i in range(u.shape[1]):

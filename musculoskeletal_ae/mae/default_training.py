@@ -3,16 +3,17 @@
 
     L = ‖θ − θ_calc‖ + ‖T − T_calc‖ + ‖l − l_calc‖ + ‖G − G_calc‖
 
-Each norm is in units of the spread of the data, so that none of them outweighs the others. The last
-one is of the slope ∂l/∂θ through ①, which control needs; it is taken between each sample and a
-close neighbour, its twin. Every sample is entered by all three masks. Muon steps the matrices, with
-a step size that rises and then falls to zero.
+Each norm is in units of the standard deviation of the data, so that all have similar weight. G is
+the muscle Jacobian ∂l/∂θ through ①, which control needs. Its error is the difference quotient
+between each sample and a close neighbour, its twin. Every sample passes through all three masks.
+Muon updates the matrices, with a step size that rises and then falls to zero.
 
-The numbers are those of an arm of 5 joints and 10 muscles. A body of several groups of joints and
-muscles that share nothing gets a block of the network for each. In proportion to the D + M of a
-larger group its layers grow (by the root of it the error of θ does, from 0.0030 to 0.0045 rad a
-joint at 17 × 40), and by its power of 1.5 in the largest group of a body the mini-batches of
-initial training (in proportion, ② is worse at 17 × 40 than at 5 × 10; so it is a tenth better).
+Layers, steps and batch are those of an arm with 5 joints and 10 muscles. A body of several groups
+that share no joint or muscle gets a block of the network for each group. The layers of a larger
+group grow in proportion to its D + M. If they grew by the square root, the error of θ would rise
+from 0.0030 to 0.0045 rad per joint at 17 × 40. The mini-batches of initial training grow with
+D + M of the largest group to the power of 1.5. With this, ② is a tenth better at 17 × 40 than at
+5 × 10; in proportion, it would be worse.
 """
 
 import math
@@ -39,29 +40,36 @@ from musculoskeletal_ae.robot.robot import Robot
 
 LAYERS = Layers((200, 100), 'silu')
 STEPS, BATCH, SAMPLES = 3000, 128, 200_000
-STEP_SIZE = 0.004  # of the biases; see `optimiser` for that of the matrices
+STEP_SIZE = 0.004  # of the biases; `optimiser` derives that of the matrices
 REFERENCE = 5 + 10  # D + M of the arm that these numbers are for
 # Muscles of a joint that count; further ones add equations, and nothing to be found.
 COUNTED_MUSCLES = 2.5
 
-# Share of samples with tensions beyond what is planned: a payload pulls muscles there, and an
-# estimator that has seen a few such states degrades gently.
+# Share of samples with tensions beyond tension.limit. A payload causes such tensions, and an
+# estimator trained on a few of them degrades gracefully.
 OVERLOAD_SHARE = 0.2
-# Reach of θ beyond each joint limit, as a share of the range: a network is least accurate at the
-# edge of what it saw, and arms do rest at their limits.
+# Samples of θ exceed each joint limit by up to this share of the range. A network is least accurate
+# at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
-# Between twins, in units of the spread of θ: small against the bends of a route, and large enough
-# that float32 resolves the difference.
+# Distance of twins in standard deviations of θ: small compared with the curvature of a route, but
+# large enough for float32 to resolve the difference.
 TWIN_DISTANCE = 0.1
-# A joint or muscle that hardly varies is not blown up beyond this, in scaled units.
+# Lower limit of the standard deviation in scaled units. Standardisation would otherwise amplify a
+# joint or muscle that hardly varies.
 LEAST_SPREAD = 1e-4
-RISE = 0.05  # share of the training in which the step size rises
+RISE = 0.05  # share of the training during which the step size rises
 
 # -- size --------------------------------------------------------------------------------------
 
 
 def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
-    """Return a number of units of a group's layer, or of steps, as it is for given groups."""
+    """Return a number of units or steps, scaled up for the largest of some groups.
+
+    Args:
+        number: The number for the reference arm, D + M = REFERENCE.
+        groups: The groups of joints and muscles.
+        power: The number grows with D + M to this power.
+    """
     times = max(1.0, max(map(size, groups)) / REFERENCE)
     return round(number * times**power)
 
@@ -73,12 +81,12 @@ def size(group: Group) -> float:
 
 
 def default_steps(groups: Iterable[Group]) -> int:
-    """Return the mini-batches of initial training for given groups."""
+    """Return the number of mini-batches of initial training for a body of these groups."""
     return grown(STEPS, groups, 1.5)
 
 
 def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
-    """Return the hidden layers of the block of each group."""
+    """Return the sizes of the hidden layers in the block of each group."""
     return {group: tuple(grown(units, [group]) for units in LAYERS.hidden) for group in groups}
 
 
@@ -86,22 +94,32 @@ def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
 
 
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
-    """Return random states mostly within tension.limit, some beyond it, up to tension.max."""
+    """Return random states, mostly within tension.limit, some with up to tension.max."""
     highest = highest_tensions(robot, count, rng)
     return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
 
 
 def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Return tension.limit (count, M) [N], or in some rows more, up to tension.max."""
+    """Return the highest tension of each sample [N]: tension.limit, in some rows up to tension.max.
+
+    The shape is (count, M).
+    """
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
     return np.where(overloaded, limit + (most - limit) * rng.uniform(size=(count, 1)), limit)
 
 
 def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:
-    """Return samples, scaled (θ, T, l) (N, D+2M), with a neighbour each, (N, 2, D+2M).
+    """Return each sample with its twin, a close neighbour of the same T.
 
-    It has the same T, and a θ that is off by TWIN_DISTANCE in units of the spread, std (D+2M,).
+    Args:
+        robot: The geometric model.
+        samples: Scaled (θ, T, l), (N, D+2M).
+        std: Standard deviations of the samples, (D+2M,); twins are TWIN_DISTANCE of them apart.
+        rng: Draws the directions in θ.
+
+    Returns:
+        Samples and twins, (N, 2, D+2M).
     """
     joints, muscles = robot.joint_count, robot.muscle_count
     direction = rng.normal(size=(len(samples), joints))
@@ -117,17 +135,17 @@ def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generato
 
 
 def loss(network: Network, samples: Tensor) -> Tensor:
-    """Return L, the mean over scaled (θ, T, l) of samples and their twins, (N, 2, D+2M)."""
+    """Return the mean of L over scaled (θ, T, l) of samples and their twins, (N, 2, D+2M)."""
     joints, muscles = network.joints, network.muscles
     rows, twins = samples[:, 0], samples[:, 1]  # (N, D+2M) each
     count = len(twins)
-    # The samples by ①, ②, ③, then the twins by ①.
+    # The samples through ①, ② and ③, then the twins through ①.
     mask = torch.arange(3).repeat_interleave(count)
     mask = torch.cat([mask, mask.new_zeros(count)])
     values = torch.cat([rows.repeat(3, 1), twins])  # (4N, D+2M)
     error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std
-    # The slope of the error between neighbours is the error of the slope.
+    # The difference quotient of the error between neighbours is the error of ∂l/∂θ.
     between = (error[-count:] - error[:count])[:, -muscles:] / TWIN_DISTANCE
     slope = (between.square().sum(dim=1) + TINY).sqrt().mean()
     parts = error[:-count].square().split([joints, muscles, muscles], dim=1)
@@ -142,8 +160,8 @@ def train(
 
     Args:
         robot: The geometric model.
-        seed: Draws states, weights and the order of the samples.
-        steps: Mini-batches in all.
+        seed: Random seed of states, weights and order of the samples.
+        steps: Number of mini-batches.
         progress: Called after every mini-batch.
     """
     rng = np.random.default_rng(seed)
@@ -168,7 +186,7 @@ def train(
 
 
 def annealing(progress: float) -> float:
-    """Return the factor of the step size at a share of the training in [0, 1)."""
+    """Return the factor of the step size at a progress of the training in [0, 1)."""
     if progress < RISE:
         return progress / RISE
     return 0.5 * (1.0 + math.cos(math.pi * (progress - RISE) / (1.0 - RISE)))

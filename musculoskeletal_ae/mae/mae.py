@@ -1,21 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trained Musculoskeletal AutoEncoder as the nodes use it: numpy only, immutable, fast.
+"""The trained Musculoskeletal AutoEncoder for inference: numpy only, immutable, fast.
 
     z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z)
 
-(paper, §III-A). SI units go in and out. The units of the network, its
-standardisation and the constant mask inputs are folded into the first and last layers when the
-object is made, so one estimate is six small matrix products and nothing else. They are computed in
-single precision: a large body's weights then fit into a core's cache, and 1e-6 of a network's
-spread is far below its error. Arrays of double precision go in and come out.
+(paper, §III-A). Inputs and outputs are in SI units. The constructor folds the units of the network,
+its standardisation and the constant mask inputs into the first and last layers. One estimate is
+therefore six small matrix products and nothing else.
 
-Isolated muscles say nothing: what their sensors read has no influence. θ is what the others make
-likely, and T and l are those of ② with the lengths in the place of theirs that belong to it:
+The products use single precision, because the weights of a large body then fit into a core's cache.
+The rounding error of 1e-6 is far below the error of a network. Inputs and outputs are arrays of
+double precision.
 
-    θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T)      l of the others; θ̄, s: mean and spread
+Sensor values of isolated muscles have no influence. θ is then the most likely posture given the
+other muscles' lengths. Each isolated muscle's length is replaced by ①(θ, T), and ② then gives T and
+l:
 
-Σ is that of the healthy lengths' residuals, which ② leaves. Those lack what a wrong θ explains,
-but generalised least squares come to the same with it or without, whichever rows are left.
+    θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T) of the other muscles
+
+θ̄ and s are mean and standard deviation of the training data. Σ is the covariance of the length
+residuals of ② on the healthy arm. ② fits θ to the same lengths, so its residuals lack the part that
+an error of θ explains. Generalised least squares give the same θ with or without that part, for any
+subset of the muscles.
 """
 
 from __future__ import annotations
@@ -42,22 +47,25 @@ from musculoskeletal_ae.robot.groups import Group
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
 
-# Without isolated muscles:
-NEWTON_STEPS, SETTLED = 10, 1e-4  # at most; [rad] of the last one
-#: σ of a length [m] beyond its healthy residuals, and where those are not known
-LENGTH_NOISE, LENGTH_SPREAD = 0.0003, 0.003
+# Constants of the estimate with isolated muscles.
+NEWTON_STEPS = 10  # at most
+SETTLED = 1e-4  # [rad]; iteration ends with a smaller step
+LENGTH_NOISE = 0.0003  # [m] σ added to that of the healthy length residuals
+LENGTH_SPREAD = 0.003  # [m] σ of a length if there are no anomaly statistics
 
 
 class BlockDiagonal:
-    """A weight (in, out) of blocks, each with inputs and outputs of its own."""
+    """A weight (in, out) of blocks, each with its own inputs and outputs."""
 
-    __array_ufunc__ = None  # x @ weight is then left to __rmatmul__
+    __array_ufunc__ = None  # lets numpy use __rmatmul__ for x @ weight
 
     def __init__(self, blocks: Sequence[Singles], into: Ints | None, out: Ints | None) -> None:
-        """Put blocks (in, out) side by side.
+        """Combine blocks.
 
-        x[into] are their inputs, one block's after the other's, and y[out] of theirs the outputs;
-        None: they stand like that.
+        Args:
+            blocks: Weights of the blocks, each (in, out).
+            into: x[..., into] are the inputs of all blocks, in order; None: x is in this order.
+            out: y[..., out] of the blocks' outputs y are the outputs; None: keep their order.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
@@ -69,12 +77,12 @@ class BlockDiagonal:
             x = x[..., self._into]
         parts = [product(x[..., into], block) for into, block in self._blocks]
         result: Singles = np.concatenate(parts, axis=-1)
-        # Rows stay whole in memory, as after a product with an array; [..., out] would turn them.
+        # `take` keeps rows contiguous in memory, like a matrix product; [..., out] would not.
         return result if self._out is None else result.take(self._out, axis=-1)
 
     @cached_property
     def T(self) -> BlockDiagonal:
-        """The transposed weight, as of an array."""
+        """The transposed weight."""
         into, out = (None if p is None else p.argsort() for p in (self._out, self._into))
         return BlockDiagonal([block.T for _, block in self._blocks], into, out)
 
@@ -82,7 +90,8 @@ class BlockDiagonal:
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
     """Return x @ weight, shape (..., out), for x (..., in).
 
-    The operator begins 0.4 µs later than the method, which takes as long for a row as a layer.
+    Uses the method `dot` where possible: the operator's overhead is 0.4 µs higher, as long as the
+    product of a layer with one row takes.
     """
     if x.ndim > 2 or isinstance(weight, BlockDiagonal):
         return x @ weight
@@ -91,7 +100,13 @@ def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
 
 
 class Activation(NamedTuple):
-    """An activation h(u), u = gain · x, and (h, dh/du) at u + bias; both may overwrite u."""
+    """An activation h(u) with u = gain · x.
+
+    Attributes:
+        value: Returns h(u); may overwrite u.
+        with_slope: Returns h and dh/du at u + bias; may overwrite u.
+        gain: The factor of u, which the weights before the activation include.
+    """
 
     value: Callable[[Singles], Singles]
     with_slope: Callable[[Singles, Singles], tuple[Singles, Singles]]
@@ -110,7 +125,8 @@ def _tanh_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
 
 
 def _silu(u: Singles) -> Singles:
-    # x σ(x) = u t with u = x/2 and t = 1 + tanh u: does not overflow, in one temporary array.
+    # x σ(x) = u t with u = x/2 and t = 1 + tanh u. This form cannot overflow and needs only one
+    # temporary array.
     result: Singles = np.tanh(u)
     result += 1.0
     result *= u
@@ -118,7 +134,7 @@ def _silu(u: Singles) -> Singles:
 
 
 def _silu_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
-    # h = u t and dh/du = t + h (2 − t), in three arrays: a batch then stays in the cache.
+    # h = u t and dh/du = t + h (2 − t). Three arrays suffice, so a batch stays in the cache.
     u += bias
     t = np.tanh(u)
     t += 1.0
@@ -142,15 +158,15 @@ ACTIVATIONS = {
     'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),
 }
-LINEAR = Activation(_linear, _linear_slope, 1.0)  # at the latent space, where stacks meet
+LINEAR = Activation(_linear, _linear_slope, 1.0)  # at the latent layer, between two joined stacks
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Layers x @ weight + bias, weight (in, out); an activation follows each but the last.
+    """Layers x @ weight + bias, weight (in, out), with an activation after each but the last.
 
-    The gain of an activation is in the weights before it. What goes in and comes out is of double
-    precision, what is between of single.
+    The weights before an activation include its gain. Inputs and outputs have double precision;
+    intermediate values have single precision.
     """
 
     layers: tuple[tuple[Singles | BlockDiagonal, Singles], ...]
@@ -158,15 +174,15 @@ class Stack:
 
     @cached_property
     def _back(self) -> list[Singles | BlockDiagonal]:
-        """Return the weights transposed, the last layer first; in one piece, which is faster."""
+        """The transposed weights, last layer first, contiguous for faster products."""
         return [
             weight.T if isinstance(weight, BlockDiagonal) else np.ascontiguousarray(weight.T)
             for weight, _ in self.layers[::-1]
         ]
 
-    def __call__(self, given: Array) -> Array:
+    def __call__(self, values: Array) -> Array:
         """Return the output (..., out) for an input (..., in)."""
-        x = given.astype(np.float32)
+        x = values.astype(np.float32)
         for (weight, bias), activation in zip(self.layers, self.activations):
             x = product(x, weight)
             x += bias
@@ -174,9 +190,9 @@ class Stack:
         weight, bias = self.layers[-1]
         return (product(x, weight) + bias).astype(np.float64)
 
-    def with_pullback(self, given: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the output and the function that maps a gradient by it to one by the input."""
-        x, slopes = given.astype(np.float32), []
+    def with_pullback(self, values: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """Return the output, and the function from its gradient to that of the input."""
+        x, slopes = values.astype(np.float32), []
         for (weight, bias), activation in zip(self.layers, self.activations):
             x, slope = activation.with_slope(product(x, weight), bias)
             slopes.append(slope)
@@ -192,11 +208,19 @@ class Stack:
 
         return (product(x, last) + last_bias).astype(np.float64), pullback
 
-    def tangent(self, given: Array, directions: Array) -> tuple[Array, Array]:
-        """Return the output and its derivatives (..., K, out) from those of x, (..., K, in)."""
-        x, tangent = given.astype(np.float32), directions.astype(np.float32)
+    def tangent(self, values: Array, directions: Array) -> tuple[Array, Array]:
+        """Return the output and its derivatives along K directions of the input.
+
+        Args:
+            values: The input, (..., in).
+            directions: Directions of the input, (..., K, in).
+
+        Returns:
+            The output (..., out) and its directional derivatives (..., K, out).
+        """
+        x, tangent = values.astype(np.float32), directions.astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
-            # One product of all rows: numpy would take each (K, in) by itself, at half the speed.
+            # A single product of all rows is twice as fast as numpy's product of each (K, in).
             shape = tangent.shape[:-1]
             if len(shape) > 1:
                 tangent = tangent.reshape(-1, tangent.shape[-1])
@@ -213,7 +237,7 @@ class Stack:
 def side_by_side(
     stacks: Sequence[Stack], into: Ints | None = None, out: Ints | None = None
 ) -> Stack:
-    """Return stacks as one whose inputs and outputs stand as in `BlockDiagonal`."""
+    """Combine stacks into one, with `into` and `out` as in `BlockDiagonal`."""
     if len(stacks) == 1:
         return stacks[0]
     layers = list[tuple[BlockDiagonal, Singles]]()
@@ -227,28 +251,28 @@ def side_by_side(
 
 @dataclass(frozen=True, eq=False)
 class Mae:
-    """A trained network and what a checkpoint says of it."""
+    """A trained network with the other content of its checkpoint."""
 
     joints: tuple[str, ...]  # D names, in the order of θ
     muscles: tuple[str, ...]  # M names, in the order of T and l
     preset: str
     activation: ActivationName
-    #: weight (out, in), bias (out,), in scaled, standardised units; one group after the other
+    #: weight (out, in) and bias (out,) in scaled, standardised units, group by group
     encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
-    mean: Array  # what scaled (θ, T, l) are centred by, (D+2M,)
-    std: Array  # what they are divided by, (D+2M,)
-    version: int = 0  # counts up with every checkpoint the learner publishes
-    training: str = ''  # how it was trained, for people to read
-    anomaly: AnomalyStatistics | None = None  # residuals of healthy data
-    touch: TouchStatistics | None = None  # friction and healthy torques, once some are learned
-    covariance: Array | None = None  # of θ_est − θ [rad²] (D, D), once a body is learned
-    groups: tuple[Group, ...] = ()  # with a block of the network each; none: it is all one
-    isolated: tuple[int, ...] = ()  # muscles that say nothing, places in T and l
+    mean: Array  # mean of scaled (θ, T, l) in standardisation, (D+2M,)
+    std: Array  # standard deviation of scaled (θ, T, l) in standardisation, (D+2M,)
+    version: int = 0  # rises with every checkpoint that the learner publishes
+    training: str = ''  # description of the training, for people
+    anomaly: AnomalyStatistics | None = None  # residuals on healthy data
+    touch: TouchStatistics | None = None  # friction and healthy torques; None: not yet learned
+    covariance: Array | None = None  # of θ_est − θ [rad²] (D, D); None: not yet learned
+    groups: tuple[Group, ...] = ()  # each has a block of the network; empty: one block for all
+    isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
     _leave_length: Stack = field(init=False, repr=False)
-    #: z (..., D+M) to (θ, T, l) in scaled units, one array (..., D+2M)
+    #: maps z (..., D+M) to scaled (θ, T, l) as one array (..., D+2M)
     decode_scaled: Stack = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -271,11 +295,11 @@ class Mae:
             (first, first_bias), *rest = encoder[layers]
             after = tuple(_transposed(*layer) for layer in rest)
             for mask, stacks in enter.items():
-                seen = visible(mask, *sizes)
-                weight = first[:, : len(own)][:, seen] / std[own][seen]
+                selected = visible(mask, *sizes)
+                weight = first[:, : len(own)][:, selected] / std[own][selected]
                 constant = first[:, len(own) :] @ np.array(mask.value, dtype=float)
-                bias = first_bias + constant - weight @ mean[own][seen]
-                layer = _transposed(weight * scale[own][seen], bias)
+                bias = first_bias + constant - weight @ mean[own][selected]
+                layer = _transposed(weight * scale[own][selected], bias)
                 stacks.append(_stack((layer, *after), activation))
             *rest, (last, last_bias) = decoder[layers]
             before = tuple(_transposed(*layer) for layer in rest)
@@ -293,11 +317,11 @@ class Mae:
         out_length = np.argsort(np.concatenate([group.muscles for group in groups]))
 
         def entered(mask: Mask) -> Ints:
-            seen = visible(mask, joints, muscles)
-            places: Ints = (np.cumsum(seen) - 1)[all_columns[seen[all_columns]]]
+            selected = visible(mask, joints, muscles)
+            places: Ints = (np.cumsum(selected) - 1)[all_columns[selected[all_columns]]]
             return places
 
-        vars(self).update(  # frozen: no other way in
+        vars(self).update(  # a frozen dataclass has no other way to set attributes
             mean=mean,
             std=std,
             encoder=encoder,
@@ -311,9 +335,9 @@ class Mae:
 
     @property
     def layer_sizes(self) -> tuple[int, ...]:
-        """Units of all layers from input to output, one group after the other.
+        """Number of units of all layers from input to output, group by group.
 
-        The latent one in the middle has D+M of the group.
+        The latent layer in the middle has D+M units.
         """
         each, depth = len(self.groups), len(self.encoder) // len(self.groups)
         stacks = ((*self.encoder[i : i + depth], *self.decoder[i : i + depth])
@@ -333,11 +357,13 @@ class Mae:
     ) -> Array:
         """Return z (..., D+M) from θ [rad] (..., D), T [N] (..., M) and l [m] (..., M).
 
-        Only the two that the mask lets in are used, and the third may be None; if one of the two is
-        missing, it is a ValueError.
+        Only the two quantities that the mask selects are used; the third may be None.
+
+        Raises:
+            ValueError: If one of the two selected quantities is None.
         """
-        given = (theta, tension, length)
-        one, two = (part for part, seen in zip(given, mask.value, strict=True) if seen)
+        quantities = (theta, tension, length)
+        one, two = (q for q, is_used in zip(quantities, mask.value, strict=True) if is_used)
         if one is None or two is None:
             raise ValueError(f'mask {mask.name} needs both of its two quantities')
         return self._enter[mask](np.concatenate((one, two), axis=-1))
@@ -349,10 +375,13 @@ class Mae:
         return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
 
     def estimate(self, tension: Array, length: Array) -> State:
-        """Return (θ, T, l) restored from (T, l): decode(encode ②) (paper, §III-D).
+        """Estimate (θ, T, l) from (T, l) by decode(encode ②) (paper, §III-D).
 
-        T is that of the elastic units: what a sensor reads, without friction (`friction`).
-        Isolated muscles have no part in it: theirs is what the others make likely.
+        Sensor values of isolated muscles are not used; their T and l are estimates as well.
+
+        Args:
+            tension: Bone-side tension, after tendon friction (`friction`) [N], (..., M).
+            length: Muscle length [m], (..., M).
         """
         if not self.isolated:
             return self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
@@ -363,12 +392,14 @@ class Mae:
         theta = np.broadcast_to(mean[:joints], (*length.shape[:-1], joints))
         prior = np.diag(1.0 / np.square(self.std[:joints]))
         for _ in range(NEWTON_STEPS):
-            likely, jacobian = self._lengths_and_jacobian(theta, tension)
-            pull = jacobian.swapaxes(-1, -2) @ self._length_weight
-            push = pull @ (length - likely)[..., None] + prior @ (mean[:joints] - theta)[..., None]
-            turn = np.linalg.solve(pull @ jacobian + prior, push)[..., 0]
-            theta = theta + turn
-            if np.abs(turn).max() < SETTLED:
+            predicted, jacobian = self._lengths_and_jacobian(theta, tension)
+            weighted = jacobian.swapaxes(-1, -2) @ self._length_weight
+            from_lengths = weighted @ (length - predicted)[..., None]
+            from_prior = prior @ (mean[:joints] - theta)[..., None]
+            hessian = weighted @ jacobian + prior
+            step = np.linalg.solve(hessian, from_lengths + from_prior)[..., 0]
+            theta = theta + step
+            if np.abs(step).max() < SETTLED:
                 break
         length[..., lost] = self.lengths(theta, tension)[..., lost]
         state = self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
@@ -376,27 +407,27 @@ class Mae:
 
     @cached_property
     def _length_weight(self) -> Array:
-        """Σ⁻¹ of the lengths [1/m²], (M, M); 0 of isolated muscles."""
+        """Σ⁻¹ of the lengths [1/m²], (M, M); 0 for isolated muscles."""
         muscles = len(self.muscles)
         used = np.delete(np.arange(muscles), self.isolated)
         rows, weight = np.ix_(used, used), np.zeros((muscles, muscles))
         if self.anomaly is None:
             weight[used, used] = LENGTH_SPREAD**-2
         else:
-            seen = self.anomaly.covariance[muscles:, muscles:][rows] / LENGTH_SCALE**2
-            weight[rows] = np.linalg.inv(seen + LENGTH_NOISE**2 * np.eye(len(used)))
+            healthy = self.anomaly.covariance[muscles:, muscles:][rows] / LENGTH_SCALE**2
+            weight[rows] = np.linalg.inv(healthy + LENGTH_NOISE**2 * np.eye(len(used)))
         return weight
 
     @property
     def friction(self) -> Array:
-        """Return μ of each wire (M,): 0 until a body was learned."""
+        """Tendon friction μ of each muscle (M,); 0 until it has been learned."""
         return np.zeros(len(self.muscles)) if self.touch is None else self.touch.friction
 
     def without(self, isolated: Iterable[int]) -> Mae:
-        """Return the same network with these muscles isolated, and no others.
+        """Return the same network with exactly these muscles isolated.
 
-        Its healthy statistics are those of the others, or, where they were taken without a muscle
-        that is not isolated any more, not calibrated.
+        The anomaly statistics keep only the other muscles. If a muscle is restored, the statistics
+        lack it and are therefore marked as not calibrated.
         """
         isolated = tuple(sorted(isolated))
         if isolated == self.isolated:
@@ -409,7 +440,7 @@ class Mae:
         return replace(self, isolated=isolated, anomaly=anomaly)
 
     def lengths(self, theta: Array, tension: Array) -> Array:
-        """Return l [m] of shape (..., M) at (θ, T): decode(encode ①)."""
+        """Return l [m] (..., M) at (θ, T), by decode(encode ①)."""
         return self.decode(self.encode(Mask.THETA_TENSION, theta, tension)).length
 
     def lengths_with_pullback(
@@ -417,7 +448,7 @@ class Mae:
     ) -> tuple[Array, Callable[[Array], Array]]:
         """Return l [m] (N, M) at (θ, T) through ①, and the function that maps dL/dl to dL/dθ.
 
-        The pullback of T is Gᵀ T, at the price of one more evaluation instead of D.
+        Applied to T, the function gives Gᵀ T at the cost of one evaluation instead of D.
         """
         length, pullback = self._compiled.with_pullback(np.concatenate((theta, tension), axis=-1))
         joints = len(self.joints)
@@ -425,7 +456,7 @@ class Mae:
 
     @cached_property
     def _compiled(self) -> Stack:
-        # Only here: who estimates or controls does without numba.
+        # Imported here, because estimators and controllers do not need numba.
         from musculoskeletal_ae.mae.compiled import WITH_SLOPE
 
         enter, leave = self._enter[Mask.THETA_TENSION], self._leave_length
@@ -434,16 +465,16 @@ class Mae:
         return Stack((*enter.layers, *leave.layers), (*before, LINEAR, *after))
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
-        """Return G = ∂l/∂θ [m/rad] at (θ, T) through ①, analytically, shape (..., M, D)."""
+        """Return the muscle Jacobian G = ∂l/∂θ [m/rad] (..., M, D) of ① at (θ, T), exactly."""
         return self._lengths_and_jacobian(theta, tension)[1]
 
     def _lengths_and_jacobian(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         x = np.concatenate((theta, tension), axis=-1)
-        # Each joint by itself, but of all groups at once: those do not meet.
-        turn = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
+        # One direction serves one joint of every group, because groups do not affect each other.
+        directions = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
         for group in self.groups:
-            turn[np.arange(len(group.joints)), group.joints] = 1.0
-        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, turn)
+            directions[np.arange(len(group.joints)), group.joints] = 1.0
+        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, directions)
         length, slopes = self._leave_length.tangent(z, tangent)
         slopes = slopes.swapaxes(-1, -2)
         if len(self.groups) == 1:

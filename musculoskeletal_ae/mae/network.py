@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Musculoskeletal AutoEncoder in torch: what is trained. `mae.py` is what runs.
+"""The Musculoskeletal AutoEncoder in torch, for training; `mae.py` has the inference.
 
     z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z),   z of size D+M
 
-(paper, §III-A). Everything is in scaled units; a masked entry is zero where it
-enters the first layer.
+(paper, §III-A). All quantities are in scaled units. Masked entries are zero at the input of the
+first layer.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,8 +28,8 @@ class Layers(NamedTuple):
     """The hidden layers of a network.
 
     Attributes:
-        hidden: Units of the encoder's hidden layers; the decoder's are the reverse.
-        activation: After every layer but the latent and the last one, which are linear.
+        hidden: Sizes of the encoder's hidden layers; the decoder has them in reverse order.
+        activation: Follows every layer except the latent and the last one, which are linear.
     """
 
     hidden: tuple[int, ...]
@@ -37,7 +37,7 @@ class Layers(NamedTuple):
 
 
 class Blocks(nn.Module):
-    """Stacks side by side; each takes some of the inputs, and gives some of the outputs."""
+    """Parallel stacks; each uses some of the inputs and computes some of the outputs."""
 
     order: Tensor
 
@@ -58,7 +58,7 @@ class Blocks(nn.Module):
 class Network(nn.Module):
     """D joints, M muscles: layers (D+2M+3, *hidden, D+M, *reversed hidden, D+2M).
 
-    One such block for each group, with its own D, M and hidden layers, where there are several.
+    With several groups, each has such a block with its own D, M and hidden layers.
     """
 
     mean: Tensor
@@ -74,9 +74,15 @@ class Network(nn.Module):
         std: Array,
         blocks: Mapping[Group, tuple[int, ...]] | None = None,
     ) -> None:
-        """Start from torch's random weights; (θ, T, l) are centred by mean, divided by std.
+        """Initialise the weights with torch's random generator.
 
-        The blocks give the hidden layers of each group, in the place of those of `layers`.
+        Args:
+            joints: D.
+            muscles: M.
+            layers: Activation, and hidden layers of a network with one block.
+            mean: Mean of scaled (θ, T, l) in standardisation, (D+2M,).
+            std: Standard deviation of scaled (θ, T, l) in standardisation, (D+2M,).
+            blocks: Hidden layers of the block of each group, which replace those of `layers`.
         """
         super().__init__()
         self.joints, self.muscles, self.activation = joints, muscles, layers.activation
@@ -89,16 +95,19 @@ class Network(nn.Module):
             sizes = len(columns) + 3, *hidden, len(latents[-1]), *reversed(hidden), len(columns)
             encoders.append(self._stack(sizes[: len(hidden) + 2]))
             decoders.append(self._stack(sizes[len(hidden) + 1 :]))
-        seen = [np.append(columns, values + np.arange(3)) for columns in own]
-        self.encoder, self.decoder = Blocks(encoders, seen, latents), Blocks(decoders, latents, own)
+        inputs = [np.append(columns, values + np.arange(3)) for columns in own]
+        self.encoder, self.decoder = (
+            Blocks(encoders, inputs, latents),
+            Blocks(decoders, latents, own),
+        )
         self.register_buffer('mean', torch.tensor(mean, dtype=torch.float32))
         self.register_buffer('std', torch.tensor(std, dtype=torch.float32))
-        # One row per mask: which entries pass, then the three mask inputs themselves.
+        # One row for each mask: a 1 for each selected entry, then the three mask inputs.
         rows = np.array([[*visible(mask, joints, muscles), *mask.value] for mask in Mask])
         self.register_buffer('rows', torch.tensor(rows, dtype=torch.float32))
 
     def encode(self, values: Tensor, mask: Tensor) -> Tensor:
-        """Return z: scaled (θ, T, l) of shape (N, D+2M), mask indices (N,) into `Mask`."""
+        """Return z (N, D+M) of scaled (θ, T, l) (N, D+2M) and indices (N,) into `Mask`."""
         standard = (values - self.mean) / self.std
         rows = self.rows[mask]  # (N, D+2M+3)
         width = standard.shape[-1]
@@ -106,11 +115,11 @@ class Network(nn.Module):
         return self.encoder(x)  # (N, D+M)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return scaled (θ, T, l), shape (N, D+2M); `decoder` gives them standardised."""
+        """Return scaled (θ, T, l) (N, D+2M); `decoder` returns them standardised."""
         return self.decoder(z) * self.std + self.mean
 
     def forward(self, values: Tensor, mask: Tensor) -> Tensor:
-        """Return what the network restores of scaled (θ, T, l) from two of the three."""
+        """Return scaled (θ, T, l), restored from the two quantities that the mask selects."""
         return self.decode(self.encode(values, mask))
 
     def _stack(self, sizes: tuple[int, ...]) -> nn.Sequential:
@@ -124,7 +133,7 @@ class Network(nn.Module):
 def to_mae(
     network: Network, joints: tuple[str, ...], muscles: tuple[str, ...], preset: str, training: str
 ) -> Mae:
-    """Return the numpy network that runs, with float64 copies of a trained network's weights."""
+    """Convert a trained network to the numpy network for inference, with float64 weights."""
 
     def array(tensor: Tensor) -> Array:
         return tensor.detach().cpu().numpy().astype(np.float64)
@@ -147,7 +156,7 @@ def to_mae(
 
 
 def from_mae(mae: Mae) -> Network:
-    """Return a torch network with the weights of a numpy one, to go on learning from."""
+    """Convert a numpy network to a torch network, to continue its training."""
     hidden = [len(bias) for _, bias in mae.encoder]
     depth = len(hidden) // len(mae.groups)
     blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}
@@ -162,10 +171,10 @@ def from_mae(mae: Mae) -> Network:
 
 
 class TorchLengths:
-    """What the simulator asks of a network, by torch on any of its devices."""
+    """Muscle lengths of a network and their gradients for the simulator, on any torch device."""
 
     def __init__(self, mae: Mae, device: str = 'cpu') -> None:
-        """Take the weights of a network."""
+        """Copy the weights of a network to the device."""
         self._network, self._tensor = from_mae(mae).to(device), partial(torch.tensor, device=device)
         self.lengths, self.friction = mae.lengths, mae.friction
         self._scale = self._tensor(scale_vector(len(mae.joints), len(mae.muscles)))
@@ -174,11 +183,11 @@ class TorchLengths:
     def lengths_with_pullback(
         self, theta: Array, tension: Array
     ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return what `Mae.lengths_with_pullback` does."""
-        angles, pulls = self._tensor(theta, requires_grad=True), self._tensor(tension)
-        given = torch.cat((angles, pulls, torch.zeros_like(pulls)), dim=1)
-        mask = torch.zeros(len(theta), dtype=torch.long, device=given.device)
-        restored = self._network((given * self._scale).float(), mask) / self._scale
+        """Return the same as `Mae.lengths_with_pullback`."""
+        angles, tensions = self._tensor(theta, requires_grad=True), self._tensor(tension)
+        values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
+        mask = torch.zeros(len(theta), dtype=torch.long, device=values.device)
+        restored = self._network((values * self._scale).float(), mask) / self._scale
         length = restored[:, -self._muscles :]
 
         def pullback(gradient: Array) -> Array:

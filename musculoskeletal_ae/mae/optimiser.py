@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What steps the weights: Adam, or Muon for the matrices and Adam for the biases.
+"""The optimiser: Adam, or Muon for the matrices and Adam for the biases.
 
     W ← W − γ √max(1, out/in) · U Vᵀ,   U Σ Vᵀ = momentum of ∂L/∂W
 
-(Muon: Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks".) At the same
-number of steps it leaves a third of Adam's error on this network, for small matrix products more.
-`torch.optim.Muon` works in bfloat16 and by another polynomial, less exactly: the network's
-lengths are then 4 to 7 % worse after 1500 mini-batches, and a step is no cheaper.
+(Muon: Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks".) On this
+network, Muon leaves a third of Adam's error after the same number of steps. Each step costs a few
+more small matrix products. `torch.optim.Muon` is less exact, because it uses bfloat16 and another
+polynomial. With it, the lengths are 4 to 7 % worse after 1500 mini-batches, and a step is no
+cheaper.
 """
 
 import math
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 from torch.optim.adam import adam
 
 MOMENTUM = 0.95
-# Newton–Schulz polynomials that together bring every singular value near 1 in five steps.
+# Newton–Schulz polynomials; applied in turn, they bring every singular value close to 1.
 POLYNOMIALS = (
     (4.0848, -6.8946, 2.9270),
     (3.9505, -6.3029, 2.6377),
@@ -24,11 +25,11 @@ POLYNOMIALS = (
     (2.8769, -3.1427, 1.2046),
     (2.8366, -3.0525, 1.2012),
 )
-MATRIX_RATIO = 12.5  # γ of the matrices over Adam's step size for the biases
+MATRIX_RATIO = 12.5  # γ divided by Adam's step size for the biases
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """Return about U Vᵀ of a matrix U Σ Vᵀ; zero stays zero."""
+    """Return approximately U Vᵀ of a matrix U Σ Vᵀ; the zero matrix stays zero."""
     tall = matrix.shape[0] > matrix.shape[1]
     x = matrix / (matrix.norm() + 1e-7)
     for a, b, c in POLYNOMIALS:
@@ -39,21 +40,27 @@ def orthogonal(matrix: Tensor) -> Tensor:
 
 
 class Optimiser:
-    """Steps all parameters of a network."""
+    """Updates all parameters of a network from their gradients."""
 
     def __init__(self, network: nn.Module, step_size: float, muon: bool) -> None:
-        """Start with empty momenta; the step size is Adam's, matrices are left to it or to Muon."""
+        """Start with zero momenta.
+
+        Args:
+            network: The network to train.
+            step_size: Adam's step size; Muon's is derived from it.
+            muon: Whether Muon updates the matrices; if false, Adam updates all parameters.
+        """
         parameters = list(network.parameters())
         self._matrices = [p for p in parameters if muon and p.ndim == 2]
         self._momenta = [torch.zeros_like(p) for p in self._matrices]
         self._step_size = step_size
-        # torch.optim.Adam would load torch's compiler, which takes a second.
+        # Importing torch.optim.Adam would load torch's compiler, which takes a second.
         self._others = [p for p in parameters if not muon or p.ndim != 2]
         self._moments = [[torch.zeros_like(p) for p in self._others] for _ in range(2)]
         self._counts = [p.new_zeros(()) for p in self._others]
 
     def step(self, scale: float = 1.0) -> None:
-        """Use the gradients, with the step sizes multiplied by `scale`, and clear them."""
+        """Update the parameters with step sizes multiplied by `scale`, and clear the gradients."""
         with torch.no_grad():
             gradients = [p.grad for p in self._others]
             adam(

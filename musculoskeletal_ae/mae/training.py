@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Initial training of the Musculoskeletal AutoEncoder on the geometric model of a robot.
 
-A preset trains in its own way: `default_training.py` is that of preset `default`. Here is what all
-of them share: random states of the geometric model, mini-batches, where torch computes, the
-checkpoint that comes of it, and how well it restores states that it has not been trained on.
+Each preset has its own training; `default_training.py` has that of preset `default`. This module
+has the parts that all presets share: random states of the geometric model, mini-batches, the choice
+of the torch device, the resulting checkpoint, and the errors on held-out states.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,11 +23,10 @@ from musculoskeletal_ae.mae.units import Mask, State
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-# Keeps the gradient of a norm finite at zero.
-TINY = 1e-12
-UNSEEN_STATES = 5000  # of the geometric model, for the residuals a new network starts with
+TINY = 1e-12  # keeps the gradient of a norm finite at zero
+HELD_OUT_STATES = 5000  # held-out states of the geometric model for the first anomaly statistics
 
-#: told (step, loss, network, mini-batch) after every one
+#: called with (step, loss, network, mini-batch) after every mini-batch
 Progress = Callable[[int, float, Network, Array], None]
 
 # -- samples -----------------------------------------------------------------------------------
@@ -41,10 +40,15 @@ def random_states(
     lowest: Array | float = 0.0,
     margin: float = 0.0,
 ) -> State:
-    """Return random states of the geometric model, T_r uniform from lowest to highest [N].
+    """Return random states of the geometric model.
 
-    The highest tension is one for all, (M,) or (count, M); margin is the reach of θ_r beyond
-    each joint limit, as a share of the range.
+    Args:
+        robot: The geometric model.
+        count: Number of states N.
+        rng: Draws the states.
+        highest: Upper end of the uniform distribution of T_r [N]; a number, (M,) or (N, M).
+        lowest: Lower end of the uniform distribution of T_r [N], likewise.
+        margin: How far θ_r may exceed each joint limit, as a share of the range.
     """
     theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(lowest, highest, (count, robot.muscle_count))
@@ -52,7 +56,7 @@ def random_states(
 
 
 def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield mini-batches of shuffled samples, epoch after epoch, without end."""
+    """Yield mini-batches of the samples forever, shuffled anew in each epoch."""
     while True:
         order = rng.permutation(len(samples))
         for i in range(0, max(len(order) - batch, 0) + 1, batch):
@@ -60,30 +64,35 @@ def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[A
 
 
 def check_device(device: str) -> None:
-    """Raise a MusculoskeletalError if torch computes nothing on a device."""
+    """Raise a MusculoskeletalError if torch cannot use a device."""
     try:
-        torch.ones(1, device=device).sum().item()  # to be there is not yet to compute
-    except (RuntimeError, AssertionError) as error:  # the latter of a torch built without it
+        # An available device may still fail to compute, so compute something.
+        torch.ones(1, device=device).sum().item()
+    except (RuntimeError, AssertionError) as error:  # AssertionError: torch was built without it
         raise MusculoskeletalError(
-            f'device {device!r}: torch {torch.__version__} computes nothing there; legal: cpu. '
-            'For a GPU, install its driver and a torch that is built for it (pytorch.org)'
+            f'device {device!r}: torch {torch.__version__} cannot use it; legal: cpu. '
+            'For a GPU, install its driver and a build of torch that supports it (pytorch.org)'
         ) from error
 
 
 def train_on(device: str) -> None:
-    """Let everything that is trained from now on be on one of `parameters.DEVICES`.
+    """Train on one of `parameters.DEVICES` from now on.
 
     Raises:
-        MusculoskeletalError: If torch computes nothing there.
+        MusculoskeletalError: If torch cannot use the device.
     """
     check_device(device)
-    # Every call of torch passes a default device, which takes a fifth of a step, even on the CPU.
+    # A default device slows every call of torch, which costs a fifth of a training step. It is
+    # therefore not set for the CPU.
     torch.set_default_device(None if device == 'cpu' else device)
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Use one core: matrices this small gain little from two, and lose much if one is busy."""
+    """Limit torch to one thread within a `with` block.
+
+    Matrices this small gain little from a second core and lose much if that core is busy.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -93,15 +102,15 @@ def one_thread() -> Iterator[None]:
 
 
 class TrainedNetwork(NamedTuple):
-    """What a preset's initial training returns."""
+    """Result of a preset's initial training."""
 
     network: Network
     losses: list[float]  # of every mini-batch
-    by: str  # size of the mini-batches and optimiser, for people to read
+    by: str  # size of the mini-batches and name of the optimiser, for people
 
 
 class Trained(NamedTuple):
-    """What `initial_mae` returns."""
+    """Result of `initial_mae`."""
 
     mae: Mae  # ready for a checkpoint
     losses: list[float]  # of every mini-batch
@@ -114,9 +123,14 @@ def initial_mae(
     progress: Progress | None = None,
     steps: int | None = None,
 ) -> Trained:
-    """Train on the geometric model, with anomaly statistics of it that are not calibrated.
+    """Train a network on the geometric model and add anomaly statistics, not calibrated.
 
-    Same seed, same network (on the same machine); `steps` overrides the preset's mini-batches.
+    Args:
+        robot: The geometric model.
+        preset: Name of the preset.
+        seed: Random seed; on the same machine, the same seed gives the same network.
+        progress: Called after every mini-batch.
+        steps: Number of mini-batches; None: that of the preset.
     """
     chosen = preset_named(preset)
     steps = chosen.initial_steps(robot.groups) if steps is None else steps
@@ -126,8 +140,8 @@ def initial_mae(
         f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {by}'
     )
     mae = to_mae(network, robot.joints, robot.muscles, preset, history)
-    unseen = np.random.default_rng([seed, 1])
-    _, tension, length = random_states(robot, UNSEEN_STATES, unseen, robot.tension.limit)
+    rng = np.random.default_rng([seed, 1])
+    _, tension, length = random_states(robot, HELD_OUT_STATES, rng, robot.tension.limit)
     error = residuals(mae.estimate(tension, length), tension, length)
     statistics = AnomalyStatistics.of(error, calibrated=False)
     statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})
@@ -136,22 +150,22 @@ def initial_mae(
 
 # -- errors ------------------------------------------------------------------------------------
 
-#: outputs with the unit and the factor from SI that errors are shown in
+#: outputs with the unit of their errors and its factor from SI
 OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
 class PairError(NamedTuple):
-    """Error of one output entered by one mask."""
+    """Error of one output restored through one mask."""
 
     mask: Mask
     output: str  # 'theta', 'tension' or 'length'
-    unit: str  # of the numbers
+    unit: str  # of `norm` and `elements`
     norm: float  # mean over samples of the L2 norm
     elements: Array  # mean absolute error of each joint or muscle, (D,) or (M,)
 
 
 def pair_errors(mae: Mae, states: State) -> list[PairError]:
-    """Return the error of each of the nine (mask, output) pairs over given states."""
+    """Return the errors of all nine (mask, output) pairs on some states."""
     result = []
     for mask in Mask:
         restored = mae.decode(mae.encode(mask, *states))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What enters and leaves the network: (θ, T, l), their scaled units, and the three masks.
+"""Inputs and outputs of the network: (θ, T, l), their scaled units and the three masks.
 
-The paper (§III-A) scales (θ, T, l) to [rad], [N/200], [mm/100] so that their
-sizes align, and enters the network with two of the three: the mask says which. SI outside.
+The paper (§III-A) scales (θ, T, l) to [rad], [N/200], [mm/100], which gives them similar
+magnitudes. Two of the three quantities enter the network; the mask selects them. Values outside the
+network are in SI units.
 """
 
 from enum import Enum
@@ -36,7 +37,7 @@ class State(NamedTuple):
 
 
 class Mask(Enum):
-    """Which of (θ, T, l) enter the network: ①, ②, ③ (paper, §III-A)."""
+    """The two of (θ, T, l) that enter the network: ①, ②, ③ (paper, §III-A)."""
 
     THETA_TENSION = (1, 1, 0)
     TENSION_LENGTH = (0, 1, 1)
@@ -44,11 +45,11 @@ class Mask(Enum):
 
 
 def scale_vector(joints: int, muscles: int) -> Array:
-    """Return what multiplies SI (θ, T, l) to give scaled units, shape (D+2M,)."""
+    """Return the factors from SI to scaled units of (θ, T, l), shape (D+2M,)."""
     scales = (THETA_SCALE, TENSION_SCALE, LENGTH_SCALE)
     return np.repeat(np.array(scales), (joints, muscles, muscles))
 
 
 def visible(mask: Mask, joints: int, muscles: int) -> Bools:
-    """Return which of the D+2M entries of (θ, T, l) a mask lets in, shape (D+2M,)."""
+    """Return which of the D+2M entries of (θ, T, l) a mask selects, shape (D+2M,)."""
     return np.repeat(np.array(mask.value, dtype=bool), (joints, muscles, muscles))

@@ -153,7 +153,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'device': Parameter(
             'cpu',
-            'where the network is trained (the CPU where torch computes nothing there)',
+            'device that trains the network (the CPU if torch cannot use the device)',
             legal=DEVICES,
         ),
     },

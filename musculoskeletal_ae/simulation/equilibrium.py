@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of N simulated arms, preset `default`: the network's equilibrium, approached smoothly.
+"""One step of N simulated arms, preset `default`: a viscous approach to the network's equilibrium.
 
-    l = f_decode,l(①(θ, T_end)),  T_end = T e^{−μ s}            the learned body, and its friction
-    T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     MSC, part of the simulated arm
+    l = f_decode,l(①(θ, T_end)),  T_end = T e^{−μ s}            learned body and tendon friction
+    T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     muscle stiffness control (MSC)
     B θ̇ = −(g(θ) − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
-The paper descends on a sum of norms (§III-F, eq. 13); its weights let ‖T‖ outweigh torque and
-length, so that the arm settles elsewhere. Here both are equations, and what is searched is the
-sheet z = ①(θ, T) of the latent space, where they have D+M unknowns for D+M equations. Their root is
-the posture of rest. (Solved for z itself, with decoded θ and T instead of exact ones, the root is
-no nearer to the body's and each step dearer.) The arm creeps towards it through a viscous medium B,
-by linearly implicit Euler steps: Newton steps on those equations with B/h on the diagonal. B stands
-for what joints and geared modules resist, so that speeds look right: more where muscles have longer
-levers. It has no say in where the arm comes to rest. A joint limit is a hard stop that gives
-whatever torque it takes. Friction along the wires (`friction`) has a say: the arm rests elsewhere
-after winding in than after paying out.
+The paper descends on a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and
+length, and the arm settles in another posture. Here torque and length are equations instead. On the
+surface z = ①(θ, T) of the latent space, they are D+M equations for D+M unknowns, and their root is
+the rest posture. (Solving for z itself, with decoded θ and T, gives a root no closer to that of the
+body, and each step costs more.)
+
+The arm approaches the root through a viscous medium B by linearly implicit Euler steps. These are
+Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and geared
+muscle modules, and so makes speeds realistic; it is larger where muscles have larger moment arms. B
+does not affect the rest posture. A joint limit is a hard stop that exerts any torque needed. Tendon
+friction (`friction`) does affect the rest posture: it differs after winding in and paying out.
 """
 
 import math
@@ -33,16 +34,17 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, Tree, hold
 
-#: l_target of muscles without a command: paid out, so that MSC holds T_bias
+#: l_target of muscles without a command; MSC then holds T_bias
 PAID_OUT = np.inf  # [m]
-#: B as a multiple of Σ_i |∂l_i/∂θ| [N·s/rad]; motions then last as long as the emulated arm's (8 to
-#: 20 is as good)
-VISCOSITY, LEVER_POSTURES = 12.0, 100
-LEAST_VISCOSITY = 0.1  # [N·m·s/rad], of a joint that no muscle crosses
-JOINT_SPEED = 5.0  # [rad/s] or [m/s]; bounds a step, and with it every fault of a network
-MODULE_SPEED = 0.25  # [m/s] at which modules wind, chosen as in the emulator
-ROUNDS = 3  # at most, until it is known which wires' friction turns round in a step
-POSTURES_PER_COEFFICIENT = 10  # of the cubic that gives slopes
+#: B divided by Σ_i |∂l_i/∂θ| [N·s/rad]. Motions then take as long as those of the emulated arm;
+#: values from 8 to 20 do equally well.
+VISCOSITY = 12.0
+JACOBIAN_POSTURES = 100  # postures over which |∂l_i/∂θ| is averaged
+LEAST_VISCOSITY = 0.1  # [N·m·s/rad] of a joint that no muscle crosses
+JOINT_SPEED = 5.0  # [rad/s] or [m/s]; limits each step, and so the effect of network errors
+MODULE_SPEED = 0.25  # [m/s] winding speed of muscle modules, the same as in the emulator
+ROUNDS = 3  # at most, to find the tendons whose friction reverses in a step
+POSTURES_PER_COEFFICIENT = 10  # of a cubic
 
 
 class ArmState(NamedTuple):
@@ -51,19 +53,19 @@ class ArmState(NamedTuple):
     theta: Array  # θ_sim [rad], (N, D)
     tension: Array  # T_sim [N], (N, M)
     length: Array  # l_sim [m], (N, M)
-    followed: Array  # the command as far as the modules have followed it [m], (N, M)
-    holding: Array  # torque of a stop, or of whoever holds a joint, on it [N·m], (N, D)
-    slid: Array  # s: which way each wire slid last, in [−1, 1], (N, M)
+    followed: Array  # command that the muscle modules have reached [m], (N, M)
+    holding: Array  # torque of a stop or an external hold on each joint [N·m], (N, D)
+    slid: Array  # s, direction in which each tendon slid last, in [−1, 1], (N, M)
 
 
 class Body(NamedTuple):
-    """What a step reads of muscles (M,) and joints (D,), as the compiled code wants it."""
+    """Constants of muscles (M,) and joints (D,) for the compiled code."""
 
     stiffness: Array  # K_stiff [N/m]
     bias: Array
     most: Array  # T_max [N]
     friction: Array  # μ
-    force: Array  # of the elastic units, as in `SeriesElastic`
+    force: Array  # of the series elastic elements, as in `SeriesElastic`
     rate: Array
     wire_stretch: Array
     length_at_zero: Array
@@ -73,49 +75,56 @@ class Body(NamedTuple):
 
 
 class Limbs(NamedTuple):
-    """The cubics of all limbs, one after the other: what `add_slopes` reads.
+    """The cubics of all limbs, concatenated, for `add_slopes`.
 
-    They are numbers in a row, so that the compiled code is the same for any number of limbs.
+    Flat arrays let the same compiled code serve any number of limbs.
     """
 
-    counts: Ints  # D joints and M muscles of each, (limbs, 2)
-    joints: Ints  # places in θ
-    muscles: Ints  # places in T and l
-    crossed: Ints  # of each place in T and l, from and to which of `joints` its limb's are, (M, 2)
-    first: Array  # of each, G (M, D) by each member of the basis 1, θ_j, θ_j θ_k with j ≤ k
-    second: Array  # of each, and each muscle, the lower half of ∂²l_i/∂θ² by 1 and each θ_j
+    counts: Ints  # number of joints D and muscles M of each limb, (limbs, 2)
+    joints: Ints  # indices in θ
+    muscles: Ints  # indices in T and l
+    crossed: Ints  # for each muscle, the range of its limb in `joints`, (M, 2)
+    #: for each limb, coefficients of G (M, D) in the basis 1, θ_j, θ_j θ_k with j ≤ k
+    first: Array
+    #: for each limb and muscle, coefficients of the lower half of ∂²l_i/∂θ² in the basis 1, θ_j
+    second: Array
 
 
 @njit(cache=True)
 def handed(body: Body, tree: Tree, limbs: Limbs) -> Handle:
-    """Return the robot that a step takes."""
+    """Return the constants as a handle that a step takes."""
     return Handle((body, tree, limbs))
 
 
 @njit(cache=True)
 def clip(value: float, low: float, high: float) -> float:
-    """Return what is nearest to a value between two others."""
+    """Return the number in [low, high] that is closest to a value."""
     return min(max(value, low), high)
 
 
 @njit(cache=True)
 def follow(command: float, followed: float, length: float, span: float, most: float) -> float:
-    """Return the command [m] as far as a module has wound that winds `most` [m] in a step.
+    """Return the length [m] that a muscle module has reached on the way to a command.
 
-    `followed` is how far it had a step before; a command adds tension as far as `span` [m] below
-    the length.
+    Args:
+        command: l_target [m].
+        followed: The length it had reached a step before [m].
+        length: Muscle length [m].
+        span: How far the command can lie below `length` until the tension is T_max [m].
+        most: Farthest that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # What lies beyond changes no tension; following it would take as long to come back from.
+    # Beyond these limits the tension no longer changes, but the way back would take time.
     return clip(reached, length - span, length + most)
 
 
 @njit(cache=True)
 def combine(shares: Array, rows: Array, total: Array) -> None:
-    """Fill the sums (W, N) of rows (K, W), each times its share (K, N)."""
+    """Fill `total` (W, N) with rowsᵀ @ shares, from rows (K, W) and shares (K, N)."""
     terms, width = rows.shape
     total[:] = 0.0
-    if total.shape[1] == 1:  # a core computes several numbers at once: of one arm those of a row
+    # The innermost loop should be long, because a core computes several numbers at once.
+    if total.shape[1] == 1:
         row = total.reshape(width)
         for k in range(terms):
             for w in range(width):
@@ -131,7 +140,15 @@ def combine(shares: Array, rows: Array, total: Array) -> None:
 def add_slopes(
     limbs: Limbs, theta: Array, tension: Array, jacobian: Array, curvature: Array
 ) -> None:
-    """Fill G [m/rad] (M, D, N); add Σ T_i ∂²l_i/∂θ² [N·m/rad] to the lower half of (D, D, N)."""
+    """Fill `jacobian` and add to `curvature` by the cubics of all limbs.
+
+    Args:
+        limbs: The cubics.
+        theta: θ [rad], (D, N).
+        tension: T [N], (M, N).
+        jacobian: Filled with G [m/rad], (M, D, N).
+        curvature: Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to its lower half, (D, D, N).
+    """
     arms = theta.shape[1]
     jacobian[:] = 0.0
     joints, muscles, first, second = limbs.joints, limbs.muscles, limbs.first, limbs.second
@@ -175,10 +192,10 @@ def add_slopes(
 def turn(
     body: Body, theta: Array, push: Array, matrix: Array, most: float, fixed: Array, arrived: Array
 ) -> None:
-    """Fill θ (D, N) after a step of at most `most` [rad] each.
+    """Fill `arrived` with θ (D, N) after a step of at most `most` [rad] per joint.
 
-    Joints at a stop stay, forced joints go where they are forced. Of the matrix (D, D, N), which is
-    symmetric, the lower half is read, and used up.
+    Joints at a stop stay there, and forced joints move to their forced angles. Only the lower half
+    of the symmetric matrix (D, D, N) is read; it is overwritten.
     """
     joints, arms = theta.shape
     way, turned, held = np.zeros((joints, arms)), push.copy(), np.empty((joints, arms), np.bool_)
@@ -203,7 +220,7 @@ def turn(
         for n in range(arms):
             if held[d, n]:
                 turned[d, n] = 0.0
-    # Gauss; no pivoting where viscosity is on the diagonal.
+    # Gaussian elimination. The viscosity on the diagonal makes pivoting unnecessary.
     for d in range(joints):
         for e in range(d + 1, joints):
             for n in range(arms):
@@ -231,11 +248,18 @@ def advance(
     robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, pulled: Array,
     command: Array, wrench: Array, fixed: Array,
 ) -> None:  # fmt: skip
-    """Fill the arms h [s] after a state, of a robot: Body, Tree and Limbs.
+    """Fill `after` with the arms h [s] after `state`. The last axis is that of the arms.
 
-    Arms stand last, as in `load`. Of the network: the lengths at θ
-    and T_end, which are the state's (M, N), and Gᵀ T_end there (D, N). `passed` is what friction
-    lets through from the motor to the elastic unit, T_end / T (M, N).
+    Args:
+        robot: Handle of Body, Tree and Limbs.
+        state: The arms now; its length is the network's at (θ, T_end), (M, N).
+        after: Filled with the arms after the step.
+        h: Duration of the step [s].
+        passed: Share of the tension that tendon friction transmits, T_end / T, (M, N).
+        pulled: The network's Gᵀ T_end [N·m], (D, N).
+        command: l_target [m], (M, N).
+        wrench: On the end effectors [N, N·m], (6, N).
+        fixed: Angles that joints are forced to [rad], (D, N); NaN for a free joint.
     """
     body, tree, limbs = robot.held
     theta, tension, length, slid = state.theta, state.tension, state.length, state.slid
@@ -273,21 +297,21 @@ def advance(
             stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
             friction = body.friction[m]
             for n in range(arms):
-                # Where a wire slides, friction is like a stiff spring until it has turned round:
-                # one of constant stiffness, where the arm's lets go little by little.
+                # While the friction of a tendon reverses, it acts like a stiff spring. Its
+                # stiffness is constant here, but decreases gradually on the real arm.
                 rubbed, turns = friction * end[m, n], abs(turning[m, n]) < 1.0
                 rub = rubbed / REVERSAL if turns else 0.0
                 lost[m, n] = 0.0 if turns else rubbed * (turning[m, n] - slid[m, n])
-                # MSC, friction and the elastic unit in series: at rest posture T moves to `wanted`,
-                # and with the posture by `soft` K G Δθ.
+                # MSC, friction and elastic element act in series. T moves to `wanted` if the
+                # posture stays the same, and a change of posture adds `soft` · G Δθ.
                 wound = stiffness * (length[m, n] - after.followed[m, n])
                 by_motor, aim = passed[m, n] * compliance[m, n], bias + wound
                 give[m, n] = 1.0 + compliance[m, n] * rub
                 soft[m, n] = stiffness / (give[m, n] + stiffness * by_motor)
                 slack = compliance[m, n] * lost[m, n] - by_motor * (aim - tension[m, n])
                 wanted[m, n] = aim + soft[m, n] * slack
-                # max(0, ·) and T_max are corners: beyond them a muscle is no spring (semismooth
-                # Newton).
+                # Beyond the corners max(0, ·) and T_max, a muscle does not act as a spring
+                # (semismooth Newton).
                 settled = clip(wanted[m, n], bias, most)
                 rise = settled - tension[m, n]
                 moved = (compliance[m, n] * lost[m, n] - by_motor * rise) / give[m, n]
@@ -336,22 +360,23 @@ def advance(
 
 
 class QuasiStatics:
-    """The equations above for one robot, and for the network that was given to `use` last."""
+    """The equations above for one robot and the network that `use` has set."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.tree, self.slopes = robot, Load(robot.kinematics).tree, Slopes(robot)
-        postures = robot.random_postures(LEVER_POSTURES, np.random.default_rng(0))
-        levers = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
-        self._viscosity = np.maximum(VISCOSITY * levers, LEAST_VISCOSITY)
+        postures = robot.random_postures(JACOBIAN_POSTURES, np.random.default_rng(0))
+        moment_arms = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
+        self._viscosity = np.maximum(VISCOSITY * moment_arms, LEAST_VISCOSITY)
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Take a network, and the robot with the muscles that are isolated now.
+        """Set the network, and the robot with the currently isolated muscles.
 
-        A FloatingPointError says that the network has no finite lengths somewhere.
+        Raises:
+            FloatingPointError: If the network's lengths are not finite somewhere.
         """
         self.slopes.fit(mae)
         self._robot, elastic, self._mae = robot, robot.series_elastic, mae
-        # A noisy fit may find a little less than none, which would drive the arm.
+        # A noisy fit may return a slightly negative friction, which would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction
         units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
@@ -362,11 +387,7 @@ class QuasiStatics:
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
-        """Return the arms h [s] later, under l_target [m] (N, M), PAID_OUT for none.
-
-        A wrench (N, 6) [N, N·m] acts on the end effector, in axes of the root link; joints are
-        forced to the angles `fixed` (N, D) [rad], nan for a free joint.
-        """
+        """Return the arms h [s] later; `SimulatedBody.step` describes the arguments."""
         passed = np.exp(-self.body.friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)
@@ -378,23 +399,24 @@ class QuasiStatics:
 
 
 def arms_last(part: Array) -> Array:
-    """Return what is given by arm, (N, …), with arms last, in one piece."""
+    """Return an array (N, …) transposed to (…, N), contiguous in memory."""
     return np.ascontiguousarray(part.T)
 
 
 class Slopes:
-    """How a network's lengths change with posture, nearly: a cubic through what it says.
+    """Approximate derivatives of a network's lengths with respect to θ, from fitted cubics.
 
         l_i(θ) ≈ Σ_n c_ni θ^n,  |n| ≤ 3      G = ∂l/∂θ,   Σ_i T_i ∂²l_i/∂θ²
 
-    A Newton step needs these slopes in every step, but only roughly: they decide how the simulator
-    approaches an equilibrium, never where it lies, which is the network's own word. The network's
-    exact second derivatives would cost ten times the rest of the step. Each limb has cubics in its
-    own joints: in all 17 of an upper body they would have 1140 coefficients each, instead of 120.
+    Each Newton step needs these derivatives, but only roughly. They affect how the simulator
+    approaches an equilibrium, whereas the network itself determines where the equilibrium lies. The
+    network's exact second derivatives would cost ten times the rest of the step. The cubics of a
+    limb depend on its own joints only. A cubic in all 17 joints of an upper body would have 1140
+    coefficients instead of 120.
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Prepare to fit over the whole joint range, muscles in the middle of their tensions."""
+        """Prepare fits over the whole joint range, at the middle of the tension range."""
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))
@@ -410,10 +432,14 @@ class Slopes:
         self._places = counts, joints, muscles, crossed
 
     def fit(self, mae: Mae) -> None:
-        """Fit what a network says; a FloatingPointError says that it cannot be fitted."""
+        """Fit the cubics to a network's lengths.
+
+        Raises:
+            FloatingPointError: If a length is not finite.
+        """
         lengths = mae.lengths(self._postures, self._tension)
         if not np.isfinite(lengths).all():
-            raise FloatingPointError('lengths within the joint limits that are not finite')
+            raise FloatingPointError('some lengths within the joint limits are not finite')
         fitted = zip(*(limb.fit(lengths) for limb in self._cubics), strict=True)
         self.limbs = Limbs(*self._places, *map(np.concatenate, fitted))
 
@@ -422,7 +448,7 @@ class Cubics:
     """The cubics of one limb."""
 
     def __init__(self, group: Group, postures: Array) -> None:
-        """Prepare to fit to lengths at some postures θ of the body (N, D) [rad]."""
+        """Prepare fits to lengths at postures θ [rad] (N, D) of the whole body."""
         self._muscles = np.array(group.muscles)
         theta, joints = postures[:, np.array(group.joints)], len(group.joints)
         basis = [term for n in range(4) for term in combinations_with_replacement(range(joints), n)]
@@ -434,7 +460,7 @@ class Cubics:
         self._bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
 
     def fit(self, lengths: Array) -> tuple[Array, Array]:
-        """Fit lengths of the body at those postures (N, M) [m]; return its part of `Limbs`."""
+        """Fit lengths [m] (N, M) at these postures; return `first` and `second` of `Limbs`."""
         cubic = self._inverse @ lengths[:, self._muscles]  # (basis, M)
         first = np.einsum('dqb,bm->qmd', self._slope, cubic)
         bend = np.einsum('elq,qmd->mlde', self._bend, first)
@@ -443,7 +469,10 @@ class Cubics:
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:
-    """Return the matrices that take coefficients of monomials to those of their ∂/∂θ_d."""
+    """Return one matrix for each ∂/∂θ_d, from coefficients in `basis` to those in `target`.
+
+    The shape is (D, target, basis).
+    """
     place = {term: i for i, term in enumerate(target)}
     matrices = np.zeros((joints, len(target), len(basis)))
     for column, term in enumerate(basis):

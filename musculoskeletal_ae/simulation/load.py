@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What gravity and a push ask of the joints of N arms, and how that changes, compiled by numba.
+"""Joint torques that hold N arms against gravity and a wrench, and their gradient, by numba.
 
     load(θ) = g(θ) − Jᵀ F
 
-(paper, §III-F: the necessary torque from the geometric model). Pinocchio answers the
-same, a test holds the two together; but it has no gradient with a push, and from Python takes as
-long as all the rest of a step. With forces f_i at points c_i, every joint k at o_k with axis a_k
-needs only sums over what it carries:
+(paper, §III-F: the necessary torque from the geometric model). Pinocchio computes the same torque,
+and a test compares the two. However, it has no gradient with a wrench, and called from Python it
+takes as long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with axis a_k
+needs only sums over the bodies that it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
 
-Arms stand last in memory, (…, N): a core then computes several at once.
+The last axis of all arrays (…, N) is that of the arms, so that a core computes several at once.
 """
 
 import math
@@ -26,36 +26,36 @@ from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 
 
 class Tree(NamedTuple):
-    """Pinocchio's joints, joint 0 being the root link, and the bodies that they carry."""
+    """The J joints of pinocchio and their bodies; joint 0 is the root link."""
 
     parent: Ints  # (J,)
-    master: Ints  # place in θ of what turns a joint
-    terms: Array  # by q = Σ terms_k θᵏ, (J, K)
+    master: Ints  # index in θ of the coordinate that moves a joint
+    terms: Array  # coefficients of q = Σ terms_k θᵏ, (J, K)
     slides: Bools
-    #: pose in the parent = placement + sin q · first + (1 − cos q) · second, each (J, 4, 4);
-    #: placement + q · first where it slides
+    #: pose in the parent's frame, (J, 4, 4): placement + sin q · first + (1 − cos q) · second if
+    #: revolute, placement + q · first if prismatic
     placement: Array
     first: Array
     second: Array
     axis: Array  # in the joint's frame, (J, 3)
     mass: Array  # [kg] (J,)
-    carried: Array  # mass of all that a joint carries [kg] (J,)
-    centre: Array  # of mass [m], in the joint's frame, (J, 3)
+    carried: Array  # total mass that a joint carries [kg] (J,)
+    centre: Array  # centre of mass in the joint's frame [m], (J, 3)
     gravity: Array  # [m/s²] (3,)
     carries: Bools  # whether a joint carries the end effector, (J,)
     effector_joint: int
-    effector: Array  # its place in the frame of the joint that carries it [m], (3,)
+    effector: Array  # end effector in the frame of the joint that carries it [m], (3,)
 
 
 @njit(cache=True)
 def vector(a: Array) -> Vector:
-    """Return a (3,) as a vector that takes no memory."""
+    """Return an array (3,) as a tuple, which needs no memory allocation."""
     return a[0], a[1], a[2]
 
 
 @njit(cache=True)
 def of(arm: int, vectors: Array) -> Vector:
-    """Return one arm's of vectors (3, N), without taking memory."""
+    """Return the vector of one arm from (3, N), without memory allocation."""
     return vectors[0, arm], vectors[1, arm], vectors[2, arm]
 
 
@@ -73,9 +73,10 @@ def polynomial(terms: Array, order: int, x: float) -> float:
 
 @njit(cache=True)
 def place(tree: Tree, theta: Array, pose: Array) -> None:
-    """Fill the axes and origins of joints in the root link's frame, and vectors of theirs.
+    """Fill `pose` (J, 6, 3, N) with six vectors of each joint in the root link's frame.
 
-    (J, 6, 3, N): three axes of its frame, its origin, the axis that it turns about, m c of its body
+    The vectors are the three axes of the joint's frame, its origin, the joint axis, and mass times
+    centre of mass of its body.
     """
     arms = theta.shape[1]
     sine, rest, column = np.empty(arms), np.empty(arms), np.empty((3, arms))
@@ -109,10 +110,10 @@ def place(tree: Tree, theta: Array, pose: Array) -> None:
 
 @njit(cache=True)
 def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) -> None:
-    """Fill load [N·m] (D, N) and ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
+    """Fill load [N·m] (D, N) and its gradient ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
 
-    The wrench (6, N) [N, N·m] acts on the end effector's origin, in axes of the root link; its
-    torque's share in the gradient is left out.
+    The wrench [N, N·m] (6, N) acts at the end effector's origin, in axes of the root link. The
+    gradient neglects the contribution of its torque.
     """
     joints, arms = len(tree.parent), theta.shape[1]
     pose, bend = np.empty((joints, 6, 3, arms)), np.empty((3, arms))
@@ -166,7 +167,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
 
 
 class Load:
-    """Torque that holds N arms against gravity and a wrench, and its gradient."""
+    """Torques that hold N arms against gravity and a wrench, and their gradient."""
 
     def __init__(self, kinematics: Kinematics) -> None:
         kin, model = kinematics, kinematics.model
@@ -192,9 +193,14 @@ class Load:
         )
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
-        """Return what `hold` fills, (N, D) and (N, D, D), for θ (N, D) and wrenches (N, 6)."""
-        pushes = np.zeros((len(theta), 6)) if wrench is None else wrench
-        theta, pushes = np.ascontiguousarray(theta.T), np.ascontiguousarray(pushes.T)
+        """Return the load [N·m] (N, D) and its gradient [N·m/rad] (N, D, D).
+
+        Args:
+            theta: θ [rad], (N, D).
+            wrench: On the end effectors, axes of the root link [N, N·m], (N, 6); None for none.
+        """
+        wrench = np.zeros((len(theta), 6)) if wrench is None else wrench
+        theta, wrench = np.ascontiguousarray(theta.T), np.ascontiguousarray(wrench.T)
         load, gradient = np.empty_like(theta), np.empty((len(theta), *theta.shape))
-        hold(self.tree, theta, pushes, load, gradient)
+        hold(self.tree, theta, wrench, load, gradient)
         return load.T, gradient.transpose(2, 0, 1)

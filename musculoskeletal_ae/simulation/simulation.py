@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learned body as a simulator: joint angles and muscle tensions from commanded lengths.
 
-(Paper, §III-F.) The simulated arms follow the same
-muscle length command as real ones, with muscle stiffness control being part of the arm: commanding
-l_target, with its l_comp, gives the tensions it gives on the robot at rest. An arm that has had no
-command rests at T_bias. One arm or thousands are the same compiled code, on all cores; their
-network may be on a GPU. The preset chooses the equations (`Preset.make_simulator`); those of
-preset `default` are in `equilibrium`.
+(Paper, §III-F.) The simulated arms follow the same length commands as the robot, because muscle
+stiffness control is part of them. An l_target, with its l_comp, causes the same tensions at rest as
+on the robot. An arm without a command rests at T_bias. The same compiled code simulates one arm or
+thousands, on all cores; the network may run on a GPU. The preset selects the equations
+(`Preset.make_simulator`); those of preset `default` are in `equilibrium`.
 """
 
 import os
@@ -27,21 +26,21 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
-LONGEST_STEP = 0.01  # [s]; a longer time is cut into several
-#: arms whose arrays fit into a core's cache together
-CHUNK = 384
-SETTLING_STEP, SETTLING_STEPS = 0.1, 300  # [s], for `settle`
-SETTLED = 1e-6  # [rad] moved in a step
+LONGEST_STEP = 0.01  # [s]; longer times are divided into several steps
+CHUNK = 384  # number of arms whose arrays fit into a core's cache
+SETTLING_STEP = 0.1  # [s] of `settle`
+SETTLING_STEPS = 300  # at most
+SETTLED = 1e-6  # [rad] of motion in a step
 
-# Below these a stop or a module at its end does not count as a limit reached.
-STOP_TORQUE, TENSION_MARGIN = 0.1, 1.0  # [N·m], [N]
+STOP_TORQUE = 0.1  # [N·m]; a stop with a lower torque is not reported
+TENSION_MARGIN = 1.0  # [N]; a tension this far below T_max is not reported
 
 
 class SimulatedBody(Protocol):
     """Steps N simulated arms of one robot."""
 
     def use(self, mae: Any, robot: Robot) -> None:
-        """Take a network, and the robot with the muscles that are isolated now."""
+        """Set the network, and the robot with the currently isolated muscles."""
 
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
@@ -50,8 +49,8 @@ class SimulatedBody(Protocol):
 
         Args:
             state: The arms now.
-            command: l_target [m], (N, M).
-            h: Time [s].
+            command: l_target [m], (N, M); PAID_OUT for muscles without a command.
+            h: Duration of the step [s].
             wrench: On the end effectors, axes of the root link [N, N·m], (N, 6).
             fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
         """
@@ -61,10 +60,10 @@ class Simulation:
     """N simulated arms of one robot."""
 
     mae: Mae  # the learned body
-    state: ArmState  # the arms now; assign it to go back to a state kept before
+    state: ArmState  # the arms now; assign an earlier state to return to it
     command: Array  # l_target [m], (N, M)
     wrench: Array  # on the end effectors, axes of the root link [N, N·m], (N, 6)
-    fixed: Array  # angles joints are forced to [rad], (N, D); nan for a free joint
+    fixed: Array  # angles that joints are forced to [rad], (N, D); NaN for a free joint
 
     def __init__(
         self,
@@ -74,45 +73,50 @@ class Simulation:
         arms: int = 1,
         device: str | None = None,
     ) -> None:
-        """Put arms at θ = 0 (or the nearest limit) with T_bias and no command.
+        """Start at θ = 0, or at the nearest joint limit, with T_bias and no command.
 
-        The network computes on a device of torch, such as `cuda`, if the preset can.
+        Args:
+            robot: The geometric model.
+            mae: The learned body.
+            preset: Name of the preset, which selects the equations.
+            arms: Number of arms.
+            device: Torch device of the network, such as `cuda`; None: numpy.
 
         Raises:
-            MusculoskeletalError: If torch computes nothing there, the preset cannot, or there are
-                no arms.
+            MusculoskeletalError: If torch or the preset cannot use the device, or if `arms` is 0.
         """
         self.robot = robot
         chosen = preset_named(preset)
         self._body, self._device = chosen.make_simulator(self.robot), device
         if device is not None and not chosen.simulates_on_devices:
             legal = ', '.join(name for name, each in PRESETS.items() if each.simulates_on_devices)
-            reason = f'preset {preset!r} simulates one arm after the other, and on no device'
-            raise MusculoskeletalError(f'{reason}; given: {device!r}. Legal there: {legal}')
-        self.wrench = np.zeros((0, 6))  # those of the arms that start
+            problem = f'device {device!r}: preset {preset!r} cannot simulate on a torch device'
+            raise MusculoskeletalError(f'{problem}; use one of these presets: {legal}')
+        self.wrench = np.zeros((0, 6))  # `start_from` sets its size
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))
 
     def use(self, mae: Mae) -> None:
-        """Take a new network; the arms move on to its equilibrium from where they are.
+        """Set a new network; the arms move from their state to its equilibrium.
 
-        A FloatingPointError says that it cannot be simulated; the one in use stays.
+        Raises:
+            FloatingPointError: If it cannot be simulated; the current network then stays in use.
         """
         self._body.use(mae if self._device is None else _there(mae, self._device), self.robot)
         self.mae = mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Let these muscles, places in T and l, pull nothing, and all others as they are told."""
+        """Isolate exactly these muscles, indices in T and l; they then exert no tension."""
         self.robot = self.robot.without(muscles)
         self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
-        """Put the arms at θ [rad] (N, D), of numpy, with T_bias, commands forgotten.
+        """Put the arms at θ [rad] (N, D) with T_bias, and reset their commands.
 
-        If they become more or fewer, wrenches and fixed angles are forgotten as well.
+        If the number of arms changes, wrenches and forced angles are reset as well.
 
         Raises:
-            MusculoskeletalError: If there are none.
+            MusculoskeletalError: If N is 0.
         """
         robot = self.robot
         if not len(theta):
@@ -124,31 +128,32 @@ class Simulation:
         tension = np.full((len(theta), robot.muscle_count), robot.tension.bias)
         self.command = np.full_like(tension, PAID_OUT)
         length = np.array(self.mae.lengths(theta, tension))
-        nothing, not_slid = np.zeros_like(theta), np.zeros_like(tension)
-        self.state = ArmState(theta, tension, length, length, nothing, not_slid)
+        holding, slid = np.zeros_like(theta), np.zeros_like(tension)
+        self.state = ArmState(theta, tension, length, length, holding, slid)
 
     def step(self, dt: float) -> ArmState:
-        """Let time pass [s], none if it is not positive; return the arms."""
+        """Advance by `dt` [s] and return the arms; a `dt` that is not positive does nothing."""
         substeps = int(np.ceil(dt / LONGEST_STEP - 1e-9))
         for _ in range(substeps):
             self._advance(dt / substeps)
         return self.state
 
     def settle(self) -> ArmState:
-        """Go on to the equilibrium of the command, in long steps; return the arms.
+        """Advance in long steps to the equilibrium of the command, and return the arms.
 
-        Arms that find none within SETTLING_STEPS are returned as they are then.
+        Arms that have not settled after SETTLING_STEPS are returned in their current state.
         """
         for _ in range(SETTLING_STEPS):
             before = self.state
             self._advance(SETTLING_STEP)
-            turned = abs(self.state.theta - before.theta).max()
-            if max(turned, 1e-3 * abs(self.state.tension - before.tension).max()) < SETTLED:
+            joint_change = abs(self.state.theta - before.theta).max()
+            tension_change = abs(self.state.tension - before.tension).max()
+            if max(joint_change, 1e-3 * tension_change) < SETTLED:
                 break
         return self.state
 
     def limits(self, arm: int = 0) -> list[str]:
-        """Return the joints and muscles of one arm that are at the end of what they can do."""
+        """Return the joints of one arm at a joint limit, and its muscles at T_max."""
         robot, forced, tension = self.robot, self.fixed[arm], self.state.tension[arm]
         stopped = np.isnan(forced) & (np.abs(self.state.holding[arm]) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)
@@ -156,7 +161,7 @@ class Simulation:
         return [*compress(robot.joints, stopped), *compress(robot.muscles, full)]
 
     def report(self) -> Report:
-        """Say what acts on the first arm, and whether it is at a limit."""
+        """Return the status of the first arm: forced joints, external wrench and limits."""
         values = {'checkpoint version': str(self.mae.version)}
         fixed, wrench, command = self.fixed[0], self.wrench[0], self.command[0]
         if forced := ', '.join(compress(self.robot.joints, np.isfinite(fixed))):
@@ -169,7 +174,7 @@ class Simulation:
         return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
 
     def _advance(self, h: float) -> None:
-        # Others may have assigned them, and compiled code is for arrays of one kind.
+        # Callers may assign any array, but the compiled code requires this type and order.
         command, wrench, fixed = (
             np.array(part, float, order='C') for part in (self.command, self.wrench, self.fixed)
         )
@@ -189,8 +194,8 @@ class Simulation:
 
 
 def _there(mae: Mae, device: str) -> Any:
-    """Return a network whose lengths are computed on a device of torch."""
-    # Only here: a node that simulates one arm does without torch.
+    """Return a network that computes its lengths on a torch device."""
+    # Imported here, because a node that simulates one arm does not need torch.
     from musculoskeletal_ae.mae.network import TorchLengths
     from musculoskeletal_ae.mae.training import check_device
 
@@ -199,10 +204,11 @@ def _there(mae: Mae, device: str) -> Any:
 
 
 def on_all_cores(function: Callable[[slice], ArmState], pieces: Sequence[slice]) -> list[ArmState]:
-    """Return function(piece) of each piece, in order; the function may not wait for others.
+    """Return function(piece) for each piece, in order; the calls run in parallel.
 
-    Compiled code and numpy let go of Python's lock while they compute, so threads suffice. BLAS
-    would also like to use all cores for every product, and the two together are slower than either.
+    The function must not wait for another piece. Threads suffice, because compiled code and numpy
+    release Python's global lock. BLAS is limited to one thread, because parallelism at both levels
+    is slower than at either.
     """
     pool, libraries = _cores()
     with libraries.limit(limits=1, user_api='blas'):

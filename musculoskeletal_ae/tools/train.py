@@ -30,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
     text = 'with --from-bag: which arm, of bags that have several'
     parser.add_argument('--from-namespace', metavar='NS', help=text)
-    text = 'where to train; refused where torch computes nothing there'
+    text = 'device for training; it must be one that torch can use'
     parser.add_argument('--device', choices=DEVICES, default='cpu', help=text)
     parser.add_quick('a tenth of the training, to try things out')
     args = parser.parse_args(argv)

@@ -114,7 +114,7 @@ def test_no_flipped_bit_changes_what_is_read(content, tmp_path):
 @pytest.mark.parametrize(
     ('data', 'problem'),
     [
-        (b'', 'the file is empty; nothing was recorded'),
+        (b'', 'the file is empty; record again'),
         (b'# Recordings\n', 'is neither an mcap nor a sqlite3 file'),
         (b'\x89MCAP0\r\n\x01\x20', 'it ends within its first record'),
         (b'SQLite format 3\0' + bytes(1000), 'cannot be read as a recording'),
@@ -129,7 +129,7 @@ def test_what_is_no_recording_is_named_so(data, problem, tmp_path):
 def test_what_does_not_exist_is_named_so(tmp_path):
     with pytest.raises(BagError, match=r'nothing: cannot be read: No such file .*name another bag'):
         Bag.open(tmp_path / 'nothing')
-    with pytest.raises(BagError, match=r'neither a usable metadata.yaml nor mcap'):
+    with pytest.raises(BagError, match=r'neither a readable metadata.yaml nor mcap'):
         Bag.open(tmp_path)
 
 

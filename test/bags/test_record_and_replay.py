@@ -240,7 +240,7 @@ def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
         (('replay', tmp_path / 'nothing'), 1, 'No such file'),
         (('record', bag), 1, 'is not empty; name a new directory'),
         (('replay', bag, '--rate', '2'), 2, '--rate other than 1 needs --clock'),
-        (('replay', bag, '--start', '100'), 1, 'is 0.620 s long; give a smaller --start'),
+        (('replay', bag, '--start', '100'), 1, 'is 0.620 s long; choose a smaller --start'),
         (('replay', bag, '--ros-args', '-r', 'bad'), 2, "Couldn't parse remap rule"),
     ]
     started = [(tool(*arguments), *rest) for arguments, *rest in cases]
@@ -313,7 +313,7 @@ def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
     np.testing.assert_allclose(shown[:, 1], -0.3)
     np.testing.assert_array_equal(message.points[-1].velocities, 0.0)
     short = tool('replay', tmp_path / 'bag', '--as-trajectory', '--duration', '0.2', *ros(graph))
-    assert 'holds no motion' in short.output()
+    assert 'contains no motion' in short.output()
     assert short.process.returncode == 1
 
 

@@ -115,12 +115,12 @@ def test_an_empty_recording_is_a_sound_bag(tmp_path):
     assert (bag.message_count, bag.unfinished, list(bag.messages())) == (0, [], [])
 
 
-def test_a_full_disk_is_told_with_the_place_and_what_to_do(tmp_path, content):
+def test_a_full_disk_raises_an_error_with_the_directory_and_the_remedy(tmp_path, content):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, hard))
-    told = pytest.raises(BagError, match=r'bag: cannot be written: .*; name another place')
+    refusal = pytest.raises(BagError, match=r'bag: cannot be written: .*; choose another directory')
     try:
-        with told, BagWriter(tmp_path / 'bag', 'none') as writer:
+        with refusal, BagWriter(tmp_path / 'bag', 'none') as writer:
             writer.add_topic(content[0].topic, content[0].type, [offered_qos(False)])
             for _ in range(30_000):
                 writer.write(content[0].topic, *content[0][2:])

@@ -147,12 +147,12 @@ def test_permuted_muscles_are_refused(mae, robot):
 @pytest.mark.parametrize(
     ('change', 'problem'),
     [
-        ({'format_version': 2}, 'format_version 2; this program reads 1'),
+        ({'format_version': 2}, 'format_version 2; legal: 1'),
         ({'format_version': True}, 'format_version'),
         ({'extra': 1}, "unknown key 'extra'; legal keys: format_version, units"),
         ({'joints': [1]}, r'\$.joints\[0\]: expected str, got int: 1'),
         ({'joints': ['kn\nee']}, 'printable'),
-        ({'muscles': ['quad', 'quad']}, 'different names'),
+        ({'muscles': ['quad', 'quad']}, 'different printable names'),
         ({'layer_sizes': [8, 4, 3, 4, 6]}, 'layer_sizes'),
         ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
         ({'layer_sizes': [8, 10**12, 3, 10**12, 5]}, r'layer_sizes\[1\]: expected int <= 4096'),
@@ -160,7 +160,7 @@ def test_permuted_muscles_are_refused(mae, robot):
         ({'preset': 'other'}, 'legal: default, paper'),
         ({'units': 'degree'}, 'units'),
         ({'version': -1}, 'version: expected int >= 0, got -1'),
-        ({'isolated': [2]}, 'different places of muscles'),
+        ({'isolated': [2]}, 'different indices of muscles'),
         ({'anomaly_calibrated': None}, 'tensors missing or unknown: anomaly'),
         ({'anomaly_thresholds': {'norm': float('nan')}}, 'NaN'),
         ({'anomaly_thresholds': {'norm': 10**400}}, 'anomaly_thresholds'),
@@ -211,7 +211,7 @@ def test_weights_that_cannot_be_computed_with_are_refused_for_a_robot(mae, robot
     huge = tuple((np.full_like(weight, 1e9), bias) for weight, bias in mae.decoder)
     data = to_bytes(replace(mae, decoder=huge))
     from_bytes(data)
-    with pytest.raises(CheckpointError, match='posture at rest'):
+    with pytest.raises(CheckpointError, match='rest posture'):
         from_bytes(data, robot)
 
 
@@ -292,7 +292,7 @@ def test_what_tells_a_push_from_friction_comes_back_and_unsound_values_are_refus
     np.testing.assert_array_equal(mae.touch.spread, touch.spread)
     assert small().touch is None and from_bytes(GOOD).touch is None
     for wrong, said in (
-        (replace(touch, friction=np.array([0.1, 9.0])), 'touch.friction holds ±9'),
+        (replace(touch, friction=np.array([0.1, 9.0])), 'touch.friction has a value of ±9'),
         (replace(touch, spread=np.zeros(1)), 'touch.spread holds 0'),
         (replace(touch, time=-1.0), 'touch_time'),
         (replace(touch, spread=np.ones(2)), 'touch.spread has shape'),
