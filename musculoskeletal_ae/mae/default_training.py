@@ -75,7 +75,7 @@ def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
 
 
 def size(group: Group) -> float:
-    """Return D + M of a group, of whose muscles COUNTED_MUSCLES a joint count at most."""
+    """Return D + M of a group, counting at most COUNTED_MUSCLES muscles per joint."""
     joints, muscles = map(len, group)
     return joints + min(muscles, COUNTED_MUSCLES * joints)
 

@@ -83,9 +83,9 @@ def place(tree: Tree, theta: Array, pose: Array) -> None:
     pose[0] = 0.0
     pose[0, 0, 0] = pose[0, 1, 1] = pose[0, 2, 2] = 1.0
     for i in range(1, len(tree.parent)):
-        up, own, given = pose[tree.parent[i]], pose[i], theta[tree.master[i]]
+        up, own, angles = pose[tree.parent[i]], pose[i], theta[tree.master[i]]
         for n in range(arms):
-            angle = polynomial(tree.terms[i], 0, given[n])
+            angle = polynomial(tree.terms[i], 0, angles[n])
             sine[n], rest[n] = math.sin(angle), 1.0 - math.cos(angle)
             if tree.slides[i]:
                 sine[n], rest[n] = angle, 0.0

@@ -178,5 +178,5 @@ def test_a_recording_whose_times_run_backwards_is_refused_at_once(tmp_path):
 def test_a_message_that_is_not_of_its_type_names_file_and_topic(data, tmp_path):
     bag = Bag.open(write(tmp_path / 'a.mcap', data=data))
     (message,) = bag.messages()
-    with pytest.raises(BagError, match=rf'a.mcap: .*a message of /anomaly is not a {FLOAT}'):
+    with pytest.raises(BagError, match=rf'a.mcap: .*a message of /anomaly is not a valid {FLOAT}'):
         bag.decode(message)

@@ -293,7 +293,7 @@ def test_what_tells_a_push_from_friction_comes_back_and_unsound_values_are_refus
     assert small().touch is None and from_bytes(GOOD).touch is None
     for wrong, said in (
         (replace(touch, friction=np.array([0.1, 9.0])), 'touch.friction has a value of ±9'),
-        (replace(touch, spread=np.zeros(1)), 'touch.spread holds 0'),
+        (replace(touch, spread=np.zeros(1)), 'touch.spread has the value 0'),
         (replace(touch, time=-1.0), 'touch_time'),
         (replace(touch, spread=np.ones(2)), 'touch.spread has shape'),
     ):
