@@ -245,13 +245,16 @@ wait_for() {
 # shellcheck disable=SC2329  # the trap calls it
 stop() {
   local pid deadline=$((SECONDS + 5))
+  local -a pids
   trap '' INT TERM HUP PIPE
-  [ ${#name_of[@]} -gt 0 ] || return
+  # Not those of name_of: a signal may come between the start of a process and its entry there.
+  mapfile -t pids < <(jobs -pr)
+  [ ${#pids[@]} -gt 0 ] || return
   say stopping
-  kill -TERM "${!name_of[@]}" 2>/dev/null
-  while kill -0 "${!name_of[@]}" 2>/dev/null && [ "$SECONDS" -lt "$deadline" ]; do sleep 0.1; done
-  for pid in "${!name_of[@]}"; do
-    ! kill -KILL "$pid" 2>/dev/null || say "${name_of[$pid]} did not stop within 5 s: killed"
+  kill -TERM "${pids[@]}" 2>/dev/null
+  while kill -0 "${pids[@]}" 2>/dev/null && [ "$SECONDS" -lt "$deadline" ]; do sleep 0.1; done
+  for pid in "${pids[@]}"; do
+    ! kill -KILL "$pid" 2>/dev/null || say "${name_of[$pid]-process $pid} did not stop within 5 s: killed"
   done
   wait
 }

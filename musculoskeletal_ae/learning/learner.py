@@ -41,6 +41,9 @@ from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 from musculoskeletal_ae.signals.pairing import Paired
 
+#: [s] by which a message is ahead of the last poll if the clock was set back since
+CLOCK_SET_BACK = 1.0
+
 
 class Learner:
     """Learns the body of one arm.
@@ -406,7 +409,8 @@ class Learner:
     def idle_time(self) -> float:
         """For how long [s] nothing has come that could be learned from; 0 before the first poll."""
         used_at = self.collector.used_at
-        if used_at > self._polled_at:  # by a clock that has been set back
+        # Messages come after the last poll, too; only a clock that was set back is far ahead of it.
+        if used_at > self._polled_at + CLOCK_SET_BACK:
             used_at = -math.inf
         since = max(used_at, self._waiting_since)
         return max(0.0, self._polled_at - since) if math.isfinite(since) else 0.0

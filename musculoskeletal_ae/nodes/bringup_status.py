@@ -26,6 +26,9 @@ from musculoskeletal_ae.report import Report
 class BringupStatus(Shell):
     """Prints estimation error, A, samples learned and number of checkpoints."""
 
+    # A terminal that is paused by Ctrl-S, or a pager that is not read on, blocks the prints.
+    is_watched = False
+
     def __init__(self, **options: Any) -> None:
         super().__init__('bringup_status', **options)
         self.duration: float = self.parameter('duration')

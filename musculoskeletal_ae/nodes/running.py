@@ -90,7 +90,8 @@ def _run(kinds: list[Any]) -> None:
                 stop_if_asked()
 
             nodes[0].create_timer(STOP_LOOK_PERIOD, look, clock=STEADY)
-            watch.start()
+            if all(node.is_watched for node in nodes):
+                watch.start()
             spin(executor, nodes[0])
     except ExternalShutdownException:
         pass

@@ -81,6 +81,7 @@ class Shell(Node):
 
     core: Any = None  # what computes
     is_time_critical = True  # whether commands wait for it
+    is_watched = True  # whether the process ends if it makes no progress for 10 s
     recording: StopRecording | None = None  # told of every message that is new, before it is used
     #: topics that have one rightful publisher, but on which this node takes what anybody sends
     accepted_from_all: frozenset[str] = frozenset()

@@ -426,6 +426,15 @@ def test_a_learner_that_gets_nothing_to_learn_from_warns_and_names_why(
     assert ('nothing to learn from for' in report.message) == bool(obstacle)
 
 
+def test_messages_after_the_last_poll_are_no_silence(learner, stage):
+    sample = stage.sample()
+    learner.poll(0.0)
+    for time in np.arange(0.0, 8.0, DT):
+        learner.step(time, sample.theta, sample.tension, sample.length)
+    learner.poll(7.5)
+    assert learner.report().level == 'ok'
+
+
 def test_silence_is_reported_as_nothing_to_learn_from(learner):
     learner.poll(100.0)
     assert learner.report().level == 'ok'
