@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning the body online: what counts as a sample, the calibrated body, the network's updates."""
+"""Online learning: collecting samples, fitting the calibrated body, updating the network."""

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated body: the geometric model with other constants, plus a residual model.
+"""The calibrated body: the geometric model with fitted constants, plus a residual model.
 
     l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + ψ(θ)ᵀ v
 
-Attachments p are off by millimetres (δ), elastic constants c by some per cent (κ), and the length
-sensor by an offset (o). Tendons wrap round bones that the straight lines do not know: that is the
-residual model (ψ, random Fourier features over the joints that the muscle crosses). A tendon that
-slides has another tension at the motor than at its elastic element (μ: tendon friction, s:
-direction of the last sliding, +1 wound in, −1 paid out). Tendons creep, by r from one sample to the
-next: a sample after which a others came says what the length was then. All parameters zero is the
-geometric model.
+    δ       errors of the attachment points p, a few millimetres
+    κ       logarithmic errors of the elastic constants c, some per cent
+    μ, s    tendon friction, and the direction of the last sliding (+1 wound in, −1 paid out);
+            friction makes the motor-side tension T differ from the tension at the elastic element
+    o       offset of the length sensor
+    r, a    creep of the tendon per sample, and the number of samples that came after this one
+    ψᵀ v    residual model: random Fourier features over the joints that the muscle crosses. It
+            represents what straight lines between route points miss, such as wrapping round bones
 
-`fit` finds the parameters.
+With all parameters zero this is the geometric model. The module `fit` estimates the parameters.
 """
 
 from __future__ import annotations
@@ -27,35 +28,41 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import end_tension
 
-FEATURES = 60  # of the residual model that are drawn, per muscle
-WIDTH = 0.35  # of the kernel that they approximate, as a share of the joint ranges
-#: share of their variance that is left out with the directions that vary least, about half of them
-#: (less than 0.1 mm at the prior's spread), and the postures that it is taken over
-LEFT_OUT, POSTURES = 1e-3, 500
-# More than twice the tension at the elastic unit than at the motor is no friction.
+FEATURES = 60  # number of random features drawn for each muscle
+WIDTH = 0.35  # width of the kernel that they approximate, as a share of the joint ranges
+#: The directions in feature space that vary least are dropped: about half of them, together this
+#: share of the variance. At the prior's spread that is less than 0.1 mm.
+LEFT_OUT = 1e-3
+POSTURES = 500  # number of random postures over which that variance is computed
+# At this value the tension at the elastic element is twice that at the motor; friction cannot
+# exceed it.
 LARGEST_FRICTION = 0.7
-LARGEST_LOG = 1.5
+LARGEST_LOG = 1.5  # bound on |κ|
 
 
 class Layout:
-    """Where the parameters of one muscle are: δ (three per route point), κ, μ, o, r, v."""
+    """Positions of the parameters δ, κ, μ, o, r and v in the vector of one muscle.
+
+    δ has three values for each route point.
+    """
 
     def __init__(self, points: Ints, weights: Array, features: int) -> None:
         end = 3 * len(points)
-        self.points = points  # its route points
-        #: of the lines between each two of them: the share of the length that counts
+        self.points = points  # indices of the muscle's route points
+        #: weight of each line between consecutive route points in the muscle's length
         self.weights = weights
         self.attachment = slice(0, end)  # δ [m]
-        self.elastic = slice(end, end + 3)  # κ: log of force, rate, wire_stretch over nominal ones
+        #: κ: logarithms of force, rate and wire_stretch relative to their nominal values
+        self.elastic = slice(end, end + 3)
         self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
         self.size = end + 6 + features
         self.rest = slice(end + 6, self.size)  # v [m]
 
 
 class ResidualModel(NamedTuple):
-    """ψ of one muscle: K random Fourier features, in the F directions in which they vary.
+    """ψ of one muscle: K random Fourier features, projected onto the F directions that vary.
 
-    In single precision, in which cosines take a seventh of the time.
+    It uses single precision, in which cosines take a seventh of the time.
     """
 
     frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
@@ -66,7 +73,14 @@ class ResidualModel(NamedTuple):
     def drawn(
         cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator
     ) -> ResidualModel:
-        """Draw those of a muscle which crosses some joints (D,); they vary over θ (N, D)."""
+        """Draw the features of one muscle.
+
+        Args:
+            robot: The robot, whose joint ranges scale the kernel.
+            crossed: Which joints the muscle crosses, (D,).
+            theta: Postures over which the variance of the features is computed, (N, D).
+            rng: The random generator.
+        """
         count = FEATURES if crossed.any() else 0
         frequency = rng.normal(0.0, 1.0, (count, robot.joint_count))
         frequency = frequency * crossed / (WIDTH * (robot.upper - robot.lower))
@@ -84,7 +98,7 @@ class ResidualModel(NamedTuple):
         return (values @ self._scaled).astype(float)
 
     def slope(self, theta: Array, joints: Ints) -> Singles:
-        """Return ∂ψ/∂θ of some joints [1/rad or 1/m], shape (joints, N, F)."""
+        """Return ∂ψ/∂θ for the joints in `joints` [1/rad or 1/m], shape (joints, N, F)."""
         angles = theta @ self.frequency.T + self.phase
         values = -np.sin(angles.astype(self.phase.dtype)) * self.frequency.T[joints, None]
         return values @ self._scaled
@@ -95,15 +109,15 @@ class ResidualModel(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Of pinocchio's joints in the root link's frame, and what wrapping adds to straight lines."""
+    """Poses of pinocchio's joints in the root link's frame, and the extra length from wrapping."""
 
     rotation: Array  # (N, J, 3, 3)
     translation: Array  # [m], (N, J, 3)
-    detour: Array  # of the nominal body [m], (N, M)
+    detour: Array  # length that wrapping adds to the straight lines of the nominal body [m], (N, M)
 
 
 class CalibratedBody:
-    """Lengths of the calibrated body, and how they change with its `parameters`."""
+    """Computes muscle lengths of the calibrated body and their derivatives by its `parameters`."""
 
     def __init__(
         self,
@@ -112,7 +126,14 @@ class CalibratedBody:
         seed: int = 0,
         smooth: list[ResidualModel] | None = None,
     ) -> None:
-        """Correct `robot` by one vector per muscle (zero); `seed` draws `smooth` if not given."""
+        """Create a calibrated body.
+
+        Args:
+            robot: The geometric model.
+            parameters: One vector for each muscle; None for zeros.
+            seed: Seed of the random features, if `smooth` is None.
+            smooth: The residual model of each muscle; None to draw new ones.
+        """
         self.robot, routes = robot, robot.routes
         if smooth is None:
             rng = np.random.default_rng([seed, 0xF0])
@@ -122,31 +143,32 @@ class CalibratedBody:
         for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
-            weights = np.zeros(len(points) - 1)  # 0 from one branch to the next
+            weights = np.zeros(len(points) - 1)  # 0 between the end of a branch and the next one
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, own.basis.shape[1]))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
-        # Where the next fit starts:
-        #: offsets of the joint sensors [rad], (D,)
+        # The next fit starts from these values:
+        #: joint-sensor offsets [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
-        #: θ (D,) of samples, with a row of `posture_model.Bent`, by the bytes of their lengths
+        #: fitted θ (D,) and a row of `posture_model.Bent` for each sample; the key is the bytes of
+        #: the sample's lengths
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
-        """Return the body of one group, with the parameters of its muscles."""
+        """Return the calibrated body of one group of joints and muscles, with its parameters."""
         of_group = [self.smooth[m] for m in muscles]
         smooth = [own._replace(frequency=own.frequency[:, joints]) for own in of_group]
         parameters = [self.parameters[m] for m in muscles]
         return CalibratedBody(self.robot.limb(joints, muscles), parameters, smooth=smooth)
 
     def with_parameters(self, parameters: list[Array]) -> CalibratedBody:
-        """Return the body with other parameters, one vector per muscle."""
+        """Return a copy of the body with other parameters, one vector for each muscle."""
         body = copy(self)
         body.parameters = parameters
         return body
 
     def elastic(self, m: int) -> SeriesElastic:
-        """Return the constants of one muscle, arrays of shape ()."""
+        """Return the elastic constants of one muscle as arrays of shape ()."""
         nominal = self.robot.series_elastic
         log = self.parameters[m][self.layouts[m].elastic]
         force, rate, stretch = np.exp(np.clip(log, -LARGEST_LOG, LARGEST_LOG))
@@ -155,27 +177,27 @@ class CalibratedBody:
         )
 
     def frictions(self) -> Array:
-        """Return μ of each wire (M,)."""
+        """Return the tendon friction μ of each muscle, (M,)."""
         return np.array([self.friction(m) for m in range(len(self.layouts))])
 
     def friction(self, m: int) -> float:
-        """Return μ of one muscle."""
+        """Return the tendon friction μ of one muscle."""
         value = self.parameters[m][self.layouts[m].friction]
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 
     def crept(self, age: Array) -> Array:
-        """Return by how much lengths have grown since samples of an age (N,) [m], (N, M)."""
+        """Return the creep of each muscle since each sample [m], (N, M); `age` is a, (N,)."""
         rates = [p[at.creep] for p, at in zip(self.parameters, self.layouts, strict=True)]
         return age[:, None] * np.array(rates)
 
     def poses(self, theta: Array) -> Poses:
-        """Return the joint poses of θ (N, D) and, in the last place, of θ = 0."""
+        """Return the joint poses at each row of θ (N, D), with θ = 0 as an additional last row."""
         theta, robot = np.vstack([theta, np.zeros(theta.shape[1])]), self.robot
         at = robot.kinematics.tree.joint_poses(theta)
         return Poses(at.rotation, at.translation, robot.routes.detours(theta))
 
     def _world(self, poses: Poses, m: int) -> tuple[Array, Array]:
-        """Return the route's points in the root link's frame, and how their links are turned."""
+        """Return the route points in the root link's frame, and the rotations of their links."""
         layout, routes = self.layouts[m], self.robot.routes
         joint = routes.joint[layout.points]
         shift = self.parameters[m][layout.attachment].reshape(-1, 3)
@@ -184,9 +206,13 @@ class CalibratedBody:
         return (turn @ local[:, :, None])[..., 0] + poses.translation[:, joint], turn
 
     def lengths(self, theta: Array, tension: Array, *direction: Array) -> tuple[Array, ...]:
-        """Return l [m] (N, M) at θ [rad] (N, D) and the motors' T [N] (N, M).
+        """Return muscle lengths l [m], (N, M), one array for each array in `direction`.
 
-        One result for each direction s in [−1, 1], shape (N, M); 0 is the mean of both directions.
+        Args:
+            theta: θ [rad], (N, D).
+            tension: Motor-side tension T [N], (N, M).
+            direction: Directions s of sliding in [−1, 1], (N, M) each. 0 lies midway between
+                winding in and paying out.
         """
         result = tuple(np.empty_like(tension) for _ in direction)
         poses = self.poses(theta)
@@ -209,17 +235,23 @@ class CalibratedBody:
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
-        Of θ come the `poses` and ψ (N, F), `smooth`; T_i [N] and s_i are the muscle's own, (N,).
+        Args:
+            poses: Joint poses at the postures θ.
+            smooth: ψ(θ), (N, F).
+            tension: Motor-side tension T_i [N], (N,).
+            direction: Direction of sliding s_i, (N,).
+            m: Index i of the muscle.
+            age: Number of samples that came after each sample, (N,).
         """
         layout, parameters = self.layouts[m], self.parameters[m]
         world, turn = self._world(poses, m)
         line = world[:, 1:] - world[:, :-1]
         norm = np.linalg.norm(line, axis=-1)
         along = line * (layout.weights / np.maximum(norm, 1e-9))[..., None]
-        pull = np.zeros_like(world)
-        pull[:, 1:] += along
-        pull[:, :-1] -= along
-        by_point = (pull[:, :, None] @ turn).reshape(len(world), -1)
+        by_world_point = np.zeros_like(world)
+        by_world_point[:, 1:] += along
+        by_world_point[:, :-1] -= along
+        by_point = (by_world_point[:, :, None] @ turn).reshape(len(world), -1)
         whole = norm @ layout.weights + poses.detour[:, m]
         absolute, at_zero = whole[:-1], whole[-1]
         elastic = self.elastic(m)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated body of one arm, from update to update.
+"""The calibrated body of one arm across updates.
 
-Every update fits the body to all samples, from where the last fit ended. The prior is the geometric
-model, or what a network knows that has learned a real arm (`fit_to_network`), unless the first
-samples show that the network is of another arm.
+Every update fits the body to all samples and starts from the last fit. The prior is the geometric
+model. If a network has already learned a real arm, a body fitted to that network is the prior
+instead (`fit_to_network`), unless the first samples show that it learned another arm.
 """
 
 import numpy as np
@@ -16,24 +16,26 @@ from musculoskeletal_ae.learning.synthetic import held_tensions
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-PROBES = 200  # postures that the mean of a body's lengths is taken over
-#: so many newest samples in a row that contradict the body mean that a muscle has changed …
+PROBES = 200  # number of postures over which the mean length of each muscle is computed
+# A muscle has changed if its newest IN_A_ROW samples or more contradict the body by more than
+# LEAST_CHANGE and OUTLIER standard deviations, and at least LEAST_BEFORE samples came before them.
 IN_A_ROW = 4
-#: … by more than this [m] and this many σ, provided that there were so many samples before
-LEAST_CHANGE, OUTLIER, LEAST_BEFORE = 0.004, 6.0, 8
+LEAST_CHANGE = 0.004  # [m]
+OUTLIER = 6.0  # [σ]
+LEAST_BEFORE = 8
 
 
 class BodyFit:
-    """Keeps the calibrated body of one arm, and fits it.
+    """Fits the calibrated body of one arm and keeps the result.
 
     Attributes:
-        body: The body as it was fitted last.
+        body: The most recently fitted body.
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, seed: int = 0) -> None:
-        """Begin with the body that a network has learned, if one is given; `seed` draws it."""
+        """Begin with a body fitted to the network `mae`, or with the geometric model if None."""
         self.body = CalibratedBody(robot, seed=seed)
-        #: what the network knew of the body, in the place of the geometric model
+        #: parameters fitted to the network, which replace the geometric model as prior mean
         self._prior_mean: list[Array] | None = None
         if mae is not None:
             fit_to_network(self.body, mae, seed)
@@ -41,12 +43,12 @@ class BodyFit:
         self._is_prior_confirmed = False
         rng = np.random.default_rng([seed, 0x3E])
         self._probe = robot.random_postures(PROBES, rng), held_tensions(robot, PROBES, rng)
-        self._mean_length = self._probe_lengths()  # of the body that the network knows [m], (M,)
+        self._mean_length = self._probe_lengths()  # [m], (M,)
 
     def is_of_another_arm(self, observed: Observations) -> bool:
-        """Whether samples contradict what the network knew of the body.
+        """Return whether samples contradict the body that was fitted to the network.
 
-        That shows once there are a few samples; it is looked at once.
+        The check runs once, as soon as there are enough samples; otherwise this returns False.
         """
         observed = observed.with_all_angles()
         if self._prior_mean is None or self._is_prior_confirmed or len(observed) < IN_A_ROW:
@@ -57,27 +59,36 @@ class BodyFit:
         return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
-        """Begin with the geometric model: a wrong prior is worse than none."""
+        """Start again from the geometric model."""
         self._prior_mean = None
         self.body = CalibratedBody(self.body.robot, smooth=self.body.smooth)
 
     def fit(self, observed: Observations, guess: Array) -> Fit:
-        """Fit the body to samples; θ that was not read is looked for from `guess` [rad] (N, D)."""
+        """Fit the body to samples.
+
+        Args:
+            observed: The samples.
+            guess: Initial values for joint angles that were not measured [rad], (N, D).
+        """
         return fit_body(self.body, observed, self._prior_mean, guess)
 
     def lengthened(self) -> Array:
-        """Return by how much all lengths have grown since this was last asked [m], (M,)."""
+        """Return the growth of each muscle's mean length since the previous call [m], (M,)."""
         before, self._mean_length = self._mean_length, self._probe_lengths()
         return self._mean_length - before
 
     def _probe_lengths(self) -> Array:
-        """Return l [m] (M,), averaged over always the same postures and tensions."""
+        """Return the mean lengths [m] (M,) over a fixed set of postures and tensions."""
         (length,) = self.body.lengths(*self._probe, np.zeros_like(self._probe[1]))
         return length.mean(axis=0)
 
 
 def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
-    """Return muscles whose newest samples contradict the body in one direction, and how many."""
+    """Return the muscles whose newest samples contradict the body, all in the same direction.
+
+    Returns:
+        Index of each such muscle, and the number of its newest samples that contradict the body.
+    """
     muscles = []
     for m, noise in enumerate(fit.noise):
         residual = fit.residual[observed.known[:, m], m]

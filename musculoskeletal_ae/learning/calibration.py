@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrating the anomaly detector: residuals of ② over messages of the healthy arm.
+"""Calibration of the anomaly detector from residuals of ② on messages of the healthy arm.
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · (1 + young/samples) · max d (of A: max A)
 
-Messages, moving and resting, are kept in a reservoir, a uniform draw from all that ever came; each
-new network gets statistics of its own residuals on them. The threshold rests on the maximum, since
-friction gives d heavy tails, and on a part of the messages that Σ did not see. Glitches of
-a sensor are no part of that: a few messages at most, far beyond all the rest, are left out.
+A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
+network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
+because friction gives d heavy tails. That maximum includes messages that were not used to
+compute Σ. Sensor glitches are excluded: at most a few messages, far beyond all others.
 
-Where joint sensors read all angles, the network learns from every second message, too (`update`);
-the others, which it has never seen, tell how good its estimates are.
+Where joint sensors read all angles, the network also learns from every second message (`update`).
+The other messages, which are not used for training, serve to validate its estimates.
 """
 
 from collections.abc import Iterable
@@ -27,39 +27,42 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.signals.friction import end_tension
 
-CAPACITY = 4000
-SPACING = 0.1  # [s] between messages that are kept
-#: healthy time [s], samples learned, and different rests within that time before a detector is
-#: worth trusting
+CAPACITY = 4000  # messages
+SPACING = 0.1  # [s] between kept messages
+# A detector counts as calibrated after LEAST_TIME of healthy messages [s] that include
+# LEAST_SAMPLES distinct rests, and after as many samples were learned.
 LEAST_TIME, LEAST_SAMPLES = 60.0, 20
-#: Threshold over the largest d seen, for a body well known. A load of 3.6 kg that was never carried
-#: before doubles it; a wire that is cut multiplies it by six to ten within 0.3 s.
+#: Threshold relative to the largest healthy d, once the body is well known. An unknown load of
+#: 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
 MARGIN = 3.5
-#: and by how much more while few samples say what the body is: 1 + this / samples
+#: The threshold is larger by 1 + YOUNG / samples while few samples determine the body.
 YOUNG = 20.0
-#: Σ is mixed with its own diagonal, so that no combination of muscles looks impossible that was
-#: only not seen
+#: Share of Σ's own diagonal that is mixed into Σ. Otherwise combinations of muscles that did not
+#: occur in the messages would look impossible.
 DIAGONAL_SHARE = 0.1
-#: this share of the messages is left out at most, and what is so many times beyond all others
+# At most the share GLITCHES of the messages is excluded, and only those whose distance is more than
+# GLITCH times that of all others.
 GLITCHES, GLITCH = 0.002, 3.0
-POSTURES = 200  # that tell where it was calibrated
-#: healthy time [s] and rests within which messages are learned from: wires creep and bed in
+POSTURES = 200  # number of stored postures that show where the detector was calibrated
+# The network learns only from messages of the last RECENT seconds and RECENT_RESTS rests, because
+# tendons creep and bed in.
 RECENT, RECENT_RESTS = 3600.0, 200
 
 
 class Healthy(NamedTuple):
-    """What was seen of the healthy arm since it was last changed."""
+    """Messages of the healthy arm since its body last changed."""
 
     messages: NDArray[np.float32]  # (T, l, s), (N, 3M)
-    time: float  # that they were drawn from [s]
-    rests: int  # how many different ones there were within
-    #: recent ones, moving or resting, with all angles: those that are learned, and those that judge
+    time: float  # healthy time from which they were drawn [s]
+    rests: int  # number of distinct rests in that time
+    # Recent messages with all joint angles, from motion and rest: one half for training, the other
+    # half for validation.
     learned: Observations | None = None
     judging: Observations | None = None
 
 
 class Reservoir:
-    """A uniform draw of bounded size from all messages of the healthy arm, and its rests."""
+    """Keeps a uniform random selection of healthy messages, of bounded size, and counts rests."""
 
     def __init__(
         self,
@@ -69,26 +72,34 @@ class Reservoir:
         capacity: int = CAPACITY,
         radian: Array | float = 1.0,
     ) -> None:
-        """Start empty; rests differ as samples do, `radian` as there."""
+        """Start empty.
+
+        Args:
+            muscles: Number of muscles.
+            seed: Seed of the random selection.
+            settings: Which rests count as distinct.
+            capacity: Largest number of messages.
+            radian: As for `SampleStore`.
+        """
         self._rng = np.random.default_rng([seed, 0x4E])
         self._muscles, self._capacity = muscles, capacity
         self._kept: list[NDArray[np.float32]] = []
-        self._seen, self._since = 0, 0.0
-        self.time = 0.0  # healthy time seen [s]
-        self._missing: frozenset[int] = frozenset()  # muscles that some messages lack
+        self._offered, self._since = 0, 0.0
+        self.time = 0.0  # healthy time [s]
+        self._missing: frozenset[int] = frozenset()  # muscles that were isolated in some messages
         self._rests = SampleStore(settings, radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
-        """Take a message, with θ where joint sensors read it."""
+        """Take a message, with θ where joint sensors measured it."""
         self._since += dt
         if self._since < SPACING - 1e-9:
             return
         self.time += min(self._since, 2.0 * SPACING)
         self._since = 0.0
         self._missing |= frozenset(reading.isolated)
-        self._seen += 1
+        self._offered += 1
         full = len(self._kept) == self._capacity
-        place = int(self._rng.integers(self._seen)) if full else len(self._kept)
+        place = int(self._rng.integers(self._offered)) if full else len(self._kept)
         if place < self._capacity:
             theta = reading.theta if reading.spread.size == 0 else np.nan * reading.theta
             muscles, when = reading[1:4], [self._rests.accepted, self.time]
@@ -96,28 +107,28 @@ class Reservoir:
             self._kept[place : place + 1] = [row]
 
     def rest(self, rest: Sample) -> None:
-        """Count a rest if it differs from those before."""
+        """Count a rest if it differs from all earlier ones."""
         if self._rests.is_new(rest):
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Go on with these muscles isolated; forget all if messages lack another muscle."""
+        """Use messages with these muscles isolated; clear if messages lack any other muscle."""
         if self._missing - frozenset(isolated):
             self.clear()
 
     def forget_newest(self, seconds: float) -> None:
-        """Forget the messages of the last seconds."""
+        """Forget the messages of the last `seconds` of healthy time."""
         self._kept = [row for row in self._kept if row[-1] <= self.time - seconds]
 
     def clear(self) -> None:
-        """Forget all, as when the body has changed."""
+        """Forget all messages and rests, for example after the body has changed."""
         self._missing = frozenset()
         self._kept.clear()
-        self._seen, self._since, self.time = 0, 0.0, 0.0
+        self._offered, self._since, self.time = 0, 0.0, 0.0
         self._rests.clear()
 
     def healthy(self) -> Healthy:
-        """Return what was seen."""
+        """Return the messages kept so far."""
         m, count = self._muscles, len(self._rests)
         if not self._kept:
             return Healthy(np.empty((0, 3 * m), np.float32), self.time, count)
@@ -126,7 +137,7 @@ class Reservoir:
         tension, length, direction, theta, number, time = columns
         age = self._rests.accepted - number[:, 0]
         recent = (time[:, 0] > self.time - RECENT) & (age < RECENT_RESTS)
-        # 0 N: it was isolated then, or slack.
+        # A tension of 0 N means that the muscle was isolated or slack.
         whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
         known = np.ones(tension.shape, dtype=bool)
         observed = Observations(theta, tension, length, direction, known, age=age)
@@ -136,10 +147,16 @@ class Reservoir:
 
 
 def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:
-    """Return a network with statistics of its residuals, at least as trusted as those before.
+    """Return a network with new statistics of its residuals.
 
-    After a restart the messages are few, and the calibrated statistics of the network that was
-    saved (`before`) serve its successors until there are enough. `samples` is the number learned.
+    Calibrated statistics are not replaced by uncalibrated ones. After a restart there are few
+    messages, so the statistics of the saved network stay in use until there are enough.
+
+    Args:
+        mae: The network.
+        before: Statistics of the preceding network.
+        healthy: Messages of the healthy arm.
+        samples: Number of samples that the network has learned.
     """
     statistics = calibrate(mae, healthy, samples)
     keep = before is not None and before.calibrated
@@ -149,24 +166,24 @@ def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, s
 
 
 def uncalibrated(mae: Mae) -> Mae:
-    """Return a network that says that its statistics are not of the arm as it is now."""
+    """Return the network with its statistics marked as uncalibrated."""
     if mae.anomaly is None:
         return mae
     return replace(mae, anomaly=replace(mae.anomaly, calibrated=False))
 
 
 def is_learned(mae: Mae) -> bool:
-    """Return whether a network was learned from an arm, not only from its geometric model."""
+    """Return whether a network has learned from an arm, not only from its geometric model."""
     return mae.covariance is not None or is_calibrated(mae)
 
 
 def is_calibrated(mae: Mae) -> bool:
-    """Whether a network's statistics come from the real arm."""
+    """Return whether a network's statistics come from the real arm."""
     return mae.anomaly is not None and mae.anomaly.calibrated
 
 
 def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
-    """Return statistics of a network's residuals, or None where there is too little."""
+    """Return statistics of a network's residuals, or None if there are fewer than two messages."""
     if len(healthy.messages) < 2:
         return None
     tension, length, direction = np.split(healthy.messages.astype(float), 3, axis=1)
@@ -176,7 +193,8 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     sound = ~_glitches(error)
     known = min(samples, healthy.rests)
     calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES
-    # Each message has its part whatever is left out, so that a glitch moves no other one.
+    # Split before glitches are excluded: otherwise one glitch would move other messages to the
+    # other half.
     first = np.arange(len(error)) % 2 == 0
     part = _statistics(error[sound & first], calibrated)
     statistics = _statistics(error[sound], calibrated)
@@ -195,7 +213,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
 
 
 def _spread_out(theta: Array, count: int) -> Array:
-    """Return at most `count` of many θ (N, D), each the farthest from those before it."""
+    """Return at most `count` rows of θ (N, D), each the farthest from those already chosen."""
     share = theta / (np.ptp(theta, axis=0) + 1e-9)
     distance, chosen = np.full(len(theta), np.inf), [0]
     for _ in range(min(count, len(theta)) - 1):
@@ -209,7 +227,8 @@ def _glitches(error: Array) -> Bools:
     few = int(GLITCHES * len(error))
     if few == 0:
         return np.zeros(len(error), dtype=bool)
-    # Statistics that glitches cannot spoil: of the others, first by each residual's own spread.
+    # Compute the statistics without the most extreme messages, ranked by robust deviation, so that
+    # glitches do not affect them.
     middle = np.median(error, axis=0)
     spread = np.median(np.abs(error - middle), axis=0) + FLOOR
     order = np.argsort((np.abs(error - middle) / spread).max(axis=1))

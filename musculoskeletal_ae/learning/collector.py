@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From raw messages to samples: which rests of the arm are new and may be learned from.
+"""Turns raw messages into samples: new rests of the arm that are safe to learn from.
 
     l, T ─► plausible (`signals.muscle_stream`) ─┐
     θ, gravity ──────────────────────────────────┴► paired by time (`pairing`)
          ─► θ plausible ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
 
-Values of isolated muscles become 0 before anything else is done with them. A sample carries the
-version of the body state and the isolated muscles under which it was taken.
+Values of isolated muscles are replaced by 0 first. A sample carries the version of the body state
+and the isolated muscles under which it was taken.
 """
 
 import math
@@ -29,11 +29,12 @@ from musculoskeletal_ae.signals.limits import LIMITS, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired, Pairing
 
-#: what θ comes from: joint sensors at any joints, a camera now and then, or nothing
+#: source of θ: sensors of some or all joints, a camera at irregular intervals, or none
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
-NO_MESSAGES = 'no muscle_states come'
-NO_JOINTS = 'no usable joint angle comes with muscle_states'
-SPREAD = 0.02  # standard deviation of θ by a camera [rad]; of a prismatic joint times RACK [m]
+NO_MESSAGES = 'no muscle_states are received'
+NO_JOINTS = 'muscle_states are received without usable joint angles'
+#: standard deviation of θ measured by a camera [rad]; for prismatic joints times RACK [m]
+SPREAD = 0.02
 
 
 class SampleCollector:
@@ -41,9 +42,9 @@ class SampleCollector:
 
     Attributes:
         samples: The samples so far.
-        healthy: Messages of the healthy arm, moving or resting.
-        rejected: How many messages and rests were not used, by reason.
-        used_at: When the last message came that could be learned from [s]; −∞ before the first.
+        healthy: Messages of the healthy arm, from motion and rest.
+        rejected: Number of messages and rests that were not used, by reason.
+        used_at: Time of the last message that could be learned from [s]; −∞ before the first.
         obstacle: Why the messages since then could not be learned from.
     """
 
@@ -56,15 +57,15 @@ class SampleCollector:
         period: float = 0.01,
         joint_source: str = SENSOR,
     ) -> None:
-        """Start with nothing.
+        """Start without any messages.
 
         Args:
             robot: The nominal body.
-            samples: Where new samples are stored.
-            healthy: Takes the messages of the healthy arm.
-            settings: What counts as rest.
-            period: Of the messages of the muscle modules [s].
-            joint_source: What θ comes from: `SENSOR`, `MARKER` or `NONE`.
+            samples: Stores new samples.
+            healthy: Stores messages of the healthy arm.
+            settings: Thresholds for rest.
+            period: Period of the muscle modules' messages [s].
+            joint_source: Source of θ: `SENSOR`, `MARKER` or `NONE`.
         """
         radian = robot.kinematics.radian
         self.samples, self.healthy = samples, healthy
@@ -82,7 +83,7 @@ class SampleCollector:
             robot.joint_count + 3 * len(robot.kinematics.tree.parent), np.nan
         )
         self._longest_pause = max(LIMITS.pause, settings.rest_time)
-        self._skipped = 0.0  # time of the messages that were not used since the last [s]
+        self._skipped = 0.0  # time covered by unused messages since the last used one [s]
 
     @property
     def body(self) -> BodyState:
@@ -91,7 +92,7 @@ class SampleCollector:
 
     @property
     def has_jumped(self) -> bool:
-        """Whether lengths have jumped before its eyes, and their offsets are those from before."""
+        """Whether a jump of lengths was observed and the length offsets date from before it."""
         return bool(self._stream.displaced) and not self._stream.has_displaced_unseen
 
     @property
@@ -104,17 +105,17 @@ class SampleCollector:
         """Whether an anomaly is present."""
         return self._margin.is_anomaly
 
-    # -- what comes -----------------------------------------------------------------------------
+    # -- messages -------------------------------------------------------------------------------
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take θ [rad] (D,) that came at `time` [s]; NaN of joints that were not measured."""
+        """Take θ [rad] (D,) received at `time` [s]; NaN for joints that were not measured."""
         self._measure(time, 0, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
-        """Take what an accelerometer read in the axes of a link [m/s²], (3,).
+        """Take an accelerometer reading in the axes of a link [m/s²], (3,).
 
-        At rest it reads what holds it against gravity, which shows where down is. What it reads in
-        motion is not used.
+        At rest the reading is opposite to gravity and therefore gives its direction. Readings
+        during motion are not used.
         """
         joint, placement = self._robot.kinematics.placement(link)
         down = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
@@ -126,10 +127,13 @@ class SampleCollector:
         self._pairing.joints(time, measured)
 
     def take(self, time: float, message: Any) -> Paired[MuscleSample] | None:
-        """Take a message of muscle_states that came at `time` [s].
+        """Take a message of muscle_states received at `time` [s].
 
-        Returns the message before, with the θ that belongs to it, or None. A RejectionError says
-        why a message cannot be used; it is counted in `rejected`.
+        Returns:
+            The previous message with its θ, or None if there is none.
+
+        Raises:
+            RejectionError: If the message cannot be used; it is also counted in `rejected`.
         """
         try:
             sample = self._stream.take(message, time)
@@ -139,10 +143,11 @@ class SampleCollector:
         return self._paired(time, sample)
 
     def muscles(self, time: float, states: Array) -> Paired[MuscleSample] | None:
-        """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s].
+        """Take raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s].
 
-        Returns the message before, with the θ that belongs to it, or None. A message that is not
-        plausible is counted in `rejected`.
+        Returns:
+            The previous message with its θ, or None if there is none. An implausible message is
+            counted in `rejected`.
         """
         try:
             sample = self._stream.take_states(states, time)
@@ -167,7 +172,7 @@ class SampleCollector:
         return self._pairing.muscles(time, sample)
 
     def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
-        """Take a message that may be learned from; return the samples that are new with it."""
+        """Take a message from the healthy arm; return the new samples that it completes."""
         dt = min(paired.dt + self._skipped, self._longest_pause)
         measured = self._unmeasured if paired.theta is None else paired.theta
         theta, gravity = np.split(measured, [self._robot.joint_count])
@@ -218,13 +223,13 @@ class SampleCollector:
         return False
 
     def accept(self, sample: Sample) -> None:
-        """Store a sample; it describes the muscles that are not isolated."""
+        """Store a sample of the muscles that are not isolated."""
         self.samples.add(sample, self.body.used.copy())
 
-    # -- what changes ---------------------------------------------------------------------------
+    # -- changes of state -----------------------------------------------------------------------
 
     def use_body(self, body: BodyState) -> None:
-        """Take samples under another body state from now on; forget what is no sample yet."""
+        """Take samples under another body state from now on; discard incomplete samples."""
         self._stream.use_body(body)
         self.healthy.use_isolated(body.isolated)
         self.reset()
@@ -235,7 +240,7 @@ class SampleCollector:
             self.rejected['anomaly'] += lost
 
     def reset(self) -> None:
-        """Forget what is no sample yet, as after a backward jump of the clock."""
+        """Discard incomplete samples, for example after a backward jump of the clock."""
         self._stream.reset()
         self._pairing.reset()
         self._detector.reset()

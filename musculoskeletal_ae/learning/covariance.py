@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good the estimates of a network have to be expected to be: their covariance."""
+"""Expected covariance of a network's estimation errors."""
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -13,12 +13,12 @@ from musculoskeletal_ae.learning.synthetic import UNSURE
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import TINY
 
-#: messages that are enough to judge by
+#: number of validation messages needed to scale the covariance
 MANY = 200
-#: bodies that the samples allow, many more than joints (of few, an ellipsoid holds what it was made
-#: of, and less of others), and samples of each
+#: Number of bodies drawn from the posterior, and of samples for each. There are many more bodies
+#: than joints, because a covariance of few draws underestimates the errors of other draws.
 BODIES, EACH = 100, 10
-INSIDE = 0.95  # share of errors within the ellipsoid that the covariance says holds as many
+INSIDE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
 
 
 def estimate_covariance(
@@ -29,16 +29,24 @@ def estimate_covariance(
     seed: int,
     judging: Observations | None,
 ) -> Array:
-    """Return the covariance of θ_est − θ [rad²] (D, D) that a network has to be expected to make.
+    """Return the expected covariance of a network's errors θ_est − θ [rad²], (D, D).
 
-    It is that of drawn errors, with postures anywhere and tensions [N] (N, M) of the samples. How
-    far drawn errors are too large or too small is told by messages that judge, if there are MANY:
-    by their own errors beside those drawn in their postures, most of which are near the samples.
+    It is computed from errors drawn at random postures with tensions of the samples. If there are
+    at least MANY validation messages, it is scaled by the ratio between their actual errors and
+    errors drawn at their postures. Most of these postures are near the samples.
+
+    Args:
+        mae: The network.
+        body: The calibrated body.
+        fit: The fit of that body.
+        tension: Tensions at the elastic elements in the samples [N], (N, M).
+        seed: Seed of the draws.
+        judging: Validation messages, if any.
     """
     rng = np.random.default_rng(seed)
 
     def expected(theta: Array) -> Array:
-        # The same bodies and errors of lengths in all postures, or chance would tell them apart.
+        # Draw the same bodies and length errors in both calls, so that only the postures differ.
         same = np.random.default_rng(seed)
         return _spread(_drawn_errors(mae, body, fit, theta, tension, same))
 
@@ -59,9 +67,8 @@ def _drawn_errors(
 ) -> Array:
     """Return θ_est − θ [rad] (BODIES · EACH, D) at as many postures.
 
-    What the samples leave open of the body is drawn from the fit's posterior (Laplace; lengths are
-    taken as linear in it), and what the network says of such bodies' lengths is compared with where
-    they are.
+    Bodies are drawn from the posterior of the fit (Laplace approximation, lengths linearised in
+    the parameters). The network estimates θ from the lengths of each body.
     """
     bodies = np.repeat(np.arange(BODIES), EACH)
     tension = tension[rng.integers(len(tension), size=len(bodies))]
@@ -79,9 +86,10 @@ def _drawn_errors(
 
 
 def _spread(error: Array) -> Array:
-    """Return a covariance whose ellipsoid of 95 % holds as many errors, (N, D).
+    """Return a covariance whose 95 % ellipsoid contains 95 % of the errors (N, D).
 
-    They have heavier tails than a normal distribution.
+    The plain covariance would not, because the errors have heavier tails than a normal
+    distribution.
     """
     covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
     covariance = 0.5 * (covariance + covariance.T)
@@ -89,17 +97,21 @@ def _spread(error: Array) -> Array:
 
 
 def _excess(covariance: Array, error: Array) -> float:
-    """Return by what to multiply a covariance for its ellipsoid to hold INSIDE of (N, D) errors."""
+    """Return the factor for a covariance whose ellipsoid shall contain INSIDE of the errors."""
     return float(np.quantile(ellipsoids(covariance, error), INSIDE))
 
 
 def ellipsoids(covariance: Array, error: Array) -> Array:
-    """Return by what to multiply a covariance for each of (N, D) errors to lie on its ellipsoid.
+    """Return, for each error, the factor that puts the covariance's ellipsoid through it, (N,).
 
-    The ellipsoid is that of the share INSIDE of a normal distribution; (N,).
+    The ellipsoid contains the share INSIDE of a normal distribution.
+
+    Args:
+        covariance: [rad²], (D, D).
+        error: Errors [rad], (N, D).
     """
     squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
-    # χ² of as many degrees as joints; scipy.stats has the same, and takes 0.7 s to import.
+    # Quantile of χ² with D degrees of freedom; importing scipy.stats for it would take 0.7 s.
     bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], INSIDE))
     return bounded
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of the calibrated body to samples.
+"""Fits the calibrated body to samples.
 
-It is maximum a posteriori and robust (`gauss_newton`), together with the samples' postures
-(`postures`), and starts from where the last fit ended. The prior spreads s are physical: how far a
-hand places an attachment, how far elastic elements of one kind differ. Where postures are known for
-sure, muscles are fitted one by one:
+The fit is a robust maximum a posteriori estimate (`gauss_newton`) of the parameters together with
+the samples' postures (`postures`). It starts from the last fit. The prior spreads s are physical:
+how accurately attachments are placed by hand, and how much elastic elements of one kind differ.
+With known postures, each muscle is fitted separately:
 
     min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k ((w_k − w̄_k) / s_k)²
 """
@@ -31,21 +31,22 @@ from musculoskeletal_ae.learning.priors import PRIOR, REOPENED, MusclePrior
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 
-ROUNDS = 30  # of Gauss–Newton for one muscle
-ENOUGH = 1e-11  # decrease of the cost, in variances for each length, that ends them
-LEAST_NOISE = 0.0003  # [m] of a length at rest, beyond what all the rest explains
-#: samples from before a muscle changed that are enough to start from what they said
+ROUNDS = 30  # largest number of Gauss–Newton iterations for one muscle
+ENOUGH = 1e-11  # the iterations end when the cost decreases by less than this for each length
+LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
+#: number of samples from before a muscle changed that are enough to derive its new prior from them
 LEAST_ANCHOR = 8
 
 
 class Fit(NamedTuple):
-    """What a fit says of the samples."""
+    """Result of a fit."""
 
     residual: Array  # l − l(θ, T; w) [m], (N, M)
-    noise: Array  # σ of each muscle [m], (M,)
-    weight: Array  # ω in (0, 1], (N, M); 0 where a sample says nothing about a muscle
-    theta: Array  # where the arm was [rad], (N, D)
-    root: list[tuple[Ints, Array]]  # muscles of a group, R with (RᵀR)⁻¹ the covariance of theirs
+    noise: Array  # σ of each muscle's length [m], (M,)
+    weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
+    theta: Array  # fitted postures [rad], (N, D)
+    #: for each group its muscles, and R; (RᵀR)⁻¹ is the covariance of their parameters
+    root: list[tuple[Ints, Array]]
 
 
 def fit_body(
@@ -54,18 +55,19 @@ def fit_body(
     prior_mean: list[Array] | None = None,
     guess: Array | None = None,
 ) -> Fit:
-    """Fit the parameters of a body in place, from the present ones, and the samples' postures.
+    """Fit the parameters of a body in place, together with the samples' postures.
+
+    The fit starts from the present parameters. A muscle counts as changed if some samples no
+    longer describe it although it was not isolated when they were taken. The prior of its new
+    parameters is then a fit to those samples.
 
     Args:
         body: The body.
         observed: The samples.
-        prior_mean: Parameters in the place of the geometric model's, if some were learned before
-            without the samples that they came from.
-        guess: Where angles that were not read are looked for [rad], (N, D); by default the middle
-            of the range.
-
-    A muscle was changed if there are samples that say nothing about it any more, unless it was
-    isolated when they came. What they said is where its new parameters are looked for.
+        prior_mean: Prior mean that replaces the geometric model, one vector for each muscle. It
+            is used if parameters were learned from samples that no longer exist.
+        guess: Initial values for joint angles that were not measured [rad], (N, D); by default the
+            middle of each joint's range.
     """
     robot = body.robot
     if guess is None:
@@ -84,26 +86,30 @@ def fit_body(
 
 
 def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
-    """Return the prior of a muscle round the geometric model."""
+    """Return the prior of a muscle around the geometric model."""
     layout = body.layouts[m]
     spread = PRIOR.spread(layout)
-    # The offset that is expected to be near 0 is that from before all creep.
+    # The prior on the offset holds before any creep; creep since then widens it.
     spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
 
 
-def _reopened(body: CalibratedBody, there: Observations, prior: MusclePrior, m: int) -> MusclePrior:
-    """Return the prior of a muscle round what it was before it was changed, if it was."""
-    before = ~there.known[:, m] & (there.tension[:, m] > 0.0)  # 0 N: it was isolated then
+def _reopened(
+    body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
+) -> MusclePrior:
+    """Return a wide prior around the earlier parameters of a muscle if it was changed."""
+    # A tension of 0 N means that the muscle was isolated.
+    before = ~observed.known[:, m] & (observed.tension[:, m] > 0.0)
     if before.sum() < LEAST_ANCHOR:
         return prior
-    problem = MuscleFit(body, body.poses(there.theta), there, before, prior, LEAST_NOISE, m)
+    poses = body.poses(observed.theta)
+    problem = MuscleFit(body, poses, observed, before, prior, LEAST_NOISE, m)
     body.parameters[m] = problem.run()
     return MusclePrior(body.parameters[m], REOPENED.spread(body.layouts[m]))
 
 
 class MusclePoint(NamedTuple):
-    """The parameters of one muscle, with residuals and derivatives."""
+    """Parameters of one muscle, with residuals and derivatives."""
 
     parameters: Array  # w, (P,)
     residual: Array  # l − l(θ, T; w) [m], (N, 1)
@@ -111,7 +117,7 @@ class MusclePoint(NamedTuple):
 
 
 class MuscleFit:
-    """The problem of one muscle at known postures, for the solver (`gauss_newton.Problem`)."""
+    """Fit of one muscle at known postures, as a `gauss_newton.Problem`."""
 
     def __init__(
         self,
@@ -123,10 +129,10 @@ class MuscleFit:
         least_noise: float,
         m: int,
     ) -> None:
-        """Fit muscle `m` of a body to those of the samples (N,) that are used."""
+        """Fit muscle `m` of a body to the samples where `used` (N,) is True."""
         self._body, self._m = body, m
         self._poses, self._smooth = poses, body.smooth[m].at(observed.theta)
-        self._seen = observed
+        self._observed = observed
         self._known = used.astype(float)[:, None]
         self._mean = prior.mean
         self._least_noise = least_noise
@@ -139,14 +145,14 @@ class MuscleFit:
         return self.usual[1]
 
     def run(self) -> Array:
-        """Return the parameters that fit, from the present ones of the body."""
+        """Return the fitted parameters, starting from the body's present ones."""
         start = self.point(self._body.parameters[self._m])
         enough = ENOUGH * float(self._known.sum())
         return minimise(self, start, ROUNDS, enough).point.parameters
 
     def point(self, parameters: Array) -> MusclePoint:
         """Return a point with its residuals."""
-        m, observed = self._m, self._seen
+        m, observed = self._m, self._observed
         of_all = list(self._body.parameters)
         of_all[m] = parameters
         length, jacobian = self._body.with_parameters(of_all).linearised(
@@ -160,14 +166,14 @@ class MuscleFit:
         return MusclePoint(parameters, (observed.length[:, m] - length)[:, None], jacobian)
 
     def weigh(self, point: MusclePoint) -> None:
-        """Take noise and weights from the residuals at a point."""
+        """Compute noise and weights from the residuals at a point."""
         self._noise, weight = noise_and_weight(
             point.residual, self._known, self._noise, self._determined, self._least_noise
         )
         self._weight = weight / self._noise**2
 
     def cost(self, point: MusclePoint) -> float:
-        """Return what is to be minimised, with the weights as they are."""
+        """Return the cost with the present weights."""
         deviation = self._mean - point.parameters
         return float((self._weight * point.residual**2).sum() + self._precision @ deviation**2)
 
@@ -179,24 +185,25 @@ class MuscleFit:
 
     def right_sides(self, point: MusclePoint) -> RightSides:
         """Return the right sides of the normal equations."""
-        pulled = point.jacobian.T @ (self._weight * point.residual)[:, 0]
-        return RightSides.of_common(pulled + self._precision * (self._mean - point.parameters))
+        by_samples = point.jacobian.T @ (self._weight * point.residual)[:, 0]
+        by_prior = self._precision * (self._mean - point.parameters)
+        return RightSides.of_common(by_samples + by_prior)
 
     def moved(self, point: MusclePoint, step: Step) -> MusclePoint:
         """Return the point after a step."""
         return self.point(point.parameters + step.common)
 
 
-NETWORK_STATES = 400  # that a network is asked for
-NETWORK_ERROR = 0.001  # [m] by which its lengths may err
+NETWORK_STATES = 400  # number of states at which the network is evaluated
+NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
 
 
 def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
-    """Fit a body in place to the lengths that a network restores which has learned a real arm.
+    """Fit a body in place to the lengths that a network which has learned a real arm restores.
 
-    A checkpoint carries what was learned of an arm, but not the samples (`train --from-bag`,
-    another machine, a lost state). The first samples after that then correct the body that the
-    network knows instead of replacing it by the geometric model.
+    A checkpoint does not contain the samples from which it was learned (`train --from-bag`, another
+    machine, a lost state). With this fit as prior, the first samples refine the learned body
+    instead of starting from the geometric model.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
     theta = robot.random_postures(NETWORK_STATES, rng)
@@ -208,7 +215,7 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     poses = body.poses(theta)
     for m, layout in enumerate(body.layouts):
         mean = PRIOR.mean(layout)
-        if mae.touch is not None:  # of friction, lengths say nothing
+        if mae.touch is not None:  # these lengths carry no information about friction
             mean[layout.friction] = mae.friction[m]
         prior = MusclePrior(mean, PRIOR.spread(layout))
         problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens to a network: it is validated, numbered, stored and published, or rolled back.
+"""Validates, numbers, stores, publishes and rolls back networks.
 
-    candidate ─► validated on own messages ─► numbered ─► on disk ─► published
-                                                 ▲
-    anomaly ─► the last network that was in use long enough without one
+    candidate ─► validated on the arm's messages ─► numbered ─► on disk ─► published
+                                                       ▲
+    anomaly ─► the last network that was in use long enough without an anomaly
 
-What is published is on disk before it leaves.
+Every network is saved to disk before it is published.
 """
 
 import math
@@ -26,11 +26,11 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class Publication:
-    """Hands out the newest checkpoint once, at most one a second.
+    """Releases each new checkpoint once, and at most one per second.
 
     Attributes:
-        checkpoint: The newest one; None before the first.
-        count: How many were handed out.
+        checkpoint: The newest checkpoint; None before the first.
+        count: Number of checkpoints released.
     """
 
     def __init__(self) -> None:
@@ -40,15 +40,15 @@ class Publication:
         self._published_at = -math.inf
 
     def offer(self, data: bytes | None) -> None:
-        """Replace the checkpoint; it is to be published soon."""
+        """Replace the checkpoint and mark it for publication."""
         self.checkpoint, self._is_pending = data, data is not None
 
     def hurry(self) -> None:
-        """Publish the next one at once."""
+        """Release the next checkpoint without waiting."""
         self._published_at = -math.inf
 
     def take(self, now: float) -> bytes | None:
-        """Return the checkpoint if it is to be published at `now` [s]."""
+        """Return the checkpoint if it is due for publication at `now` [s], else None."""
         if not self._is_pending or is_recent(self._published_at, now):
             return None
         self._is_pending, self._published_at = False, now
@@ -57,14 +57,14 @@ class Publication:
 
 
 class CheckpointKeeper:
-    """Keeps the network of one learner.
+    """Manages the network of one learner.
 
     Attributes:
         mae: The network in use; None before the first.
-        validation: Tries candidates on the messages of the arm.
-        publication: Hands out checkpoints.
-        rejected: How many candidates were rejected.
-        last_rejected: Why the last one was.
+        validation: Validates candidates on the messages of the arm.
+        publication: Releases checkpoints for publication.
+        rejected: Number of rejected candidates.
+        last_rejected: Reason of the last rejection.
     """
 
     def __init__(
@@ -78,9 +78,9 @@ class CheckpointKeeper:
 
         Args:
             robot: The nominal body.
-            samples: Stored together with the network.
-            directory: Where they are stored; None for nowhere.
-            is_validating: Whether networks that were learned have to pass the validation.
+            samples: The samples, which are saved together with the network.
+            directory: State directory; None to save nothing.
+            is_validating: Whether learned networks have to pass the validation.
 
         Raises:
             StateError: If the directory cannot be used.
@@ -92,52 +92,52 @@ class CheckpointKeeper:
         self._torque = HealthyTorque(robot)
         self._samples = samples
         self._is_validating = is_validating
-        self._time = 0.0  # of the messages [s]
+        self._time = 0.0  # sum of the messages' dt [s]
         self._state = None if directory is None else StateStore(directory, robot)
 
-    # -- what comes from the arm ----------------------------------------------------------------
+    # -- messages and events --------------------------------------------------------------------
 
     def observe(self, message: MuscleSample, dt: float, is_anomaly: bool) -> None:
-        """Note a plausible message, `dt` [s] after the one before."""
+        """Process a plausible message, `dt` [s] after the previous one."""
         self._time += dt
         self.validation.message(message.motor_tension, message.length, self._time)
         if self.mae is not None and not is_anomaly:
             self._torque.step(message.motor_tension, message.length, dt)
 
     def forget_messages(self) -> None:
-        """Forget the messages, as when the body state has changed."""
+        """Discard the messages used for validation, for example after the body state changed."""
         self.validation.forget()
 
     def reset(self) -> None:
-        """Forget the motion so far, as after a backward jump of the clock."""
+        """Restart the torque filter, for example after a backward jump of the clock."""
         self._torque.reset()
 
     def set_anomaly(self, is_anomaly: bool, adapt: Callable[[Mae], Mae]) -> None:
-        """Note whether an anomaly is present.
+        """Set whether an anomaly is present.
 
-        The last network that explained the arm is published again, if that is another one, as
-        `adapt` returns it.
+        At the start of an anomaly, the last network that was in use long enough without one is
+        published again, unless it is still in use. `adapt` is applied to it first.
         """
         earlier = self.validation.anomaly(is_anomaly, self._time)
         if earlier is not None:
             self.use(adapt(earlier))
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Note which muscles are isolated; what is published from now on knows it."""
+        """Set the isolated muscles of the networks that are published from now on."""
         self.validation.isolated = tuple(muscles)
 
     # -- networks -------------------------------------------------------------------------------
 
     def check(self, mae: Mae) -> None:
-        """Check that a network explains the arm.
+        """Validate a network on recent messages of the arm.
 
         Raises:
-            GateError: If it does not.
+            GateError: If the validation rejects the network.
         """
         self.validation.check(mae)
 
     def is_accepted(self, mae: Mae) -> bool:
-        """Whether a learned network passes the validation; count it if it does not."""
+        """Return whether a learned network passes the validation, and count rejections."""
         if not self._is_validating:
             return True
         try:
@@ -148,23 +148,23 @@ class CheckpointKeeper:
         return True
 
     def numbered(self, mae: Mae) -> Mae:
-        """Return a network with the number that follows on the one in use, and on its own."""
+        """Return the network with a version above its own and that of the network in use."""
         before = 0 if self.mae is None else self.mae.version
         return replace(mae, version=1 + max(mae.version, before))
 
     def use(self, mae: Mae) -> None:
-        """Number, store and publish a network in the place of the one before."""
+        """Number, save and publish a network that replaces the one in use."""
         self.restore(self.numbered(mae))
 
     def restore(self, mae: Mae) -> None:
-        """Do as `use`, under the number that the network has."""
+        """Save and publish a network like `use`, but keep its version."""
         self.mae = mae = self._torque.use(mae.without(self.validation.isolated))
         self.publication.offer(checkpoint.to_bytes(mae))
         self.validation.take(mae, self._time)
         self.store()
 
     def clear(self) -> None:
-        """Forget the network, and all that was observed."""
+        """Forget the network and all messages."""
         self.validation.start()
         self._torque.start()
         self.mae = None
@@ -173,34 +173,39 @@ class CheckpointKeeper:
     # -- the disk -------------------------------------------------------------------------------
 
     def load(self) -> Mae | None:
-        """Fill the store with the saved samples; return the saved network if it is usable."""
+        """Load the saved samples into the store; return the saved network if it is usable."""
         if self._state is None:
             return None
         saved = self._state.load(self._samples)
         if saved is None or self.is_accepted(saved):
             return saved
         self._state.back_up(self._samples, checkpoint.to_bytes(saved), self.last_rejected)
-        self.store()  # without the network, or each start would make another backup
+        self.store()  # save without the network; otherwise each start would make another backup
         return None
 
     def store(self, changed: bool = True) -> None:
-        """Store samples and network; unless something `changed`, only check that they are there."""
+        """Save samples and network if they `changed`; otherwise check that the files still exist.
+
+        Failed saves are retried either way.
+        """
         if self._state is not None:
             self._state.keep(self._samples, self.publication.checkpoint, changed)
 
     def save(self) -> Path:
-        """Store samples and network at once; return where.
+        """Save samples and network at once; return the state directory.
 
         Raises:
             StateError: If there is no directory, or it cannot be written.
         """
         if self._state is None:
-            raise StateError("state_directory is '': nothing is kept; start with a directory")
+            raise StateError(
+                "nothing can be saved because state_directory is ''; restart with a directory"
+            )
         self._state.save(self._samples, self.publication.checkpoint)
         return self._state.directory
 
     def back_up(self) -> None:
-        """Keep what was learned so far as a backup.
+        """Save the present samples and network as a backup.
 
         Raises:
             StateError: If the backup cannot be made.
@@ -210,21 +215,21 @@ class CheckpointKeeper:
             self._state.back_up(self._samples, data)
 
     def close(self) -> None:
-        """Release the directory."""
+        """Release the state directory."""
         if self._state is not None:
             self._state.close()
 
     @property
     def trouble(self) -> str:
-        """Why what was learned is not on disk; or ''."""
+        """Why samples and network are not on disk, or ''."""
         return '' if self._state is None else self._state.trouble(self._samples)
 
     def values(self) -> dict[str, str]:
-        """Return what people want to know, for /diagnostics."""
+        """Return values for /diagnostics."""
         values = {}
         if self.rejected:
-            values['refused networks'] = str(self.rejected)
-            values['last refused'] = self.last_rejected
+            values['rejected networks'] = str(self.rejected)
+            values['last rejected network'] = self.last_rejected
         if self._state is not None:
             values['state directory'] = str(self._state.directory)
             if self._state.not_used:

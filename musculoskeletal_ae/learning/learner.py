@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Online learning from messages to checkpoints: what the node ships and experiments measure.
+"""Online learning from messages to checkpoints, shared by the node and the experiments.
 
     θ, (T, l) ─► SampleCollector ─ samples ─► UpdateScheduler ─ job ─► Trainer
                        │                                                  │ update
@@ -7,11 +7,11 @@
                                                           │
                                          disk, subscribers ◄
 
-Nothing is learned from isolated muscles: samples do not describe them, and the published network
-knows which they are.
+Isolated muscles are not learned: samples do not describe them, and the published network lists
+them.
 
-Time is the caller's: the ROS clock, recorded or simulated time. All rules about time go by it.
-Therefore a recording is learned exactly as on a robot, except that training takes no time.
+The caller supplies the time: the ROS clock, recorded time or simulated time. All timing rules use
+it. Therefore a recording is learned exactly as on a robot, except that training takes no time.
 """
 
 import math
@@ -54,7 +54,7 @@ class Learner:
         scheduler: Decides when an update begins.
         trainer: Makes updates.
         keeper: Validates, stores and publishes networks.
-        enabled: Whether it learns, see `enable`.
+        enabled: Whether the learner learns, see `enable`.
     """
 
     def __init__(
@@ -71,22 +71,22 @@ class Learner:
         trainer: Callable[[Robot, str, int], Trainer] = Trainer,
         directory: Path | None = None,
     ) -> None:
-        """Continue from the saved state, if there is one that fits, else from a network.
+        """Continue from the saved state if it fits the robot, otherwise from a network.
 
         Args:
             robot: The nominal body.
             mae: A network that fits the robot; None to wait for one (`begin`).
-            preset: How to learn.
-            seed: Draws what is random.
-            steps: Of training per update, in preset default.
-            period: Of the messages of the muscle modules [s].
-            settings: What counts as rest, and as new.
-            joint_source: What θ comes from: `SENSOR`, `MARKER` or `NONE` of `collector`.
-            trainer: Makes the trainer.
-            directory: Where samples and network are kept; None for nowhere.
+            preset: Name of the learning preset.
+            seed: Random seed.
+            steps: Training steps per update, for preset `default`.
+            period: Period of the muscle modules' messages [s].
+            settings: Thresholds for rest and for new samples.
+            joint_source: Source of θ: `SENSOR`, `MARKER` or `NONE` of `collector`.
+            trainer: Creates the trainer.
+            directory: State directory for samples and network; None to save nothing.
 
         Raises:
-            MusculoskeletalError: If there is no such preset.
+            MusculoskeletalError: If the preset does not exist.
             StateError: If the directory cannot be used.
         """
         self.robot = robot
@@ -94,28 +94,29 @@ class Learner:
         self._waiting_since = math.inf  # time of the first poll, or after a jump of the clock [s]
         self._polled_at = math.inf
         self.trainer = trainer(robot, preset, seed)
-        way = self.trainer.preset
+        own_preset = self.trainer.preset
         radian = robot.kinematics.radian
         samples = SampleStore(settings, radian=radian)
         healthy = Reservoir(robot.muscle_count, seed, settings, radian=radian)
         self.collector = SampleCollector(robot, samples, healthy, settings, period, joint_source)
-        least = way.least_samples
+        least = own_preset.least_samples
         self.scheduler = UpdateScheduler(
             least if joint_source == SENSOR else max(least, LEAST_BLIND), steps
         )
-        self.keeper = CheckpointKeeper(robot, samples, directory, way.validates_updates)
+        self.keeper = CheckpointKeeper(robot, samples, directory, own_preset.validates_updates)
         saved = self.keeper.load()
         self.offset_check = OffsetCheck(self.body.offsets)
         self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
-        self._time, self._jumps = -math.inf, 0  # of the last message [s]; jumps of lengths so far
+        self._time = -math.inf  # time of the last message [s]
+        self._jumps = 0  # jumps of lengths so far
         if self.samples:
-            # They keep the versions of the body state that they were taken under: count on.
+            # Continue after the body-state versions of the saved samples, so that none repeats.
             self._use_body(replace(self.body, version=self.samples.body_version + 1))
         if saved is not None:
             self._start(saved)
             return
-        # Samples without their network bring as many updates as when they came: the network was
-        # damaged or rejected, or it is of the robot with fewer muscles.
+        # The saved network was damaged or rejected, or the robot had fewer muscles. Repeat as many
+        # updates as the samples caused when they were collected.
         self.scheduler.restart(updates_to_repeat=len(self.samples))
         if mae is not None:
             self.begin(mae)
@@ -123,29 +124,30 @@ class Learner:
     # -- messages → samples ---------------------------------------------------------------------
 
     def step(self, time: float, theta: Array | None, tension: Array, length: Array) -> bytes | None:
-        """Take what was measured at `time` [s], and `poll`; θ is None where it was not."""
+        """Take the measurements at `time` [s] and `poll`; θ is None if it was not measured."""
         if theta is not None:
             self.joints(time, theta)
         self.muscles(np.array([length, tension, np.full(len(length), np.nan)]), time)
         return self.poll(time)
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take θ [rad] (D,) that came at `time` [s]; NaN of joints that were not measured."""
+        """Take θ [rad] (D,) received at `time` [s]; NaN for joints that were not measured."""
         self.collector.joints(time, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
-        """Take what an accelerometer read in the axes of a link at `time` [s], [m/s²] (3,)."""
+        """Take an accelerometer reading in the axes of a link [m/s²] (3,) at `time` [s]."""
         self.collector.imu(time, link, acceleration)
 
     def take(self, message: Any, time: float) -> None:
-        """Take a message of muscle_states that came at `time` [s].
+        """Take a message of muscle_states received at `time` [s].
 
-        A RejectionError says why it cannot be used.
+        Raises:
+            RejectionError: If the message cannot be used.
         """
         self._learn_from(self.collector.take(time, message), time)
 
     def muscles(self, states: Array, time: float) -> None:
-        """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s]."""
+        """Take raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s]."""
         self._learn_from(self.collector.muscles(time, states), time)
 
     def _learn_from(self, paired: Paired[MuscleSample] | None, time: float) -> None:
@@ -163,7 +165,7 @@ class Learner:
             self._note_new_samples()
 
     def _believes_offsets(self, paired: Paired[MuscleSample]) -> bool:
-        """Return whether the lengths of a message can be relied on."""
+        """Return whether the length offsets are plausible and no length has jumped."""
         check, measured = self.offset_check, paired.theta
         was_believed = check.is_believed
         theta = None if measured is None else measured[: self.robot.joint_count]
@@ -174,7 +176,7 @@ class Learner:
         return check.is_believed and not self.collector.has_jumped
 
     def _believe_offsets(self) -> None:
-        """Go by length offsets that the messages agree with."""
+        """Use length offsets that agree with the messages."""
         before = self.offset_history.corrected
         self.offset_history.use(self.body.offsets.offset)
         if self.offset_history.corrected != before:
@@ -183,7 +185,7 @@ class Learner:
         self.keeper.store()
 
     def accept(self, sample: Sample) -> None:
-        """Keep a new sample, on disk too, and learn from it soon."""
+        """Store and save a new sample, and schedule an update."""
         self.collector.accept(sample)
         self._note_new_samples()
 
@@ -191,28 +193,27 @@ class Learner:
         self.keeper.store()
         self.scheduler.note_news()
 
-    # -- what others decide ---------------------------------------------------------------------
+    # -- body state, anomalies and enabling -----------------------------------------------------
 
     @property
     def samples(self) -> SampleStore:
-        """What is learned from."""
+        """The samples that are learned from."""
         return self.collector.samples
 
     @property
     def body(self) -> BodyState:
-        """Length offsets and isolated muscles."""
+        """The body state: length offsets and isolated muscles."""
         return self.collector.body
 
     @property
     def isolated(self) -> tuple[int, ...]:
-        """The isolated muscles, positions in T and l."""
+        """Indices of the isolated muscles."""
         return self.body.isolated
 
     def use_body(self, body: BodyState) -> None:
-        """Go by another body state from now on; samples so far stay.
+        """Use another body state from now on; the present samples are kept.
 
-        Nothing is learned from isolated muscles, and nothing at all while the length offsets are
-        unknown.
+        Isolated muscles are not learned. While the length offsets are unknown, learning pauses.
         """
         isolated_before = self.isolated
         self._use_body(body)
@@ -228,7 +229,7 @@ class Learner:
         if has_changed:
             self.offset_check.use(offsets)
             if offsets.is_suspect:
-                # They stay on disk until it is known which of them are wrong.
+                # The samples held back stay on disk until the offsets have been calibrated again.
                 self.offset_history.revoke(self._time)
                 self.collector.healthy.forget_newest(HELD)
             elif self.offset_check.is_believed:
@@ -237,7 +238,7 @@ class Learner:
         self.keeper.forget_messages()
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Go by a body state in which exactly these muscles are isolated."""
+        """Use the present body state with exactly these muscles isolated."""
         body = self.body.with_isolated(muscles)
         if body is not self.body:
             self.use_body(body)
@@ -245,24 +246,25 @@ class Learner:
     def anomaly(self, detected: bool) -> None:
         """Stop learning when an anomaly is detected, resume when it is reset.
 
-        The last network that explained the arm is published again, if that is another one.
+        On detection, the keeper returns to the last network that was in use long enough without an
+        anomaly.
         """
         self.collector.set_anomaly(detected)
-        # A calibrated detector may be of the arm before a muscle was changed.
+        # That network's detector may have been calibrated before a muscle was changed.
         holds = self.scheduler.statistics_hold
         self.keeper.set_anomaly(detected, lambda mae: mae if holds else uncalibrated(mae))
         self._publish_isolation()
 
     def _publish_isolation(self) -> None:
-        """Publish a network that knows who is isolated, but not while a suspect is verified."""
+        """Publish the network with the isolated muscles, except while an anomaly is present."""
         mae = self.keeper.mae
         if mae is not None and mae.isolated != self.isolated and not self.collector.is_anomaly:
             self.keeper.use(mae)
 
     def relearn(self, muscles: Iterable[int]) -> None:
-        """Learn the constants of muscles anew from what comes.
+        """Relearn muscles from samples that are still to come.
 
-        The detector is uncalibrated until enough of the changed arm has been observed.
+        The detector is uncalibrated until there are enough messages of the changed arm.
         """
         for muscle in muscles:
             self._forget(muscle)
@@ -273,20 +275,23 @@ class Learner:
         self.keeper.store()
 
     def enable(self, enabled: bool) -> None:
-        """Stop or resume learning; samples and network stay; an update under way is not used."""
+        """Stop or resume learning; samples and network are kept.
+
+        Stopping discards the result of an update that is under way.
+        """
         if enabled and not self.enabled:
             self.reset()
         self.enabled = enabled
 
     def reset(self) -> None:
-        """Forget what is no sample yet, as after a backward jump of the clock."""
+        """Discard incomplete samples, for example after a backward jump of the clock."""
         self.collector.reset()
         self.keeper.reset()
 
     # -- samples → checkpoints ------------------------------------------------------------------
 
     def poll(self, now: float) -> bytes | None:
-        """Begin and end updates at `now` [s]; return a checkpoint if one is to be published."""
+        """Begin and finish updates at `now` [s]; return a checkpoint if one is due."""
         self._waiting_since = min(self._waiting_since, now)
         self._polled_at = now
         is_learning = self.enabled and not self.collector.is_anomaly
@@ -300,7 +305,7 @@ class Learner:
         return self.keeper.publication.take(now)
 
     def _finish(self, update: Update, is_learning: bool) -> None:
-        if not is_learning:  # a network that is stopped stays, and it may know an anomaly's arm
+        if not is_learning:  # discard the update: its samples may come from a faulty arm
             self.scheduler.note_news()
             return
         mae = self.scheduler.finish(update)
@@ -310,7 +315,7 @@ class Learner:
             self.keeper.use(mae)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
-        """Let all samples but the newest ones say nothing about a muscle."""
+        """Mark a muscle as unknown in all samples except the newest ones."""
         self.samples.forget(muscle, newest)
         self.collector.healthy.clear()
         self.scheduler.note_change()
@@ -318,25 +323,27 @@ class Learner:
     # -- beginning and end ----------------------------------------------------------------------
 
     def begin(self, mae: Mae) -> None:
-        """Continue from a network, where none was saved; samples stay.
+        """Continue from a network if none was saved; samples are kept.
 
         Raises:
-            GateError: If it does not explain the arm.
+            GateError: If the validation rejects the network.
         """
         self.keeper.check(mae)
         self._start(self.keeper.numbered(mae))
 
     def replace(self, mae: Mae | None) -> None:
-        """Start anew from a network, or without; what was learned so far is kept as a backup.
+        """Discard all samples and start again from a network, or without one.
+
+        The previous samples and network are saved as a backup first.
 
         Raises:
             StateError: If the backup cannot be made; nothing is changed then.
-            GateError: If the network does not explain the arm; nothing is changed then.
+            GateError: If the validation rejects the network; nothing is changed then.
         """
         successor = None
         if mae is not None:
             self.keeper.check(mae)
-            # A muscle that the estimator has isolated is isolated for every network.
+            # Muscles that the estimator has isolated stay isolated in the new network.
             isolated = {*mae.isolated, *self.isolated}
             successor = self.keeper.numbered(mae.without(isolated))
         self.keeper.back_up()
@@ -361,7 +368,7 @@ class Learner:
         self.keeper.restore(mae)
 
     def save(self) -> Path:
-        """Save samples and network at once; return where.
+        """Save samples and network at once; return the state directory.
 
         Raises:
             StateError: If there is no directory, or it cannot be written.
@@ -369,52 +376,53 @@ class Learner:
         return self.keeper.save()
 
     def close(self) -> None:
-        """End the training process and release the directory."""
+        """End the training process and release the state directory."""
         self.trainer.close()
         self.keeper.close()
 
-    # -- what there is to say -------------------------------------------------------------------
+    # -- status ---------------------------------------------------------------------------------
 
     @property
     def mae(self) -> Mae:
-        """The network as learned so far; only where there is a `checkpoint`."""
+        """The network in use; only valid if `checkpoint` is not None."""
         assert self.keeper.mae is not None
         return self.keeper.mae
 
     @property
     def checkpoint(self) -> bytes | None:
-        """The same as the content of a checkpoint; None before the first network."""
+        """The network in use as the content of a checkpoint; None before the first network."""
         return self.keeper.publication.checkpoint
 
     @property
     def updates(self) -> int:
-        """How many updates were made."""
+        """Number of finished updates."""
         return self.scheduler.updates
 
     @property
     def last_update(self) -> Update | None:
-        """The last of them."""
+        """The last finished update, if any."""
         return self.scheduler.last_update
 
     @property
     def trouble(self) -> str:
-        """Why nothing is learned, or what is learned is not on disk; or ''."""
+        """Why learning is not possible or results are not on disk, or ''."""
         jumped = ''
         if self.collector.has_jumped and self.body.offsets.known:
-            jumped = 'lengths have jumped: nothing is learned until estimator/zero'
+            jumped = 'learning is paused because lengths have jumped; call estimator/zero'
         troubles = self.trainer.trouble, self.keeper.trouble, self.offset_check.problem, jumped
         return '; '.join(filter(None, troubles))
 
     @property
     def idle_time(self) -> float:
-        """For how long [s] nothing has come that could be learned from; 0 before the first poll."""
+        """Time since the last message that could be learned from [s]; 0 before the first poll."""
         used_at = self.collector.used_at
-        # Messages come after the last poll, too; only a clock that was set back is far ahead of it.
+        # Messages may arrive after the last poll; a time far ahead of it means that the clock has
+        # been set back.
         if used_at > self._polled_at + CLOCK_SET_BACK:
             used_at = -math.inf
         since = max(used_at, self._waiting_since)
         return max(0.0, self._polled_at - since) if math.isfinite(since) else 0.0
 
     def report(self) -> Report:
-        """Return how it is, for /diagnostics."""
+        """Return the learner's status for /diagnostics."""
         return learner_report(self)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The margin round anomalies: what comes shortly before or after one is not learned.
+"""Excludes messages shortly before and after an anomaly from learning.
 
-An anomaly is noticed late: what came within `MARGIN` before that was already wrong. Every message
-therefore waits that long before it counts. After the anomaly has been reset, nothing counts for
-another `MARGIN`.
+An anomaly is detected late, so messages within `MARGIN` before the detection may already be wrong.
+Every message is therefore held back for that time. After the reset of an anomaly, messages are
+ignored for another `MARGIN`.
 """
 
 from collections import deque
@@ -12,18 +12,18 @@ from typing import NamedTuple
 from musculoskeletal_ae.learning.samples import Sample
 
 MARGIN = 2.0  # [s] before a detection and after its reset
-#: messages that wait at most: more than MARGIN at 1 kHz, and an end where the clock stands still
+#: most messages held back: more than MARGIN at 1 kHz; bounds the memory if the clock stands still
 MOST_WAITING = 5000
 
 
 class Waiting(NamedTuple):
-    """A message, and the rest that ended with it, if one did.
+    """A message that is held back.
 
     Attributes:
-        time: When it came, as the sum of all `dt` [s].
-        dt: Time since the message before [s].
-        reading: What was measured.
-        rest: Mean of the rest.
+        time: Time of the message as the sum of all `dt` [s].
+        dt: Time since the previous message [s].
+        reading: The measurements.
+        rest: Mean of the rest that ended with the message, if one did.
     """
 
     time: float
@@ -33,7 +33,7 @@ class Waiting(NamedTuple):
 
 
 class AnomalyMargin:
-    """Holds messages back until it is known that no anomaly followed.
+    """Holds messages back until `MARGIN` has passed without an anomaly.
 
     Attributes:
         is_anomaly: Whether an anomaly is present.
@@ -46,15 +46,15 @@ class AnomalyMargin:
 
     @property
     def is_closed(self) -> bool:
-        """Whether messages do not count: during an anomaly and shortly after it."""
+        """Whether messages are ignored: during an anomaly and shortly after it."""
         return self.is_anomaly or self._time < self._closed_until
 
     def pass_time(self, dt: float) -> None:
-        """Let `dt` [s] pass, up to the message that comes next."""
+        """Advance the time by `dt` [s] to that of the next message."""
         self._time += dt
 
     def hold(self, dt: float, reading: Sample, rest: Sample | None) -> list[Waiting]:
-        """Hold a message back; return those that count from now on."""
+        """Hold a message back; return the messages that have waited long enough."""
         self._waiting.append(Waiting(self._time, dt, reading, rest))
         released = []
         while self._waiting and self._time - self._waiting[0].time >= MARGIN:
@@ -62,7 +62,7 @@ class AnomalyMargin:
         return released
 
     def set_anomaly(self, is_anomaly: bool) -> int:
-        """Note that an anomaly was detected or reset; return how many rests are lost by that."""
+        """Set whether an anomaly is present; return the number of rests that are discarded."""
         lost = 0
         if is_anomaly and not self.is_anomaly:
             lost = sum(waiting.rest is not None for waiting in self._waiting)
@@ -73,5 +73,5 @@ class AnomalyMargin:
         return lost
 
     def reset(self) -> None:
-        """Forget the messages that wait, as after a backward jump of the clock."""
+        """Discard the messages held back, for example after a backward jump of the clock."""
         self._waiting.clear()

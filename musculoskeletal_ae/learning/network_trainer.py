@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How preset `default` trains the network online: a few steps at a time, averaged."""
+"""Online training of the network in preset `default`: few steps per update, averaged weights."""
 
 import copy
 
@@ -16,40 +16,42 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE
 
 STEP_SIZE = 2e-3
 BATCH = 128
-#: averaged over this share of the steps so far, but at least and at most so many steps
+#: The weights are averaged over this share of all steps so far, within these limits.
 AVERAGED_SHARE, LEAST_AVERAGED, MOST_AVERAGED = 0.1, 20.0, 2000.0
-#: the step size falls to a half after so many steps, and at last to this share of itself, below
-#: which the average no longer wanders but a slowly changing body is still followed
-CALMING, LEAST_CALM = 2000.0, 0.1
+#: The step size falls to a half after this number of steps …
+CALMING = 2000.0
+#: … and not below this share of its initial value: the average no longer drifts then, but the
+#: network still follows a slowly changing body.
+LEAST_CALM = 0.1
 
 
 class NetworkTrainer:
-    """Trains the network a few steps at a time, for as long as the robot lives.
+    """Trains the network a few steps at a time over the whole life of a robot.
 
-    What is published is the average of the weights over about the last tenth of all steps, and the
-    step size falls as steps add up, so that the network follows a body that is still being found
-    out and becomes calm when it is known. (At a constant step size even the average wanders: ±10 %
-    of the error of an arm over hours.)
+    The published network is a weight average over about the last tenth of all steps. The step size
+    decreases with the number of steps: the network first follows a body that is still being
+    learned, and settles when it is known. At a constant step size even the averaged network's error
+    varies by ±10 % over hours.
     """
 
     def __init__(self, network: Network, seed: int = 0, steps: int = 0) -> None:
-        """Go on from a network's weights, as calmly as after so many `steps`."""
-        self.network = network  # the average: what is published
-        self._restless = copy.deepcopy(network)
-        self._weights = [*zip(network.parameters(), self._restless.parameters())]
-        self._optimiser = Optimiser(self._restless, STEP_SIZE, muon=True)
+        """Continue from a network that has been trained online for `steps` steps."""
+        self.network = network  # weight average, which is published
+        self._raw = copy.deepcopy(network)
+        self._weights = [*zip(network.parameters(), self._raw.parameters())]
+        self._optimiser = Optimiser(self._raw, STEP_SIZE, muon=True)
         self._rng = np.random.default_rng([seed, 0x7A])
-        self.steps = steps  # taken so far, in former lives too
+        self.steps = steps  # number of steps so far, including those before a restart
 
     def train(self, data: TrainingData, steps: int) -> float:
-        """Take steps on batches of the data; return the mean loss of the last half of them."""
+        """Train for `steps` steps on random batches; return the mean loss of the second half."""
         entered, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
         mask = torch.arange(3).repeat_interleave(BATCH)
         losses = []
         with one_thread():
             for _ in range(steps):
                 rows = torch.as_tensor(self._rng.integers(len(entered), size=BATCH))
-                value = _loss(self._restless, entered[rows], true[rows], mask)
+                value = _loss(self._raw, entered[rows], true[rows], mask)
                 value.backward()
                 self._optimiser.step(max(LEAST_CALM, 1.0 / (1.0 + self.steps / CALMING)))
                 self.steps += 1
@@ -58,23 +60,23 @@ class NetworkTrainer:
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def move(self, length: Array) -> None:
-        """Go on as the network of an arm whose lengths are all longer by so much [m], (M,)."""
-        for network in (self.network, self._restless):
+        """Shift the network's muscle lengths by `length` [m], (M,), without training."""
+        for network in (self.network, self._raw):
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
-        """Take large steps again and average few: the body has changed."""
+        """Return to large steps and a short average after the body has changed."""
         self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
 
     def _average(self) -> None:
         span = min(max(AVERAGED_SHARE * self.steps, LEAST_AVERAGED), MOST_AVERAGED)
         with torch.no_grad():
-            for mean, now in self._weights:
-                mean.lerp_(now, 1.0 / span)
+            for average, raw in self._weights:
+                average.lerp_(raw, 1.0 / span)
 
 
 def _loss(network: Network, entered: Tensor, true: Tensor, mask: Tensor) -> Tensor:
-    """Return the three norms, each in units of the spread of the data, all three masks entered."""
+    """Return the sum of the error norms of θ, T and l in scaled units, over all three masks."""
     error = network.decoder(network.encode(entered.repeat(3, 1), mask))
     error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
     parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)

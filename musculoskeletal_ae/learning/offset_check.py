@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Length offsets are believed only if the arm's own messages agree with them.
+"""Checks new length offsets against the arm's own messages.
 
-    e = |l − o − ①(θ, T_end)|,   median over COUNT messages, of each muscle
+    e = |l − o − ①(θ, T_end)|,   median over COUNT messages, for each muscle
 
-θ is measured, or else restored by ②. New offsets o have to leave no more than WORSE times what the
-offsets before left with the same network, or FLOOR if that is more. Whoever published them, an
-estimator that was misled or a stranger, nothing is learned with offsets that do not agree.
+θ is measured, or else estimated by ②. New offsets o are accepted if e is at most WORSE times the
+error with the previous offsets and the same network, or at most FLOOR. Learning pauses while the
+published offsets disagree with the messages, whichever node published them.
 """
 
 import math
@@ -18,46 +18,46 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-SPACING, COUNT = 0.1, 20  # [s] between messages that are compared, and how many
+SPACING, COUNT = 0.1, 20  # time between compared messages [s], and their number
 WORSE = 2.0
-#: [m] that is left by healthy networks: those that have learned this arm, and those that have not
+#: error that a healthy network may have [m]: one that has learned this arm, and one that has not
 FLOOR, FLOOR_UNLEARNED = 0.04, 0.1
-SAME = 0.008  # [m] by which offsets of two calibrations of the same arm differ
+SAME = 0.008  # largest difference between two correct calibrations of the same arm [m]
 
 
 class OffsetCheck:
-    """Decides whether length offsets are believed.
+    """Decides whether length offsets are plausible.
 
     Attributes:
-        is_believed: Whether they are. They are not while too few messages have come.
-        problem: Why they are not believed, or ''.
+        is_believed: Whether the offsets are accepted; False until enough messages were compared.
+        problem: Why they are rejected, or ''.
     """
 
     def __init__(self, offsets: LengthOffsets) -> None:
-        """Believe the first offsets: nothing else is known of the arm."""
+        """Accept the first offsets, because there is nothing to compare them with."""
         self._offsets = self._believed = offsets
         self._since = math.inf
-        #: θ (NaN where it was not measured), T_end and l, with the offsets before and with these
+        # θ (NaN if it was not measured), T_end and l with the previous and with the new offsets.
         self._before: deque[tuple[Array, Array, Array]] = deque(maxlen=COUNT)
         self._now: deque[tuple[Array, Array, Array]] = deque(maxlen=COUNT)
         self.is_believed, self.problem = True, ''
 
     def use(self, offsets: LengthOffsets) -> None:
-        """Go by other offsets, which may be unknown."""
+        """Check other offsets from now on; they may be unknown."""
         self._offsets = offsets
         self._now.clear()
         self.problem = ''
         change = np.abs(offsets.offset - self._believed.offset).max()
         self.is_believed = offsets.known and self._believed.known and bool(change <= SAME)
-        if not offsets.known:  # what comes after it is another calibration
+        if not offsets.known:  # the next offsets come from a new calibration
             self._believed = LengthOffsets(self._believed.offset, offsets.deviation)
 
     def forget(self) -> None:
-        """Forget the messages, as after a backward jump of the clock."""
+        """Discard the messages, for example after a backward jump of the clock."""
         self._now.clear()
 
     def step(self, mae: Mae | None, message: MuscleSample, theta: Array | None, dt: float) -> None:
-        """Take a message, `dt` [s] after the one before, and θ [rad] (D,) where it was measured."""
+        """Take a message, `dt` [s] after the previous one, and θ [rad] (D,) if it was measured."""
         self._since += dt
         if self._since < SPACING - 1e-9 or mae is None or not self._offsets.known:
             return
@@ -72,30 +72,30 @@ class OffsetCheck:
             self._judge(mae)
 
     def _judge(self, mae: Mae) -> None:
-        left = _left(mae, self._now)
-        limit = np.full_like(left, FLOOR if mae.covariance is not None else FLOOR_UNLEARNED)
+        error = _length_error(mae, self._now)
+        limit = np.full_like(error, FLOOR if mae.covariance is not None else FLOOR_UNLEARNED)
         if len(self._before) == COUNT:
-            limit = np.maximum(FLOOR, WORSE * _left(mae, self._before))
-        over = left / limit
-        if over.max() > 1.0:
-            m = int(over.argmax())
+            limit = np.maximum(FLOOR, WORSE * _length_error(mae, self._before))
+        excess = error / limit
+        if excess.max() > 1.0:
+            m = int(excess.argmax())
             self.problem = (
-                f'the length zeros do not agree with the messages: {mae.muscles[m]} is off by '
-                f'{1e3 * left[m]:.0f} mm, limit {1e3 * limit[m]:.0f} mm; call estimator/zero'
+                f'the length offsets disagree with the messages: {mae.muscles[m]} is off by '
+                f'{1e3 * error[m]:.0f} mm, limit {1e3 * limit[m]:.0f} mm; call estimator/zero'
             )
             return
         self._believed, self.is_believed, self.problem = self._offsets, True, ''
         self._before = self._now.copy()
 
 
-def _left(mae: Mae, rows: deque[tuple[Array, Array, Array]]) -> Array:
-    """Return what is left of every length [m], (M,); 0 of isolated muscles."""
+def _length_error(mae: Mae, rows: deque[tuple[Array, Array, Array]]) -> Array:
+    """Return the median length error e of each muscle [m], (M,); 0 for isolated muscles."""
     theta, tension, length = map(np.array, zip(*rows, strict=True))
     is_measured = np.isfinite(theta).all(axis=1)
     if 2 * np.count_nonzero(is_measured) > len(rows):
         theta, tension, length = theta[is_measured], tension[is_measured], length[is_measured]
     else:
         theta = mae.estimate(tension, length).theta
-    left: Array = np.median(np.abs(length - mae.lengths(theta, tension)), axis=0)
-    left[list(mae.isolated)] = 0.0
-    return left
+    error: Array = np.median(np.abs(length - mae.lengths(theta, tension)), axis=0)
+    error[list(mae.isolated)] = 0.0
+    return error

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibrated body says that resting samples should have measured: residuals, derivatives.
+"""Residuals of rest samples against the calibrated body, and their derivatives.
 
     length    l_nm − l_m(θ_n, T_n; w)
     torque    τ_nj = −(g(θ_n) + Gᵀ T_end)_j, which is 0 at rest
     angle     y_nj − θ_nj − z_j
     gravity   u_ni − R_iᵀ(θ_n) ĝ
 
-w are the parameters of the body, θ_n the postures of the samples, z the offsets of the joint
-sensors; see `postures`.
+Here w are the parameters of the body, θ_n the postures of the samples and z the joint-sensor
+offsets; see `postures`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 from musculoskeletal_ae.signals.friction import end_tension
 
-DIFFERENCE = 1e-6  # [rad] or [m]
-#: turn of a joint over which Σ T ∂²l/∂θ² of the geometric model is as it was [rad], for prismatic
+DIFFERENCE = 1e-6  # step of the finite differences [rad] or [m]
+#: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]; for prismatic
 #: joints times RACK [m]
 BENT = 0.05
 SMALL = 1e-6
 
 
 class Unknowns(NamedTuple):
-    """A value of all that is to be found for one group of D joints and M muscles."""
+    """Values of all unknowns of one group of D joints and M muscles."""
 
     theta: Array  # θ of all joints of the body [rad], (N, all joints)
     zero: Array  # z [rad], (D,)
@@ -46,47 +46,52 @@ class Residuals(NamedTuple):
     by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
     torque: Array  # (N, D)
     torque_by_body: Array  # ∂τ/∂w, (N, D, W)
-    load: Array  # what muscles exert at each joint, in either direction [N·m], (D,)
-    angle: Array  # (N, D); 0 where nothing is known
+    load: Array  # median sum of the muscles' absolute torques at each joint [N·m], (D,)
+    angle: Array  # (N, D); 0 where the angle was not measured
     gravity: Array  # (N, 3J)
     gravity_by_posture: Array  # (N, 3J, D)
 
 
 class Bent(NamedTuple):
-    """Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
+    """Cache of Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
 
-    theta: Array  # where it was taken last [rad], (N, D)
+    theta: Array  # postures of the last evaluation [rad], (N, D)
     stiffness: Array  # [N·m/rad], (N, D, D)
 
     @classmethod
     def unknown(cls, count: int, joint_count: int) -> Bent:
-        """Return that of postures it has never been taken of."""
+        """Return an empty cache for `count` postures."""
         nowhere = np.full((count, joint_count), np.nan)
         return cls(nowhere, np.zeros((count, joint_count, joint_count)))
 
 
 class PostureModel:
-    """What the calibrated body says that N samples of one group should have measured."""
+    """Computes residuals and derivatives for N samples of one group."""
 
     def __init__(
         self, body: CalibratedBody, observed: Observations, joints: Ints, muscles: Ints, bent: Bent
     ) -> None:
-        """Take the whole body, all samples, and the joints and muscles of the group.
+        """Create the model of one group.
 
-        `bent` is that of the whole body; it is brought up to date in place.
+        Args:
+            body: The whole body.
+            observed: All samples.
+            joints: Joints of the group.
+            muscles: Muscles of the group.
+            bent: Cache of the whole body, which is updated in place.
         """
         self.body, self.observed = body.limb(joints, muscles), observed.limb(joints, muscles)
         self.joints = joints
         self._kinematics = body.robot.kinematics  # of the whole body
         ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])
-        #: where the parameters of each muscle are in w
+        #: positions of each muscle's parameters in w
         self.columns = [slice(*pair) for pair in pairwise(ends.tolist())]
         self._crossed = self.body.robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
         #: the parameters of the muscles that cross each joint
         self.acting = [np.flatnonzero(own) for own in of_muscle]
         self.is_read = np.isfinite(self.observed.theta)
-        self.by_sensor = self.is_read & (self.observed.spread == 0.0)  # of a joint sensor
+        self.by_sensor = self.is_read & (self.observed.spread == 0.0)  # measured by a joint sensor
         self.is_tilt_known = np.isfinite(self.observed.gravity)
         self._tilt = np.where(self.is_tilt_known, self.observed.gravity, 0.0)
         self._bent = bent
@@ -105,7 +110,7 @@ class PostureModel:
         )
         own = at.theta[:, self.joints]
         count, places = own.shape
-        # The postures, then all of them with each joint turned a little.
+        # The postures, followed by all of them with each joint moved by DIFFERENCE.
         flat = np.concatenate([own[None], own + DIFFERENCE * np.eye(places)[:, None]])
         poses = body.poses(flat.reshape(-1, places))
         length, end = np.empty_like(observed.length), np.empty_like(observed.length)
@@ -113,23 +118,25 @@ class PostureModel:
         by_body = []
         torque_by_body = np.zeros((count, places, self.parameter_count))
         for m in range(length.shape[1]):
-            pull, way = observed.tension[:, m], observed.direction[:, m]
-            turns = np.flatnonzero(self._crossed[m])  # the other joints do not move it
+            tension, direction = observed.tension[:, m], observed.direction[:, m]
+            turns = np.flatnonzero(self._crossed[m])  # other joints do not change its length
             parts = np.append(0, 1 + turns)
             rows = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))
-            pulls, ways, age = (np.tile(part, len(parts)) for part in (pull, way, observed.age))
+            tensions, directions, age = (
+                np.tile(part, len(parts)) for part in (tension, direction, observed.age)
+            )
             still = body.smooth[m].at(own)
             turned = still + DIFFERENCE * body.smooth[m].slope(own, turns)
             smooth = np.concatenate([still, *turned])
-            l_m, j_m = body.linearised(placed, smooth, pulls, ways, m, age)
+            l_m, j_m = body.linearised(placed, smooth, tensions, directions, m, age)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
             length[:, m] = observed.length[:, m] - l_m[0]
             by_body.append(j_m[0])
             slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
-            end[:, m] = end_tension(body.friction(m), pull, way)
+            end[:, m] = end_tension(body.friction(m), tension, direction)
             block = (j_m[1:] - j_m[0]) * (end[:, m, None] / DIFFERENCE)
-            block[:, :, body.layouts[m].friction] -= way * end[:, m] * slope[:, m, turns].T
+            block[:, :, body.layouts[m].friction] -= direction * end[:, m] * slope[:, m, turns].T
             torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)
         muscular = end[:, :, None] * slope
         weight = self._kinematics.holding_torque(at.theta)[:, self.joints]
@@ -149,7 +156,8 @@ class PostureModel:
     def _down(self, theta: Array) -> Array:
         """Return gravity's direction in the frames of the tree's joints, (1+D, N, 3J).
 
-        At θ, then with each joint of the group turned by `DIFFERENCE`; 0 columns without an IMU.
+        The first entry is at θ; in the others, one joint of the group each is moved by
+        `DIFFERENCE`. Without an IMU the result has 0 columns.
         """
         if not self._tilt.size:
             return np.zeros((1 + len(self.joints), len(theta), 0))
@@ -161,14 +169,14 @@ class PostureModel:
         return down.reshape(-1, *self._tilt.shape)
 
     def stiffness(self, theta: Array) -> Array:
-        """Return ∂τ/∂θ [N·m/rad] (N, D, D), where the muscles' part is the geometric model's."""
+        """Return ∂τ/∂θ [N·m/rad] (N, D, D), with the muscles' part from the geometric model."""
         within = self.joints[:, None], self.joints
         gravity = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
         stiffness: Array = gravity[:, within[0], within[1]]
         return stiffness + self._muscle_stiffness(theta[:, self.joints])
 
     def _muscle_stiffness(self, own: Array) -> Array:
-        """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at about θ (N, D)."""
+        """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at or near θ (N, D)."""
         joints, radian = self.joints, self.body.robot.kinematics.radian
         at = self._bent.theta[:, joints]
         moved = np.flatnonzero(~(np.abs(own - at) < BENT * radian).all(axis=1))

@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The body and the postures of its samples, found together from whatever sensors there are.
+"""Joint fit of the body and the postures of its samples from all available sensors.
 
     min  Σ ω (l_nm − l_m(θ_n, T_n; w))²/σ_m² + Σ ω (g(θ_n) + Gᵀ T_end)_j²/σ_τ²
          + Σ (θ_nj + z_j − y_nj)²/σ_y² + Σ ‖R_iᵀ(θ_n) ĝ − u_ni‖²/σ_u² + Σ ((w − w̄)/s)²
          + Σ ((z − z̄)/s_z)²
 
-over the parameters w of the calibrated body, the postures θ_n and the offsets z of the joint
-sensors, by robust Gauss–Newton (`gauss_newton`). y are joint angles that a sensor read (with its
-offset z), a camera measured or somebody stated. u are directions of gravity in links that carry an
-IMU. Any of them may be missing anywhere. z̄ and s_z are what the joints' stops tell (`stops`).
+The minimum is over the parameters w of the calibrated body, the postures θ_n and the joint-sensor
+offsets z, by robust Gauss–Newton (`gauss_newton`). y are joint angles that a joint sensor (with
+offset z) or a camera measured, or that a user stated. u are directions of gravity in links that
+carry an IMU. Any of these measurements may be missing. z̄ and s_z are derived from the joints' stops
+(`stops`).
 
-M > D makes that possible: N rests give N (M − D) equations of length more than there are angles,
-and N D of torque. A joint that muscles push against its stop harder than friction holds is taken to
-be there; one that is beyond it is drawn back. The groups of joints and muscles that share nothing
-are fitted one after another. For each of them
+The problem can be solved because M > D. N rests give N (M − D) more length equations than there are
+angles, and N D torque equations. A joint that muscles push against its stop harder than friction
+can hold is assumed to be at the stop. A joint beyond its stop is drawn back to it. Independent
+groups of joints and muscles are fitted one after another. Each group uses
 
     PostureModel    parameters and postures → residuals and their derivatives
-    GroupPrior      what is known before the samples, and how far each sensor is to be trusted
-    Stops           the joints that lean on their stops
+    GroupPrior      prior of the parameters, and accuracy of each sensor
+    Stops           the joints that are at their stops
     GroupFit        weights, cost and normal equations for the solver
 """
 
@@ -49,23 +50,23 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
 
 # For prismatic joints, [rad] below are times RACK [m].
-GRAVITY = 0.02  # σ_u: an accelerometer's error and how it is mounted [rad]
-#: σ of a length at first, and at least in what it says of postures: what no body explains [m]
-FIRST_NOISE, LEAST_NOISE = 0.002, 0.0008
-#: σ_τ as a share of what the muscles exert at a joint, in either direction. It is wide, because
-#: friction and the offsets of the tension sensors are common to all samples.
+GRAVITY = 0.02  # σ_u: error and mounting error of an accelerometer [rad]
+FIRST_NOISE = 0.002  # initial σ of a length [m]
+LEAST_NOISE = 0.0008  # smallest σ of a length in the weights: error that no body explains [m]
+#: σ_τ as a share of the muscles' absolute torques at a joint. It is wide, because friction and the
+#: offsets of the tension sensors are common to all samples.
 TORQUE = 0.3
-LEAST_TORQUE = 0.01  # of the torque that is usually left, as such a share
-ROUNDS = 12
-#: decrease, in variances for each length, that ends the rounds: the step was then far shorter than
-#: what the samples leave open, and the noise has settled (with ten times as much, a joint sensor
-#: that slipped is taken for a changed muscle more often)
+LEAST_TORQUE = 0.01  # smallest usual residual torque, as the same share
+ROUNDS = 12  # largest number of Gauss–Newton iterations
+#: The iterations end when the cost decreases by less than this for each length. The step is then
+#: far shorter than the posterior spread, and the noise has settled. With ten times this value, the
+#: fit mistakes a slipped joint sensor for a changed muscle more often.
 ENOUGH = 3e-4
-EXPECTED = 0.3  # usual step of a posture [rad]
+EXPECTED = 0.3  # typical step of a posture [rad]
 
 
 class Weights(NamedTuple):
-    """Robust weights over variances, of all residuals."""
+    """Robust weights of all residuals, divided by their variances."""
 
     length: Array  # (N, M)
     torque: Array  # (N, D)
@@ -74,34 +75,42 @@ class Weights(NamedTuple):
 
 
 class Point(NamedTuple):
-    """A value of the unknowns, and its residuals."""
+    """Values of the unknowns, and the residuals there."""
 
     unknowns: Unknowns
     residuals: Residuals
 
 
 class GroupFit:
-    """The problem of one group, for the solver (`gauss_newton.Problem`).
+    """Fit of one group, as a `gauss_newton.Problem`.
 
     Attributes:
         noise: σ of each muscle's length [m], (M,).
-        weight: ω of each length in (0, 1], 0 where a sample says nothing about a muscle, (N, M).
-        usual: One over the squares of usual steps of θ (D,) and of (w, z).
+        weight: ω of each length in (0, 1]; 0 where a sample does not describe a muscle, (N, M).
+        usual: Inverse squares of typical steps of θ (D,) and of (w, z).
     """
 
     def __init__(
         self, model: PostureModel, mean: list[Array], spread: list[Array], least_noise: float
     ) -> None:
-        """Take the model; w̄ and s of each muscle of the group; and the least noise [m]."""
+        """Create the fit of one group.
+
+        Args:
+            model: Residuals of the group.
+            mean: Prior mean w̄ of each muscle.
+            spread: Prior spread s of each muscle.
+            least_noise: Smallest σ of a length [m].
+        """
         self.model, self.stops = model, Stops(model)
         self.prior = GroupPrior.of(model, mean, spread)
         self._least_noise = least_noise
         self._known = model.observed.known.astype(float)
         self.noise = np.full(len(mean), FIRST_NOISE)
         self.weight = self._known
-        self._determined = np.zeros(len(mean))  # unknowns that each muscle's lengths determine
+        #: effective number of unknowns that each muscle's lengths determine
+        self._determined = np.zeros(len(mean))
         self._weights: Weights
-        self._stiffness: Array  # ∂τ/∂θ of the last equations
+        self._stiffness: Array  # ∂τ/∂θ in the last normal equations
         radian = model.body.robot.kinematics.radian
         self.usual = (
             1.0 / (EXPECTED * radian) ** 2,
@@ -109,13 +118,16 @@ class GroupFit:
         )
 
     def run(self, start: Unknowns) -> tuple[Unknowns, Array]:
-        """Fit from a start on; return the unknowns and the root of the equations of w and z."""
+        """Fit from initial values; return the unknowns and the posterior root of (w, z).
+
+        The root R is upper triangular, and (RᵀR)⁻¹ is the covariance of w and z.
+        """
         enough = ENOUGH * self._known.sum()
         fit = minimise(self, self.point(start), ROUNDS, enough)
         assert fit.eliminated is not None
         eliminated, prior = fit.eliminated, self.prior
         if fit.level or (prior.unread > 1.0).any():
-            # What the body does not know is common to all samples: see ALIKE.
+            # Errors of the body model are common to all samples: see ALIKE.
             self._weights = self._weights._replace(torque=self._weights.torque / prior.unread)
             prior.repeated = prior.repeated * prior.unread
             eliminated = Eliminated(self.equations(fit.point), 0.0, SMALL)
@@ -123,19 +135,20 @@ class GroupFit:
         return fit.point.unknowns, eliminated.root
 
     def _widen(self, residuals: Residuals, root: Array) -> None:
-        """Trust a muscle that is learned anew no more than it is known."""
+        """Add the parameter uncertainty of relearned muscles to their length noise."""
         for m in np.flatnonzero((self._known == 0.0).any(axis=0)):
-            wide = np.zeros((len(root), len(self._known)))
-            wide[self.model.columns[m]] = residuals.by_body[m].T
-            unknown = np.square(solve_triangular(root, wide, trans='T')).sum(axis=0)
-            self.noise[m] = np.hypot(self.noise[m], np.sqrt(unknown.mean()))
+            by_parameters = np.zeros((len(root), len(self._known)))
+            by_parameters[self.model.columns[m]] = residuals.by_body[m].T
+            scaled = solve_triangular(root, by_parameters, trans='T')
+            variance = np.square(scaled).sum(axis=0)
+            self.noise[m] = np.hypot(self.noise[m], np.sqrt(variance.mean()))
 
     def point(self, unknowns: Unknowns) -> Point:
         """Return a point with its residuals."""
         return Point(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: Point) -> None:
-        """Take noise, robust weights and stops at a point."""
+        """Compute noise, robust weights and stops at a point."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise
@@ -156,7 +169,7 @@ class GroupFit:
         return self.stops.pull(unknowns.theta[:, self.model.joints], self.prior.repeated)
 
     def cost(self, point: Point) -> float:
-        """Return what is to be minimised, with the weights as they are."""
+        """Return the cost with the present weights."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
         stop, by_stop = self._pull(unknowns)
@@ -208,7 +221,7 @@ class GroupFit:
         return Equations(inner, mixed, outer)
 
     def _by_lengths(self, curvature: list[Array]) -> Array:
-        """Return how many parameters each muscle's lengths determine, (M,)."""
+        """Return the effective number of parameters that each muscle's lengths determine, (M,)."""
         precisions = (self.prior.precision[column] for column in self.model.columns)
         return np.array([determined(c, p) for c, p in zip(curvature, precisions, strict=True)])
 
@@ -218,17 +231,17 @@ class GroupFit:
         weights, prior = self._weights, self.prior
         length, torque = weights.length * residuals.length, weights.torque * residuals.torque
         stop, by_stop = self._pull(unknowns)
-        pulled = np.einsum('nmi,nm->ni', residuals.muscle_jacobian, length)
-        pulled += np.einsum('nki,nk->ni', self._stiffness, torque)
+        of_postures = np.einsum('nmi,nm->ni', residuals.muscle_jacobian, length)
+        of_postures += np.einsum('nki,nk->ni', self._stiffness, torque)
         tilt = weights.gravity * residuals.gravity
-        pulled += np.einsum('nki,nk->ni', residuals.gravity_by_posture, tilt)
-        pulled += weights.angle * residuals.angle + by_stop * stop
-        by_body = [at.T @ pull for at, pull in zip(residuals.by_body, length.T)]
+        of_postures += np.einsum('nki,nk->ni', residuals.gravity_by_posture, tilt)
+        of_postures += weights.angle * residuals.angle + by_stop * stop
+        by_body = [at.T @ weighted for at, weighted in zip(residuals.by_body, length.T)]
         right = np.concatenate(by_body) + prior.precision * prior.deviation(unknowns.parameters)
         right += np.tensordot(torque, residuals.torque_by_body, 2)
         angle = (weights.angle * self.model.by_sensor * residuals.angle).sum(axis=0)
         of_zero = angle + prior.zero_precision * (prior.zero - unknowns.zero)
-        return RightSides(pulled, np.append(right, of_zero))
+        return RightSides(of_postures, np.append(right, of_zero))
 
     def moved(self, point: Point, step: Step) -> Point:
         """Return the point after a step."""
@@ -250,9 +263,18 @@ def fit_jointly(
     spread: list[Array],
     least_noise: float,
 ) -> tuple[Array, Array, Array, Array, list[tuple[Ints, Array]]]:
-    """Fit body and offsets of joint sensors (in place), and postures from `start` [rad] (N, D).
+    """Fit the body, the joint-sensor offsets and the postures of the samples.
 
-    Returns what `Fit` holds.
+    Args:
+        body: The body, whose parameters and joint-sensor offsets are changed in place.
+        observed: The samples.
+        start: Initial postures [rad], (N, D).
+        mean: Prior mean of each muscle's parameters.
+        spread: Prior spread of each muscle's parameters.
+        least_noise: Smallest σ of a length [m].
+
+    Returns:
+        The fields of `Fit`.
     """
     own, zero = np.isfinite(observed.theta) & (observed.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in observed.length]
@@ -267,14 +289,15 @@ def fit_jointly(
         model = PostureModel(body, observed, joints, muscles, bent)
         fit = GroupFit(model, [mean[m] for m in muscles], [spread[m] for m in muscles], least_noise)
         begin = Unknowns(theta, zero[joints], [body.parameters[m] for m in muscles])
-        found, group_root = fit.run(begin)
-        theta, zero[joints] = found.theta, found.zero
-        for m, parameters in zip(muscles, found.parameters):
+        solution, group_root = fit.run(begin)
+        theta, zero[joints] = solution.theta, solution.zero
+        for m, parameters in zip(muscles, solution.parameters):
             body.parameters[m] = parameters
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight
         root.append((muscles, group_root))
     body.last_postures = dict(zip(samples, zip(theta, *bent), strict=True))
-    # At angles as they were read, a joint sensor that slipped shows in all muscles of that joint.
-    read = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
-    (length,) = body.lengths(read, observed.tension, observed.direction)
+    # Use the measured angles where there are any: a slipped joint sensor then shows in the
+    # residuals of all muscles of that joint.
+    measured = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
+    (length,) = body.lengths(measured, observed.tension, observed.direction)
     return observed.length + body.crept(observed.age) - length, noise, weight, theta, root

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of a body before any sample: physical spreads round the geometric model."""
+"""Priors of the body's parameters: physical spreads around the geometric model."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from musculoskeletal_ae.learning.posture_model import PostureModel
 from musculoskeletal_ae.learning.stops import sensor_zeros
 
 # For prismatic joints, [rad] below are times RACK [m].
-#: What the body does not know is common to all samples. Therefore they count as no more than these
-#: in what they say of an offset; and torque and stops of joints that no sensor reads, in how much
-#: all that leaves open.
+#: Errors of the body model are common to all samples. Therefore all samples together count as at
+#: most this number of independent ones, both for joint-sensor offsets and for the posterior
+#: uncertainty from the torque and the stops of joints without a sensor.
 ALIKE = 10.0
 SENSOR = 0.002  # σ_y of a joint sensor [rad]
-SMALL = 1e-6  # [rad], least σ_y
+SMALL = 1e-6  # smallest σ_y [rad]
 
 
 @dataclass(frozen=True)
 class Prior:
-    """How much a body differs from its geometric model (one standard deviation each)."""
+    """Standard deviations of the differences between a body and its geometric model."""
 
     attachment: float = 0.007  # each coordinate of each route point [m]
     elastic: float = 0.2  # logarithm of each elastic constant
-    friction: float = 0.05  # relative tension loss along the route, around its mean
-    friction_mean: float = 0.05
-    offset: float = 0.001  # zero of the length sensor [m]
-    creep: float = 1e-5  # of a wire, from one sample to the next [m]
-    smooth: float = 0.002  # the residual model [m]
+    friction: float = 0.05  # μ, around `friction_mean`
+    friction_mean: float = 0.05  # mean of μ
+    offset: float = 0.001  # offset of the length sensor [m]
+    creep: float = 1e-5  # creep of a tendon from one sample to the next [m]
+    smooth: float = 0.002  # residual model [m]
 
     def spread(self, layout: Layout) -> Array:
-        """Return s of every parameter of a muscle."""
+        """Return the prior spread s of every parameter of a muscle."""
         spread = np.empty(layout.size)
         spread[layout.attachment] = self.attachment
         spread[layout.elastic] = self.elastic
@@ -52,7 +52,7 @@ class Prior:
 
 
 PRIOR = Prior()
-#: of a muscle that was replaced or re-wired, around what it was before
+#: prior of a muscle that was replaced or whose tendon was renewed, around its earlier parameters
 REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
 
 
@@ -65,16 +65,16 @@ class MusclePrior(NamedTuple):
 
 @dataclass
 class GroupPrior:
-    """What is known before the samples, and how far each sensor is to be trusted.
+    """Prior of one group, and the accuracy of its joint sensors.
 
     Attributes:
-        mean: w̄, (W,).
+        mean: Prior mean of the parameters w̄, (W,).
         precision: 1/s², (W,).
-        zero: z̄ [rad], (D,).
+        zero: Prior mean of the joint-sensor offsets z̄ [rad], (D,).
         zero_precision: 1/s_z², (D,).
-        angle_precision: 1/σ_y², 0 where nothing was read, (N, D).
-        repeated: How many readings of a joint sensor count as one, (D,).
-        unread: How many samples count as one for a joint that no sensor reads, (D,).
+        angle_precision: 1/σ_y²; 0 where the angle was not measured, (N, D).
+        repeated: Number of readings of a joint sensor that count as one, (D,).
+        unread: Number of samples that count as one for a joint without a sensor, (D,).
     """
 
     mean: Array
@@ -87,7 +87,7 @@ class GroupPrior:
 
     @classmethod
     def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
-        """Return that of a group; `mean` and `spread` are those of its muscles."""
+        """Return the prior of a group from the `mean` and `spread` of each of its muscles."""
         observed, robot, by_sensor = model.observed, model.body.robot, model.by_sensor
         radian = robot.kinematics.radian
         angle_spread = np.where(by_sensor, SENSOR * radian, observed.spread)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the learner shows on /diagnostics."""
+"""The learner's status on /diagnostics."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.learner import Learner
 
-LONGEST_IDLE = 5.0  # [s] without a message to learn from, before that is a warning
+LONGEST_IDLE = 5.0  # time without a usable message after which the status is a warning [s]
 
 
 def learner_report(learner: Learner) -> Report:
-    """Return how a learner is."""
+    """Return the status of a learner."""
     level: Level = 'warn'
     if trouble := learner.trouble:
         level, message = 'error', trouble
@@ -26,13 +26,13 @@ def learner_report(learner: Learner) -> Report:
     elif not learner.enabled:
         message = 'stopped by learner/enable'
     elif not learner.body.offsets.known:
-        message = 'waiting until the estimator has found the length zeros'
+        message = 'waiting for the length calibration by the estimator'
     elif not learner.offset_check.is_believed:
-        message = 'comparing new length zeros with the messages'
+        message = 'checking new length offsets against muscle_states'
     elif learner.collector.is_anomaly:
-        message = 'stopped by an anomaly until estimator/reset'
+        message = 'stopped by an anomaly; call estimator/reset to resume'
     elif (idle_time := learner.idle_time) > LONGEST_IDLE:
-        message = f'nothing to learn from for {idle_time:.0f} s: {learner.collector.obstacle}'
+        message = f'no usable data for {idle_time:.0f} s: {learner.collector.obstacle}'
     else:
         level, message = 'ok', 'learning'
     return Report(level, message, {**_values(learner), 'state': message})
@@ -53,14 +53,14 @@ def _values(learner: Learner) -> dict[str, str]:
     }
     history = learner.offset_history
     if history.dropped or history.corrected:
-        values['samples dropped with wrong length zeros'] = str(history.dropped)
-        values['samples corrected for wrong length zeros'] = str(history.corrected)
+        values['samples dropped with wrong length offsets'] = str(history.dropped)
+        values['samples corrected for wrong length offsets'] = str(history.corrected)
     if learner.isolated:
         values['isolated muscles'] = learner.robot.names(learner.isolated)
     values |= keeper.values()
     if learner.last_update is not None:
         values |= _update_values(learner.robot, learner.last_update)
-    return values | {f'not learned: {why}': str(n) for why, n in collector.rejected.items()}
+    return values | {f'not learned: {reason}': str(n) for reason, n in collector.rejected.items()}
 
 
 def _update_values(robot: Robot, update: Update) -> dict[str, str]:
@@ -75,6 +75,6 @@ def _update_values(robot: Robot, update: Update) -> dict[str, str]:
         values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({robot.muscles[worst]})'
     if update.contradicted:
         names = robot.names(update.contradicted)
-        what = 'newest samples contradict several muscles'
-        values[what] = f'{names}; look at the joint sensors'
+        key = 'newest samples contradict several muscles'
+        values[key] = f'{names}; check the joint sensors'
     return values

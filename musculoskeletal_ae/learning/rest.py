@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From messages to rests: when the arm is still.
+"""Detects when the arm is at rest, and averages the messages of each rest.
 
-The arm rests while the means of the two halves of a short window differ by no more than the given
-rates allow, beyond what the sensors' own scatter explains (a camera's θ is far noisier than a joint
-sensor's). The rest is averaged until it ends, or for `LONGEST` at a time. An arm without joint
-sensors (`blind`) rests while its muscles do, and θ is averaged where there is any. A motion begins
-and ends too slowly to be told from rest, but not to bend what an accelerometer reads of gravity:
-that counts where the whole windows before and after it were still.
+The arm is at rest while the means of the two halves of a short window differ by no more than the
+settings' rates allow. Sensor noise is taken into account, because θ from a camera is much noisier
+than θ from a joint sensor. A rest is averaged until it ends, or in parts of `LONGEST`. For an arm
+without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
+measured.
+
+The slow start and end of a motion cannot be distinguished from rest, but it disturbs the direction
+of gravity that an accelerometer measures. Therefore gravity is used only if the whole windows
+before and after a reading were still.
 """
 
 from bisect import bisect_right
@@ -20,21 +23,23 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 from musculoskeletal_ae.learning.settings import Settings
 
-LONGEST = 1.0  # [s] of rest that one sample averages
-MOST = 20_000  # readings of one rest: an end where the clock stands still
-LEAST_READINGS = 4  # in half of `rest_time`, which slow messages make longer: fewer hide a drift
-SURE = 3.0  # standard errors that a difference of means may have by chance
+LONGEST = 1.0  # longest part of a rest that one sample averages [s]
+MOST = 20_000  # largest number of readings in a rest; bounds the memory if the clock stands still
+#: Smallest number of readings in each half of the window. Fewer readings could hide a drift; the
+#: window is longer than `rest_time` if messages are slow.
+LEAST_READINGS = 4
+SURE = 3.0  # standard errors of a difference of means that count as noise
 
 
 class ReadingWindow:
-    """The latest readings with the times when they came, and their values as rows of an array.
+    """The latest readings with their times, and their values as rows of an array.
 
-    The array is reused, because a new one for every message would be slow.
+    The array is reused, because allocating one for every message would be slow.
     """
 
     def __init__(self) -> None:
         self.readings: deque[tuple[float, Sample]] = deque(maxlen=MOST)
-        self._rows = np.empty((0, 1))  # from `_first` on (l, θ) of the readings
+        self._rows = np.empty((0, 1))  # (l, θ) of the readings, starting at row `_first`
         self._first = 0
 
     def clear(self) -> None:
@@ -43,12 +48,12 @@ class ReadingWindow:
 
     @property
     def start(self) -> float:
-        """When the first reading came [s]."""
+        """Time of the first reading [s]."""
         return self.readings[0][0]
 
     def append(self, time: float, reading: Sample) -> None:
-        """Add a reading that came at `time` [s]."""
-        held = min(len(self.readings), MOST - 1)  # of which one goes when the window is full
+        """Add a reading received at `time` [s]."""
+        held = min(len(self.readings), MOST - 1)  # a full window loses its oldest reading
         self._first += len(self.readings) - held
         row = np.concatenate((reading.length, reading.theta))
         if self._first + held == len(self._rows):
@@ -59,27 +64,27 @@ class ReadingWindow:
         self.readings.append((time, reading))
 
     def drop_before(self, time: float) -> None:
-        """Forget the readings that came before `time` [s]."""
+        """Drop the readings from before `time` [s]."""
         while self.start < time:
             self.readings.popleft()
             self._first += 1
 
     def parts(self, time: float) -> tuple[Array, Array]:
-        """Return the rows of the readings up to `time` [s], and of those after it."""
-        cut = bisect_right(self.readings, time, key=itemgetter(0))
-        middle, end = self._first + cut, self._first + len(self.readings)
+        """Return the rows of the readings up to `time` [s], and those of later readings."""
+        earlier_count = bisect_right(self.readings, time, key=itemgetter(0))
+        middle, end = self._first + earlier_count, self._first + len(self.readings)
         return self._rows[self._first : middle], self._rows[middle:end]
 
 
 @dataclass
 class OpenRest:
-    """A rest that goes on.
+    """A rest that has not ended yet.
 
     Attributes:
-        since: When the arm was found still [s].
-        span: How long the readings last that are averaged [s].
-        readings: Those readings.
-        gravity: What IMUs read of gravity in readings with still windows before and after them.
+        since: Time at which the rest was detected [s].
+        span: Duration of the averaged readings [s].
+        readings: The averaged readings.
+        gravity: Directions of gravity from readings with still windows before and after them.
     """
 
     since: float
@@ -88,7 +93,7 @@ class OpenRest:
     gravity: list[Array] = field(default_factory=list)
 
     def mean(self) -> Sample | None:
-        """Return the mean of the readings; None if there is none."""
+        """Return the mean of the readings; None if there are none."""
         if not self.readings:
             return None
         theta, tension, length, direction = (
@@ -105,34 +110,42 @@ class OpenRest:
 
 
 class RestDetector:
-    """Turns the stream of readings into one mean per rest."""
+    """Turns a stream of readings into one mean for each rest."""
 
     def __init__(
         self, settings: Settings, blind: bool = False, radian: Array | float = 1.0
     ) -> None:
-        """Start with an empty window; `radian` is that of `SampleStore`."""
+        """Start with an empty window.
+
+        Args:
+            settings: Thresholds for rest.
+            blind: Whether the arm has no joint sensors.
+            radian: As for `SampleStore`.
+        """
         self.settings, self.blind, self._radian = settings, blind, radian
         self._window = ReadingWindow()
         self.reset()
 
     def reset(self) -> None:
-        """Forget the window, as after a jump of the clock."""
+        """Clear the window, for example after a jump of the clock."""
         self._window.clear()
         self._time = 0.0  # [s]
-        self._read_at, self._periods = 0.0, (0.0, 0.0)  # of messages that count, the last two [s]
-        self._rest: OpenRest | None = None  # None: the arm moves
+        self._read_at = 0.0  # time of the last usable message [s]
+        self._periods = 0.0, 0.0  # last two periods between usable messages [s]
+        self._rest: OpenRest | None = None  # None while the arm moves
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
-        """Take a message, `dt` [s] after the one before, with θ NaN where none was measured.
+        """Take a reading, `dt` [s] after the previous one, with θ NaN where it was not measured.
 
-        Returns the mean of a rest that ended or is long enough.
+        Returns:
+            The mean of a rest that has ended or has reached `LONGEST`, otherwise None.
         """
         self._time += dt
         self._window.append(self._time, reading)
         if self.blind or _is_measured(reading):
             self._periods = self._periods[1], self._time - self._read_at
             self._read_at = self._time
-        # Of the last two periods the shorter one counts: a gap is no rate.
+        # Use the shorter of the last two periods, so that a single gap does not count.
         readings = (2 * LEAST_READINGS + 1) * min(self._periods)
         needed = max(self.settings.rest_time, readings)
         self._window.drop_before(self._time - needed - 1e-9)
@@ -156,7 +169,7 @@ class RestDetector:
         return rest.mean()
 
     def _is_still(self, needed: float) -> bool:
-        """Whether the arm was still for the time that a rest needs [s]."""
+        """Return whether the arm was still during the last `needed` seconds."""
         half = 0.5 * needed
         if self._time - self._window.start <= 0.7 * needed:
             return False
@@ -174,7 +187,7 @@ class RestDetector:
             return self.blind
         rate = self.settings.rest_joint_rate * half * self._radian
         allowed, whole = np.broadcast_to(rate, enough.shape), known[0].all(0) & known[1].all(0)
-        # Of some joints only some messages tell, as where two nodes publish some joints each.
+        # Some joints are in only part of the messages, for example if two nodes publish joints.
         some = (
             [a[k[:, j], j] for a, k in zip(angles, known)] for j in np.flatnonzero(enough & ~whole)
         )
@@ -188,7 +201,7 @@ def _is_measured(reading: Sample) -> bool:
 
 
 def _mean(values: Array) -> Array:
-    """Return the mean of rows where they are numbers, NaN where none is."""
+    """Return the mean over rows without NaN; NaN where all rows are NaN."""
     known = np.isfinite(values)
     mean: Array = np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(known.any(axis=0), mean, np.nan)
@@ -199,7 +212,7 @@ def _unmoved(halves: list[Array], allowed: Array | float) -> bool:
     difference = np.abs(second.sum(axis=0) / len(second) - first.sum(axis=0) / len(first))
     if (difference <= allowed).all():
         return True
-    # Taken from neighbours' differences, which a slow drift hardly enters.
+    # Estimate the noise from differences of consecutive rows, which a slow drift hardly affects.
     error = sum(
         np.square(half[1:] - half[:-1]).sum(axis=0) / (2.0 * len(half) * (len(half) - 1))
         for half in halves

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples: what the sensors said while the arm was at rest, and which of them are kept.
+"""Rest samples, and the store that keeps them.
 
 A sample is new when θ or T differs from every stored one by more than a threshold (paper,
-§III-C). When the store is full, one of the two samples nearest to each other goes, the older one,
-so that what remains is spread over the postures and tensions ever seen, and the newest always
-stays.
+§III-C). When the store is full, it drops the older of the two samples that are nearest to each
+other. The remaining samples then cover all postures and tensions so far, and the newest sample
+always stays.
 """
 
 from __future__ import annotations
@@ -22,55 +22,56 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import end_tension
 
 CAPACITY = 400
-#: creep of wires is told from this share of a store on, if as many samples come with all angles
+#: Tendon creep is estimated once the number of accepted samples exceeds this share of the capacity,
+#: if the same share of the samples has all joint angles.
 CREEPING = 0.5
 NOTHING: Array = np.zeros(0)
-#: length that counts as a joint angle where none was read, per radian: a usual moment arm [m]
+#: typical moment arm [m]; converts lengths to angles where no joint angle was measured
 MOMENT_ARM = 0.04
-LEAST_DISTANCE = 1e-6  # [rad], [N] that 0 stands for: whatever differs is new
+LEAST_DISTANCE = 1e-6  # [rad], [N]; replaces a threshold of 0, so that any difference is new
 
 
 class Sample(NamedTuple):
-    """Means over a rest."""
+    """Mean measurements over a rest."""
 
-    theta: Array  # θ [rad], (D,); NaN where nothing was read
+    theta: Array  # θ [rad], (D,); NaN where it was not measured
     tension: Array  # T [N], (M,)
     length: Array  # l [m], (M,)
-    direction: Array  # s of every wire's friction: +1 wound in last, −1 paid out last, (M,)
-    #: how far each θ may be off [rad], (D,); 0 or nothing: as a joint sensor, but for its zero
+    direction: Array  # direction s of the last sliding: +1 wound in, −1 paid out, (M,)
+    #: standard deviation of each θ [rad], (D,); 0 or empty: measured by a joint sensor
     spread: Array = NOTHING
-    #: direction of gravity in the frames of the tree's joints, (3J,); NaN or nothing: no IMU there
+    #: direction of gravity in the frames of the tree's joints, (3J,); NaN or empty without an IMU
     gravity: Array = NOTHING
-    #: version of the `BodyState` under which it was taken, and the muscles that were isolated then
+    #: version of the `BodyState` under which the sample was taken, and the muscles isolated then
     body_version: int = 0
     isolated: tuple[int, ...] = ()
 
 
 class StoredSample(NamedTuple):
-    """A sample with what its store knows about it."""
+    """A sample with the data that its store keeps about it."""
 
     sample: Sample
-    known: Bools  # which muscles it says something about, (M,)
-    number: int  # its place among all that were ever accepted, from 1
+    known: Bools  # whether the sample describes each muscle, (M,)
+    number: int  # position among all samples ever accepted, from 1
 
 
 @dataclass(frozen=True)
 class Observations:
     """N samples as arrays."""
 
-    theta: Array  # θ [rad], (N, D); NaN where nothing was read
-    tension: Array  # T at the motors [N], (N, M)
+    theta: Array  # θ [rad], (N, D); NaN where it was not measured
+    tension: Array  # motor-side tension T [N], (N, M)
     length: Array  # l [m], (N, M)
     direction: Array  # s in [−1, 1], (N, M)
-    known: Bools  # which of them say something about which muscle, (N, M)
+    known: Bools  # whether each sample describes each muscle, (N, M)
     spread: Array = field(default_factory=lambda: NOTHING)  # see `Sample`, (N, D)
-    #: (N, 3J), or (N, 0): no IMU anywhere
+    #: see `Sample`, (N, 3J); (N, 0) without an IMU
     gravity: Array = field(default_factory=lambda: NOTHING)
-    #: how many samples came after each, (N,); 0 where no creep of wires can be told
+    #: number of samples that came after each one, (N,); 0 where creep cannot be estimated
     age: Array = field(default_factory=lambda: NOTHING)
 
     def __post_init__(self) -> None:
-        """Fill in what was left out."""
+        """Replace empty arrays by defaults."""
         if self.spread.size == 0:
             object.__setattr__(self, 'spread', np.zeros_like(self.theta))
         if self.gravity.size == 0:
@@ -85,11 +86,15 @@ class Observations:
         return Observations(*(values[rows] for values in vars(self).values()))
 
     def limb(self, joints: Ints, muscles: Ints) -> Observations:
-        """Return what they say of the joints and muscles of one group."""
-        ours = {'theta': joints, 'spread': joints}
-        ours |= dict.fromkeys(('tension', 'length', 'direction', 'known'), muscles)
+        """Return the observations of one group of joints and muscles."""
         return replace(
-            self, **{name: getattr(self, name)[:, which] for name, which in ours.items()}
+            self,
+            theta=self.theta[:, joints],
+            spread=self.spread[:, joints],
+            tension=self.tension[:, muscles],
+            length=self.length[:, muscles],
+            direction=self.direction[:, muscles],
+            known=self.known[:, muscles],
         )
 
     def state(self) -> State:
@@ -97,16 +102,16 @@ class Observations:
         return State(self.theta, self.tension, self.length)
 
     def end_tension(self, friction: Array) -> Array:
-        """Return T at the elastic units [N] (N, M), by μ (M,): what networks take for T."""
+        """Return T at the elastic elements [N] (N, M) by μ (M,), which is a network's input."""
         return end_tension(friction, self.tension, self.direction)
 
     def with_all_angles(self) -> Observations:
-        """Return those of which all joint angles are known."""
+        """Return the samples with all joint angles measured."""
         return self[np.flatnonzero(np.isfinite(self.theta).all(axis=1))]
 
 
 class SampleStore:
-    """Samples in the order in which they came, at most `capacity`."""
+    """Keeps up to `capacity` samples in the order in which they were accepted."""
 
     def __init__(
         self,
@@ -114,22 +119,34 @@ class SampleStore:
         capacity: int = CAPACITY,
         radian: Array | float = 1.0,
     ) -> None:
-        """Start empty; `radian` [rad or m] (D,) is what counts as a radian of each joint."""
+        """Start empty.
+
+        Args:
+            settings: Thresholds for new samples.
+            capacity: Largest number of samples.
+            radian: Displacement of each joint that counts as one radian [rad or m], (D,).
+        """
         self._settings, self._radian = settings, radian
         self.capacity = capacity
-        self.accepted = 0  # ever
+        self.accepted = 0  # number of samples ever accepted
         self.clear()
 
     def __len__(self) -> int:
         return len(self.samples)
 
     def is_new(self, sample: Sample) -> bool:
-        """Whether a sample differs enough from every stored one."""
+        """Return whether a sample differs enough from every stored one."""
         points = self._scaled([*self.samples, sample])
         return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
-        """Store a sample, as the newest; `known` and `number` are given to one stored before."""
+        """Store a sample as the newest one.
+
+        Args:
+            sample: The sample.
+            known: Whether it describes each muscle, (M,); by default all of them.
+            number: Its number if it is restored from disk; by default the next one.
+        """
         self.accepted = number or self.accepted + 1
         self.samples.append(sample)
         self.known.append(np.ones(len(sample.tension), dtype=bool) if known is None else known)
@@ -139,12 +156,12 @@ class SampleStore:
             del self.samples[worst], self.known[worst], self.numbers[worst]
 
     def forget(self, muscle: int, newest: int = 0) -> None:
-        """Let all samples but the newest ones say nothing about a muscle any more."""
+        """Mark a muscle as unknown in all samples except the `newest` ones."""
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
 
     def take_out(self, numbers: Set[int]) -> list[StoredSample]:
-        """Remove the samples of these numbers; return them."""
+        """Remove and return the samples with these numbers."""
         stored = [*map(StoredSample, self.samples, self.known, self.numbers)]
         for place in reversed(range(len(stored))):
             if stored[place].number in numbers:
@@ -152,7 +169,7 @@ class SampleStore:
         return [each for each in stored if each.number in numbers]
 
     def put_back(self, stored: Iterable[StoredSample]) -> None:
-        """Add samples that were taken out, each at its place."""
+        """Insert samples that were taken out at their original positions."""
         for each in stored:
             place = bisect(self.numbers, each.number)
             self.samples.insert(place, each.sample)
@@ -160,7 +177,13 @@ class SampleStore:
             self.numbers.insert(place, each.number)
 
     def lengthen(self, by: Array, first: int) -> int:
-        """Let the lengths of samples from a number on be more by so much [m] (M,); say how many."""
+        """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.
+
+        Lengths of muscles that were isolated in a sample stay.
+
+        Returns:
+            The number of changed samples.
+        """
         places = [i for i, number in enumerate(self.numbers) if number >= first]
         for i in places:
             sample = self.samples[i]
@@ -170,14 +193,14 @@ class SampleStore:
 
     @property
     def body_version(self) -> int:
-        """The newest version of the body state that a stored sample was taken under."""
+        """The newest body-state version among the stored samples; 0 if there are none."""
         return max((sample.body_version for sample in self.samples), default=0)
 
     def clear(self) -> None:
         """Forget all samples."""
         self.samples: list[Sample] = []  # the oldest first
-        self.known: list[Bools] = []  # the muscles that each says something about, (M,)
-        self.numbers: list[int] = []  # each one's place among all ever accepted, from 1
+        self.known: list[Bools] = []  # whether each sample describes each muscle, (M,)
+        self.numbers: list[int] = []  # position of each among all samples ever accepted, from 1
         self.accepted = 0
 
     def observations(self) -> Observations:
@@ -186,34 +209,35 @@ class SampleStore:
         theta, tension, length, direction = map(np.array, columns[:4])
         spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
-        # Without angles, wires that creep look like postures that drift.
+        # Without joint angles, creep cannot be distinguished from a drift of the postures.
         read = np.isfinite(theta).all(axis=1).mean()
         if self.accepted <= CREEPING * self.capacity or read < CREEPING:
             age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
     def _scaled(self, samples: Sequence[Sample]) -> Array:
-        """Return samples as points (N, D + 2 M), NaN where something does not count."""
+        """Return samples as points in units of the thresholds, (N, D + 2 M); NaN is ignored."""
         theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
         distances = self._settings.new_joint_distance, self._settings.new_tension_distance
-        joint, pull = (max(distance, LEAST_DISTANCE) for distance in distances)
+        joint, newton = (max(distance, LEAST_DISTANCE) for distance in distances)
         unread = np.isnan(theta).any(axis=1, keepdims=True)
-        # Of a posture that was not read the lengths tell whether it is another one.
-        told = np.where(unread, length / (MOMENT_ARM * joint), np.nan)
-        return np.concatenate([theta / (joint * self._radian), tension / pull, told], axis=1)
+        # Where the posture was not measured, compare the muscle lengths instead.
+        by_length = np.where(unread, length / (MOMENT_ARM * joint), np.nan)
+        by_angle, by_tension = theta / (joint * self._radian), tension / newton
+        return np.concatenate([by_angle, by_tension, by_length], axis=1)
 
     def _dispensable(self) -> int:
         points = np.nan_to_num(self._scaled(self.samples))
         square = np.sum(points**2, axis=1)
         distance = square[:, None] + square - 2.0 * points @ points.T
         distance[np.diag_indices_from(distance)] = np.inf
-        # A sample that says nothing about some muscle any more goes before one that does.
+        # Prefer to drop samples that no longer describe all muscles.
         lost = 1.0 - np.array(self.known).mean(axis=1)
         distance /= 1.0 + lost[:, None] + lost
         return int(min(np.unravel_index(np.argmin(distance), distance.shape)))
 
 
 def _filled(parts: Sequence[Array], nothing: float) -> Array:
-    """Return parts of equal size, or of none, as one array."""
+    """Stack arrays of equal size; empty ones are filled with `nothing`."""
     size = max(part.size for part in parts)
     return np.array([part if part.size else np.full(size, nothing) for part in parts])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The content of a state file: what the learner has learned, as MessagePack behind a checksum."""
+"""The content of a state file: samples and network as MessagePack after a checksum."""
 
 import zlib
 
@@ -13,15 +13,15 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-CHECKSUM = 4  # [bytes] at the start
+CHECKSUM = 4  # size of the checksum at the start [bytes]
 
 Values = tuple[float, ...]
 
 
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
-    """One `Sample`, its number among all ever accepted, and which muscles it describes.
+    """One `Sample` with its number and the muscles that it describes, as in `StoredSample`.
 
-    `isolated` are positions among the muscles of the saved state.
+    `isolated` are indices into the muscles of the saved state.
     """
 
     number: int
@@ -37,7 +37,7 @@ class SavedSample(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Samples, the oldest first, and the newest network, as a checkpoint."""
+    """The samples, oldest first, and the newest network as the content of a checkpoint."""
 
     joints: tuple[str, ...]
     muscles: tuple[str, ...]
@@ -46,7 +46,7 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
-    """Return what is to be saved."""
+    """Return the state to be saved."""
     stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
     saved = tuple(_saved(number, sample, known) for number, sample, known in stored)
     return SavedState(robot.joints, robot.muscles, saved, network)
@@ -77,23 +77,23 @@ def to_bytes(state: SavedState) -> bytes:
 
 
 def from_bytes(data: bytes, robot: Robot) -> SavedState:
-    """Return the state of a file's content.
+    """Decode and check the content of a state file.
 
     Raises:
-        StateError: If it is damaged, or does not fit the robot: the robot must have its joints, in
-            this order, and all of its muscles.
+        StateError: If the content is damaged or does not fit the robot. The robot must have the
+            same joints in the same order, and at least the muscles of the state.
     """
     checksum, content = data[:CHECKSUM], data[CHECKSUM:]
     if checksum != _checksum(content):
-        raise StateError('damaged, or no state of a learner')
+        raise StateError('the file is damaged or is not a learner state')
     try:
         state = msgspec.msgpack.decode(content, type=SavedState)
     except msgspec.MsgspecError as error:
-        raise StateError(f'no state of this version of the learner ({error})') from error
+        raise StateError(f'the state is not of this version of the learner ({error})') from error
     if state.joints != robot.joints or not set(state.muscles) <= set(robot.muscles):
         raise StateError(
-            f'of a robot with joints {", ".join(state.joints)} and muscles '
-            f'{", ".join(state.muscles)}; this one has {", ".join(robot.joints)} and '
+            f'the state is of a robot with joints {", ".join(state.joints)} and muscles '
+            f'{", ".join(state.muscles)}; this robot has {", ".join(robot.joints)} and '
             f'{", ".join(robot.muscles)}'
         )
     for sample in state.samples:
@@ -119,11 +119,11 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
 
 
 def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
-    """Add the saved samples to a store; they say nothing about muscles that the robot has more."""
+    """Add the saved samples to a store; they do not describe muscles added to the robot since."""
     places = list(robot.muscle_indices(state.muscles))
     for saved in state.samples:
         theta = np.array(saved.theta)
-        # What was not measured, of an added muscle, is as the geometric model has it.
+        # Fill in the unmeasured values of added muscles from the geometric model.
         tension = robot.tension.bias.copy()
         length = robot.muscle_lengths(np.nan_to_num(theta), tension)
         direction = np.zeros(robot.muscle_count)
@@ -144,13 +144,15 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     """Return the saved network, if there is one.
 
     Raises:
-        StateError: If the saved network lacks muscles of the robot, or is no valid checkpoint.
+        StateError: If the saved network lacks muscles of the robot or is not a valid checkpoint.
     """
     if added := [name for name in robot.muscles if name not in state.muscles]:
-        raise StateError(f'of the robot without {", ".join(added)}; only its samples are used')
+        raise StateError(
+            f'the saved network lacks {", ".join(added)}; only the saved samples are used'
+        )
     if state.network is None:
         return None
     try:
         return checkpoint.from_bytes(state.network, robot, 'the saved network')
     except CheckpointError as error:
-        raise StateError(f'{error}; only the samples are used') from error
+        raise StateError(f'{error}; only the saved samples are used') from error

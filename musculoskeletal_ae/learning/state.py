@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's state on disk, so that nothing learned is lost when it is killed at any moment.
+"""Saves the learner's state to disk, so that nothing is lost if the learner is killed.
 
     learner.state     the samples and the newest network
-    previous.state    the state before that, which is used if the newest cannot be
-    backup-N.state    states that were replaced by the user or could not be used
+    previous.state    the state before that, used if the newest one is unusable
+    backup-N.state    states that the user replaced or that were unusable
     lock              locked by the learner that uses the directory
 
-Each save replaces the whole file atomically; a checksum shows damage. Any of the states becomes
-the learner's again when it is copied to `learner.state` while no learner runs.
+Each save replaces the whole file atomically, and a checksum detects damage. To restore a state,
+copy its file to `learner.state` while no learner is running.
 """
 
 import fcntl
@@ -25,8 +25,10 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
-LARGEST = 1 << 26  # [bytes] of a state; a full one of the shipped arms has a hundredth
-#: between two checks that the files are still there, and between two attempts to save [s]
+LARGEST = (
+    1 << 26
+)  # largest size of a state [bytes]; those of the shipped arms are 100 times smaller
+#: time between checks that the files still exist, and between attempts to save [s]
 CHECK_INTERVAL, RETRY_INTERVAL = 0.5, 2.0
 
 
@@ -34,41 +36,43 @@ class StateStore:
     """Saves and loads the state of one learner in a directory.
 
     Attributes:
-        directory: Where it is.
-        not_used: What was found at the start and could not be used, and where it is now; or ''.
+        directory: The state directory.
+        not_used: Why a state on disk was unusable and where its backup is, or ''.
     """
 
     def __init__(self, directory: str | Path, robot: Robot) -> None:
-        """Open a directory, made if missing, for this learner alone.
+        """Open and lock a directory, and create it if it does not exist.
 
         Raises:
-            StateError: If it cannot be written, or another learner uses it.
+            StateError: If the directory cannot be written or another learner uses it.
         """
         name = f'state_directory {str(directory)!r}'
         try:
             self.directory = Path(directory).expanduser()
         except RuntimeError as error:
             raise StateError(
-                f"{name}: the home directory is not known; give a whole path, or ''"
+                f'{name}: the home directory is unknown; set an absolute path, '
+                "or '' to save nothing"
             ) from error
         self.not_used = ''
         self._robot = robot
         self._newest = self.directory / NEWEST
         self._previous = self.directory / PREVIOUS
         self._lock: TextIO | None = None
-        self._saved_samples: list[Sample] = []  # those that are on disk
-        self._is_saved = False  # whether `_newest` should be there
+        self._saved_samples: list[Sample] = []  # samples that are on disk
+        self._is_saved = False  # whether `_newest` should exist
         self._problem = ''  # why the last save failed
         self._next_attempt = 0.0
         try:
             self._open()
         except BlockingIOError as error:
             raise StateError(
-                f'{name} is used by another learner; give each its own, or stop the other'
+                f'{name} is in use by another learner; set another directory, or stop that learner'
             ) from error
-        except (OSError, ValueError) as error:  # a ValueError is a NUL in the path
+        except (OSError, ValueError) as error:  # a NUL in the path raises a ValueError
             raise StateError(
-                f"{name} cannot be written ({error}); give a directory that can, or ''"
+                f'{name} cannot be written ({error}); set a writable directory, '
+                "or '' to save nothing"
             ) from error
 
     def _open(self) -> None:
@@ -82,12 +86,12 @@ class StateStore:
                 raise BlockingIOError('another learner uses the directory') from error
             raise
         self._lock = lock
-        # A learner that was killed while it saved leaves its temporary file.
+        # Remove the temporary files of a learner that was killed while it saved.
         for unfinished in self.directory.glob('.*.state.*'):
             unfinished.unlink()
 
     def close(self) -> None:
-        """Release the directory; everything is on disk already."""
+        """Release the directory. No save is needed, because the newest state is on disk."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -95,20 +99,20 @@ class StateStore:
     # -- reading --------------------------------------------------------------------------------
 
     def load(self, samples: SampleStore) -> Mae | None:
-        """Fill an empty store with the saved samples; return the saved network, if there is one.
+        """Load the saved samples into an empty store; return the saved network, if there is one.
 
-        A state that cannot be used becomes a backup, and the one before it is used. Of the robot as
-        it was with fewer muscles the samples are used, which describe the others only.
+        An unusable state is renamed to a backup, and the previous state is used. If muscles were
+        added to the robot since, only the samples are used; they do not describe the added muscles.
 
         Raises:
-            StateError: If a state cannot become a backup.
+            StateError: If a state cannot be kept as a backup.
         """
         try:
             return self._load(samples)
         except OSError as error:
             raise StateError(
-                f'{self.directory}: a state that cannot be used cannot be kept as a backup '
-                f'({error}); make space there, or give another state_directory'
+                f'{self.directory}: an unusable state cannot be kept as a backup ({error}); '
+                'free disk space, or set another state_directory'
             ) from error
 
     def _load(self, samples: SampleStore) -> Mae | None:
@@ -116,7 +120,7 @@ class StateStore:
         if state is None:
             state = self._read(self._previous)
             if self.not_used:
-                used = 'learning starts anew' if state is None else 'the state before it is used'
+                used = 'learning starts again' if state is None else 'the previous state is used'
                 self.not_used += f'; {used}'
         if state is None:
             return None
@@ -130,7 +134,7 @@ class StateStore:
             return None
 
     def _read(self, file: Path) -> SavedState | None:
-        """Return the state of a file; make the file a backup if it cannot be used."""
+        """Return the state in a file; rename the file to a backup if it is unusable."""
         if not file.exists():
             return None
         try:
@@ -146,10 +150,10 @@ class StateStore:
     # -- writing --------------------------------------------------------------------------------
 
     def keep(self, samples: SampleStore, network: bytes | None, changed: bool = True) -> None:
-        """Save; what cannot be saved now (see `trouble`) is saved as soon as that succeeds.
+        """Save the state if it `changed`, and retry a failed save (see `trouble`).
 
-        Call it often: unless something `changed`, it only checks now and then that the files are
-        still there.
+        Call this method often. Without a change it only checks from time to time that the files
+        still exist.
         """
         now = time.monotonic()
         if now < self._next_attempt and (self._problem or not changed):
@@ -165,10 +169,10 @@ class StateStore:
             self._next_attempt = now + RETRY_INTERVAL
 
     def save(self, samples: SampleStore, network: bytes | None) -> None:
-        """Save at once.
+        """Save the state at once.
 
         Raises:
-            StateError: If that cannot be done.
+            StateError: If the state cannot be saved.
         """
         self._next_attempt = 0.0
         self.keep(samples, network)
@@ -176,44 +180,48 @@ class StateStore:
             raise StateError(trouble)
 
     def trouble(self, samples: SampleStore) -> str:
-        """Return why the newest state is not on disk, and how much that is; or ''."""
+        """Return why the newest state is not on disk and how many samples are missing, or ''."""
         if not self._problem:
             return ''
         on_disk = {id(sample) for sample in self._saved_samples}
         count = sum(id(sample) not in on_disk for sample in samples.samples)
         return (
-            f'samples and network cannot be saved ({self._problem}); samples that are not on disk '
-            f'yet: {count}; make space in {self.directory}, or make it writable, and all is saved'
+            f'samples and network cannot be saved ({self._problem}); samples not on disk yet: '
+            f'{count}; free disk space or make {self.directory} writable, then saving succeeds'
         )
 
     def back_up(self, samples: SampleStore, network: bytes | None, reason: str = '') -> None:
         """Save a state that is about to be replaced as a backup.
 
-        `reason` says why a network that was found is not used.
+        Args:
+            samples: The samples.
+            network: The network as the content of a checkpoint, if there is one.
+            reason: Why a saved network is not used, for `not_used`.
 
         Raises:
-            StateError: If that cannot be done.
+            StateError: If the backup cannot be made.
         """
         try:
             backup = self._write_backup(saved_state.collect(self._robot, samples, network))
         except OSError as error:
             raise StateError(
-                f'{self.directory}: no backup can be made ({error}); nothing was replaced. Make '
-                'space there and try again'
+                f'{self.directory}: no backup can be made ({error}); nothing was replaced. Free '
+                'disk space and try again'
             ) from error
         if reason:
             self._note_backup(reason, backup)
 
     def _check_in_place(self) -> None:
-        """Open the directory if need be; raise an OSError if it, or the state, was removed."""
+        """Open the directory if it is closed; raise an OSError if it or the state was removed."""
         if self._lock is None:
             self._open()
             return
         try:
-            there = os.path.samestat(os.fstat(self._lock.fileno()), (self.directory / LOCK).stat())
+            in_directory = (self.directory / LOCK).stat()
+            is_lock_there = os.path.samestat(os.fstat(self._lock.fileno()), in_directory)
         except FileNotFoundError:
-            there = False
-        if not there or (self._is_saved and not self._newest.exists()):
+            is_lock_there = False
+        if not is_lock_there or (self._is_saved and not self._newest.exists()):
             self.close()
             raise FileNotFoundError(f'{self._newest} was removed')
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic samples of a calibrated body: what the network is trained on beside real ones."""
+"""Synthetic training samples of the calibrated body, which complement the real samples."""
 
 from typing import NamedTuple
 
@@ -11,20 +11,22 @@ from musculoskeletal_ae.mae.default_training import highest_tensions
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
-#: share with most muscles near T_bias, as muscle stiffness control holds them
+#: share of samples with most muscles near T_bias, as under muscle stiffness control
 HELD_SHARE = 0.5
-# The arm reaches its limits, and friction or a push carries it a little beyond.
+# Postures extend slightly beyond the joint limits, because friction or contact can move the arm
+# there.
 MARGIN = 0.02
 
 
 class TrainingData(NamedTuple):
     """N samples in scaled units, shape (N, D+2M) each."""
 
-    entered: Array  # with scattered lengths
-    true: Array  # what the network is to restore
+    entered: Array  # network input, with noisy lengths
+    true: Array  # target output
 
 
-UNSURE = 0.25  # share of the friction that the direction of sliding, as lengths tell it, misses
+#: share of the friction that remains unknown although the direction of sliding is estimated
+UNSURE = 0.25
 
 
 def synthetic_samples(
@@ -33,20 +35,26 @@ def synthetic_samples(
     count: int,
     rng: np.random.Generator,
 ) -> TrainingData:
-    """Draw `count` samples of a body whose lengths scatter by `noise` [m] (M,) beside friction.
+    """Draw random samples of a body with length noise and residual friction.
 
-        (θ, T, l) = (θ_r, T_r, l(θ_r, T_r; s = 0)),   seen as (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
+        target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
 
-    T_r is at the elastic units. An estimator knows that but for the share u (UNSURE) of friction,
-    so that the network sees lengths with this and the sensors' scatter and is asked for those
-    without: ② then learns to weigh muscles by how far their lengths can be trusted, as weighted
-    least squares do.
+    T_r is the tension at the elastic elements. An estimator knows it except for the share u
+    (UNSURE) of the friction. The network's input contains this error and the noise ε, and its
+    target does not. ② therefore learns to weight muscles by the accuracy of their lengths, as in
+    weighted least squares.
+
+    Args:
+        body: The calibrated body.
+        noise: σ of ε for each muscle [m], (M,).
+        count: Number of samples.
+        rng: The random generator.
     """
     robot = body.robot
     shape = count, robot.muscle_count
     theta = robot.random_postures(count, rng, MARGIN)
     tension = held_tensions(robot, count, rng)
-    # Mostly at either end of [−1, 1], where sliding leaves it.
+    # Sliding leaves the direction near either end of [−1, 1] most of the time.
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     length, scattered = body.lengths(theta, tension, np.zeros(shape), UNSURE * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
@@ -55,7 +63,7 @@ def synthetic_samples(
 
 
 def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Draw T [N] (count, M): anywhere up to the highest, or mostly near T_bias."""
+    """Draw T [N] (count, M): uniform up to the highest tensions, or mostly near T_bias."""
     shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
     anywhere = rng.uniform(0.0, 1.0, shape) * highest
     lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)

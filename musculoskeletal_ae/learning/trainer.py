@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where updates are made: here (experiments, recordings) or in a process of their own (the node).
+"""Runs updates, either in the calling process or in a separate training process.
 
-A job goes in, an update comes out, and the caller looks now and then whether it has. What an update
-does is in `update`, which imports torch and is itself imported only where something trains.
+Experiments and recordings use the calling process, the node a separate one. The caller submits a
+job and polls for its update. The update itself is in `update`, which imports torch; it is imported
+only in processes that train.
 """
 
 from __future__ import annotations
@@ -41,41 +42,42 @@ if TYPE_CHECKING:
 
 
 class Job(NamedTuple):
-    """What an update may use."""
+    """Inputs of an update."""
 
-    observed: Observations  # the samples, the oldest first
-    healthy: Healthy  # what was seen of the healthy arm
-    statistics_hold: bool  # the statistics so far are of the arm as it is: no muscle has changed
-    steps: int  # of training
-    isolated: tuple[int, ...] = ()  # muscles that the messages say nothing about
+    observed: Observations  # the samples, oldest first
+    healthy: Healthy  # messages of the healthy arm
+    statistics_hold: bool  # whether the statistics so far are valid for the present arm
+    steps: int  # number of training steps
+    isolated: tuple[int, ...] = ()  # muscles that the messages do not describe
 
 
 class Update(NamedTuple):
-    """What came of it."""
+    """Result of an update."""
 
-    mae: Mae  # the network
-    loss: float  # of the training
-    noise: Array = np.empty(0)  # σ of each length that the body does not explain [m], (M,) or none
-    # The muscle, if any, whose newest samples contradict all older ones, with how many they are.
+    mae: Mae  # the trained network
+    loss: float  # training loss
+    noise: Array = np.empty(0)  # σ of each length that the body does not explain [m], (M,) or empty
+    #: a muscle whose newest samples contradict all older ones, and their number; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
-    contradicted: tuple[int, ...] = ()  # muscles that they contradict together: θ is wrong there
+    #: several muscles that the newest samples contradict at once, which indicates a wrong θ
+    contradicted: tuple[int, ...] = ()
     error: float = 0.0  # mean ‖θ_est − θ‖₂ over the newest samples before they were learned [rad]
-    seconds: float = 0.0  # how long it took
-    device: str = 'cpu'  # where it was trained
+    seconds: float = 0.0  # duration of the update [s]
+    device: str = 'cpu'  # device of the training
 
 
 class Trainer:
-    """Makes an update at once, where it is submitted; one job at a time."""
+    """Runs each update in the calling process when its job is submitted."""
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
-        """Learn as `preset` says; `seed` draws what is random."""
+        """Use the preset with this name; `seed` is the random seed."""
         self.robot, self.preset, self.seed = robot, preset_named(preset), seed
-        self.trouble = ''  # why there is no update
+        self.trouble = ''  # why no updates are made, or ''
         self._updater: Updater | None = None
         self._update: Update | None = None
 
     def begin(self, mae: Mae) -> None:
-        """Go on from a network; what was submitted before is forgotten."""
+        """Continue from a network and discard any earlier job."""
         self._updater = self.preset.make_updater(self.robot, mae, self.seed)
         self._update = None
 
@@ -86,50 +88,51 @@ class Trainer:
 
     @property
     def body(self) -> CalibratedBody | None:
-        """The calibrated body as it was fitted last; None where none is, or it is elsewhere."""
+        """The most recently fitted body; None without one, or if another process has it."""
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
-        """Take a job."""
+        """Start a job."""
         assert self._updater is not None
         self._update = self._updater.update(job)
 
     def poll(self) -> Update | None:
-        """Return what came of the job, if that is known by now."""
+        """Return the update if it is complete, else None."""
         update, self._update = self._update, None
         return update
 
     def values(self) -> dict[str, str]:
-        """Return what people want to know, for /diagnostics."""
+        """Return values for /diagnostics."""
         return {}
 
     def close(self) -> None:
-        """End it."""
+        """Discard the updater and its job."""
         self._updater = self._update = None
 
 
-# -- a process of its own -------------------------------------------------------------------------
+# -- separate training process --------------------------------------------------------------------
 
-NICENESS = 5  # beside that of the node
-#: until a training process that was lost is started again [s], doubled each time up to the longest
+NICENESS = 5  # added to the niceness of the node
+#: pause before a lost training process is restarted [s]; it doubles up to the longest one
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
-#: until a process that has not answered is taken to hang [s], and what each step of training adds;
-#: the first answer waits for imports, which take minutes on a slow disk
+#: Time after which a process that has not answered counts as hung [s], plus a time for each
+#: training step. The first answer takes longer: imports can take minutes on a slow disk.
 PATIENCE_AT_FIRST, PATIENCE, PATIENCE_PER_STEP = 300.0, 60.0, 0.1
-ENDING = 2.0  # [s] that the operating system has to end a process
+ENDING = 2.0  # longest wait for a killed process to end [s]
 
 
 class TrainerProcess(Trainer):
-    """Makes updates in another process, and in the next one if that dies or hangs.
+    """Runs updates in a separate process, which is restarted if it dies or hangs.
 
-    No call waits for the process: a thread does. A job that was lost with one is given to the next.
+    A thread communicates with the process, so that no call blocks. A restarted process repeats the
+    job that was lost.
     """
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0, device: str = 'cpu') -> None:
-        """Learn on one of `parameters.DEVICES`, or on the CPU where there is no such."""
+        """Train on one of `parameters.DEVICES`, or on the CPU if that device is not available."""
         super().__init__(robot, preset, seed)
         self._device = device
-        self.restarts = 0  # how often a process was lost
+        self.restarts = 0  # number of processes lost
         self._mae: Mae | None = None
         self._job: Job | None = None
         self._process: SpawnProcess | None = None
@@ -137,7 +140,7 @@ class TrainerProcess(Trainer):
         self._restart_at = self._deadline = math.inf
 
     def begin(self, mae: Mae) -> None:
-        """Start a process with a network, in the place of the one before."""
+        """Replace the process by a new one that continues from a network."""
         self.close()
         self._mae = mae
         self._start()
@@ -155,7 +158,7 @@ class TrainerProcess(Trainer):
             with theirs, _interrupts_blocked():
                 process.start()
         except OSError as error:
-            self._lost(f'cannot be started ({error})')
+            self._schedule_restart(f'cannot be started ({error})')
             return
         self._process, self._restart_at = process, math.inf
         talk = ours, process, self._mae, self.robot, self._jobs, self._answers
@@ -166,22 +169,22 @@ class TrainerProcess(Trainer):
 
     @property
     def pid(self) -> int | None:
-        """Id of the process; None while there is none."""
+        """Process id; None while there is no process."""
         return None if self._process is None else self._process.pid
 
     @property
     def ready(self) -> bool:
-        """Whether there is a process, and it is idle."""
+        """Whether a process is running and idle."""
         return self._process is not None and self._job is None
 
     def submit(self, job: Job) -> None:
-        """Hand over a job."""
+        """Send a job to the process."""
         self._job = job
         self._deadline = time.monotonic() + self._patience + PATIENCE_PER_STEP * job.steps
         self._jobs.put(job)
 
     def poll(self) -> Update | None:
-        """Return the update, if it has come; start a process that was lost again."""
+        """Return the update if it has arrived, else None; restart a lost process when due."""
         now = time.monotonic()
         if now >= self._restart_at:
             self._start()
@@ -191,24 +194,24 @@ class TrainerProcess(Trainer):
             answer = self._answers.get_nowait()
         except queue.Empty:
             if now > self._deadline:
-                self._lost('did not answer in time')
+                self._schedule_restart('did not answer in time')
             return None
         if isinstance(answer, str):
-            self._lost(f'died ({answer})')
+            self._schedule_restart(f'died ({answer})')
             return None
         self.trouble, self._pause, self._patience = '', FIRST_PAUSE, PATIENCE
         self._mae, self._job = answer.mae, None
         return answer
 
-    def _lost(self, why: str) -> None:
+    def _schedule_restart(self, problem: str) -> None:
         self._end()
         self.restarts += 1
-        self.trouble = f'the training process {why}; starting it again'
+        self.trouble = f'the training process {problem}; restarting it'
         self._restart_at = time.monotonic() + self._pause
         self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
 
     def _end(self) -> None:
-        # By force, whatever it is doing: it keeps nothing that is not known here.
+        # Kill it at once: the process has no state that this object lacks.
         if self._process is not None:
             self._process.kill()
             self._process.join(ENDING)
@@ -217,20 +220,23 @@ class TrainerProcess(Trainer):
             self._process = None
 
     def values(self) -> dict[str, str]:
-        """Return restarts and process id."""
+        """Return number of restarts and process id."""
         values = {'training process restarts': str(self.restarts)}
         return values if self.pid is None else {**values, 'training process': str(self.pid)}
 
     def close(self) -> None:
-        """End the process, and forget the job."""
+        """End the process and discard the job."""
         self._end()
         self._job, self._restart_at = None, math.inf
 
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Let a child be born deaf to Ctrl-C, which goes to the whole group; the node ends it."""
-    # It is started with the first child, and unblocks the signal afterwards.
+    """Start child processes with SIGINT blocked.
+
+    Ctrl-C sends SIGINT to the whole process group, but only the node may end the child.
+    """
+    # Start the resource tracker now. If it started with the first child, it would unblock SIGINT.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -247,7 +253,7 @@ def _talk(
     jobs: queue.SimpleQueue[Job | None],
     answers: queue.SimpleQueue[Update | str],
 ) -> None:
-    """Give a process its network and its jobs; answer with updates, or with why there are none."""
+    """Send network and jobs to a process, and put its updates or an error text into `answers`."""
     with connection:
         try:
             connection.send(checkpoint.to_bytes(mae))
@@ -258,13 +264,14 @@ def _talk(
         except (EOFError, OSError):
             process.join(ENDING)
             answers.put(f'status {process.exitcode}')
-        # Whatever it is, as a torn pickle or no memory: it would be waited for else.
+        # Report every error, such as a truncated pickle or a lack of memory; otherwise the node
+        # would wait until the deadline.
         except Exception as error:  # noqa: BLE001
             answers.put(f'{type(error).__name__}: {error}')
 
 
 def serve(connection: Connection, directory: Path, preset: str, seed: int, device: str) -> None:
-    """Be the training process: answer until the other end closes, however the node ended."""
+    """Run the training process until the node closes its end of the connection or dies."""
     faulthandler.enable()
     os.nice(NICENESS)
     import torch
@@ -284,7 +291,7 @@ def serve(connection: Connection, directory: Path, preset: str, seed: int, devic
             trainer.submit(connection.recv())
             update = trainer.poll()
             assert update is not None
-            # A checkpoint, so that it is checked where it arrives.
+            # Send the network as a checkpoint, which the receiver validates.
             connection.send((checkpoint.to_bytes(update.mae), *update[1:]))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass

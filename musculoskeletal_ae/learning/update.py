@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An update of preset `default`: it finds out the body, then lets the network learn that.
+"""An update of preset `default`: fits the calibrated body, then trains the network on it.
 
-1. Fit the calibrated body to the samples (`body`), and move the network by what lengths changed by
-   everywhere: zeros, and wires that creep, need no training, and no average of weights lags behind.
-2. Draw synthetic samples of it, and put real ones in the place of some: rests, and messages of the
-   moving arm, of which there are many more and which say what rests do not (how wires slide, what
-   the body cannot say).
-3. Train the network on them for a bounded number of steps.
-4. Take the residuals' statistics of healthy messages (`calibration`).
+1. Fit the calibrated body to the samples (`body`). Shift the network's lengths by the mean change
+   of each muscle's length, so that length offsets and creep need no training.
+2. Draw synthetic samples of the body, and replace some of them by real ones: rest samples and
+   motion samples. There are many more motion samples, and they contain what rest samples and the
+   body model lack, such as tendon sliding.
+3. Train the network on these samples for a bounded number of steps.
+4. Compute the statistics of the residuals on healthy messages (`calibration`).
 
-The body needs few samples because the geometric model and its tolerances are known; the network
-needs many, and gets them from the body.
+The body needs few samples, because the geometric model and its tolerances are known. The network
+needs many, which the body provides.
 """
 
 from __future__ import annotations
@@ -39,27 +39,28 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.robot.robot import Robot
 
+#: share of the training samples that rest samples replace
 REAL_SHARE = 0.1
-#: share of synthetic samples that many messages of the moving arm take the place of; half of that,
-#: when there are `MANY`
+#: share of the training samples that motion samples replace if there are many; half of it if there
+#: are `MANY`
 MOVING_SHARE = 0.3
-#: how often a synthetic sample is used before it is forgotten
+#: mean number of times that a training sample is used
 USES = 3
-#: a real sample that fits the body worse than this weight is not shown to the network
+#: smallest robust weight with which a rest sample is used for training
 TRUSTED = 0.3
 
 
 def learned_steps(mae: Mae) -> int:
-    """Return how many steps of preset `default` a network has learned on a real arm, or 0."""
-    said = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
-    return int(said[1]) if said else 0
+    """Return the number of online training steps of preset `default` in a network's history."""
+    match = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
+    return int(match[1]) if match else 0
 
 
 class BodyUpdater(Updater):
-    """Learns by the calibrated body."""
+    """Updates the network by way of the calibrated body."""
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
-        """Go on from a network, and from the body that it knows if it has learned one."""
+        """Continue from a network, and from a body fitted to it if it has learned a real arm."""
         super().__init__(robot, mae, seed)
         steps = learned_steps(mae)
         self.body_fit = BodyFit(robot, mae if steps else None, seed)
@@ -69,7 +70,7 @@ class BodyUpdater(Updater):
 
     @property
     def body(self) -> CalibratedBody:
-        """The body as it was fitted last."""
+        """The most recently fitted body."""
         return self.body_fit.body
 
     def _learn(self, job: Job) -> Update:
@@ -82,8 +83,8 @@ class BodyUpdater(Updater):
         job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
         self._trainer.move(self.body_fit.lengthened())
         contradicted = contradicted_muscles(observed, fit)
-        # Several at once are no replaced muscles but a joint sensor that slipped or a touched arm:
-        # the robust weights leave such samples out until they are the rule.
+        # Several contradicted muscles indicate a slipped joint sensor or contact, not replaced
+        # muscles. The robust weights exclude such samples until they are the majority.
         alone = len(contradicted) == 1
         if self._statistics_held and not job.statistics_hold:
             self._trainer.restart()
@@ -103,26 +104,26 @@ class BodyUpdater(Updater):
         )
 
     def _at_angles(self, read: Observations | None) -> Observations | None:
-        """Return messages with θ less what the joint sensors' zeros were found to be."""
+        """Return messages with θ corrected for the estimated joint-sensor offsets."""
         return read and replace(read, theta=read.theta - self.body.zero)
 
     def _mix_in_real(self, data: TrainingData, observed: Observations, fit: Fit) -> None:
-        """Put real samples in the place of some."""
+        """Replace some training samples by rest samples that fit the body."""
         trusted = np.flatnonzero((fit.weight > TRUSTED).all(axis=1))
         self._put(data, observed[trusted], slice(int(REAL_SHARE * len(data.entered))))
 
     def _mix_in_moving(self, data: TrainingData, observed: Observations, noise: Array) -> None:
-        """Put messages in the place of some, but none that contradict the body."""
+        """Replace some training samples by motion samples that do not contradict the body."""
         (length,) = self.body.lengths(observed.theta, observed.tension, observed.direction)
-        off = np.abs(observed.length + self.body.crept(observed.age) - length)
-        sound = np.flatnonzero((off <= np.maximum(OUTLIER * noise, LEAST_CHANGE)).all(axis=1))
+        error = np.abs(observed.length + self.body.crept(observed.age) - length)
+        sound = np.flatnonzero((error <= np.maximum(OUTLIER * noise, LEAST_CHANGE)).all(axis=1))
         share = MOVING_SHARE * len(sound) / (len(sound) + MANY)
         self._put(
             data, observed[sound], slice(len(data.entered) - int(share * len(data.entered)), None)
         )
 
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
-        """Put some of what was measured there, with T as the elastic units have it."""
+        """Replace the training samples at `places` by random real ones, with bone-side tension."""
         if len(real) == 0:
             return
         real = real[self._rng.integers(len(real), size=len(data.entered[places]))]

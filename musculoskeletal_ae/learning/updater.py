@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all ways of learning online have in common: samples go in, a network comes out.
+"""Base class of all online learning methods: an updater turns samples into a network.
 
-An updater keeps its network and optimiser from update to update. `update.py` is the way of preset
-`default`; presets/ lists the others.
+An updater keeps its network and optimiser between updates. `update.py` implements preset
+`default`; the folder presets/ contains the others.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: between how the network was made and what it learned since, in `Mae.training`
+#: separates initial training and online learning in `Mae.training`
 LEARNED = '; learned online: '
-NEWEST = 20  # samples that tell how good the estimates are
+NEWEST = 20  # number of newest samples over which the estimation error is computed
 
 
 class Updater(ABC):
-    """A way of learning online; keeps network and optimiser from update to update."""
+    """Base class of an online learning method, which keeps its network between updates."""
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
-        """Go on from a network; `seed` draws what is random."""
+        """Continue from a network; `seed` is the random seed."""
         self._robot, self._origin, self._mae, self._seed = robot, mae, mae, seed
 
     @property
     def body(self) -> CalibratedBody | None:
-        """The body as it was fitted last; None where none is."""
+        """The most recently fitted body; None if the method fits none."""
         return None
 
     def update(self, job: Job) -> Update:
-        """Learn a little; bounded time for a bounded store."""
-        begun, newest = time.perf_counter(), job.observed[-NEWEST:]
+        """Run one update. Its duration is bounded, because the store is bounded."""
+        start, newest = time.perf_counter(), job.observed[-NEWEST:]
         mae = self._mae.without(job.isolated)
         estimate = observed_theta(mae, newest)
         observed = np.isfinite(newest.theta)
-        away = np.where(observed, estimate - newest.theta, 0.0)[observed.any(axis=1)]
-        error = float(np.linalg.norm(away, axis=1).mean()) if len(away) else math.nan
+        errors = np.where(observed, estimate - newest.theta, 0.0)[observed.any(axis=1)]
+        error = float(np.linalg.norm(errors, axis=1).mean()) if len(errors) else math.nan
         update = self._learn(job)
-        seconds, device = time.perf_counter() - begun, str(torch.get_default_device())
+        seconds, device = time.perf_counter() - start, str(torch.get_default_device())
         return update._replace(error=error, seconds=seconds, device=device)
 
     @abstractmethod
@@ -60,7 +60,7 @@ class Updater(ABC):
     def _published(
         self, network: Network, preset: str, steps: int, job: Job, fit: Fit | None = None
     ) -> Mae:
-        """Return the network that runs, with its statistics, and with what it has learned."""
+        """Return the trained network as an `Mae` with its statistics and its training history."""
         origin, samples = self._origin, len(job.observed)
         history = (
             f'{origin.training.split(LEARNED)[0]}{LEARNED}'

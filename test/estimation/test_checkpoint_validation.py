@@ -167,7 +167,7 @@ def test_the_learner_publishes_no_refused_network_and_rolls_back_on_an_anomaly(t
     learner.trainer.answer = ATTACKS['weights × 1.5'](trained['default'])
     assert learner.poll(10.0) is None
     assert learner.keeper.rejected == 1
-    assert 'limit' in learner.report().values['last refused']
+    assert 'limit' in learner.report().values['last rejected network']
     assert learner.checkpoint == good
     learner.trainer.answer = trained['paper']
     assert learner.poll(20.0) is not None

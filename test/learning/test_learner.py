@@ -219,7 +219,7 @@ def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage)
     arm = Arm(learner, stage)
     arm.rest(2.0 * MARGIN)
     assert len(learner.samples) == 0
-    assert 'length zeros' in learner.report().message
+    assert 'length calibration' in learner.report().message
     learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
     arm.rest(3.0 * MARGIN)  # they are compared with the messages first
     assert [sample.body_version for sample in learner.samples.samples] == [learner.body.version]
@@ -405,10 +405,10 @@ NAN = np.nan
 @pytest.mark.parametrize(
     ('angles', 'shift', 'obstacle'),
     [
-        ([NAN, NAN], 0.0, 'no usable joint angle'),
+        ([NAN, NAN], 0.0, 'without usable joint angles'),
         ([9.0, 0.0], 0.0, 'joint limits'),
         ([0.1, 0.2], 5.0, 'muscle_states are rejected'),
-        (None, 0.0, 'no usable joint angle'),
+        (None, 0.0, 'without usable joint angles'),
         ([0.1, NAN], 0.0, ''),  # the other joint is learned from
     ],
 )
@@ -423,7 +423,7 @@ def test_a_learner_that_gets_nothing_to_learn_from_warns_and_names_why(
     report = learner.report()
     assert report.level == ('warn' if obstacle else 'ok')
     assert obstacle in report.message
-    assert ('nothing to learn from for' in report.message) == bool(obstacle)
+    assert ('no usable data for' in report.message) == bool(obstacle)
 
 
 def test_messages_after_the_last_poll_are_no_silence(learner, stage):
@@ -439,6 +439,6 @@ def test_silence_is_reported_as_nothing_to_learn_from(learner):
     learner.poll(100.0)
     assert learner.report().level == 'ok'
     learner.poll(120.0)
-    assert learner.report().message == 'nothing to learn from for 20 s: no muscle_states come'
+    assert learner.report().message == 'no usable data for 20 s: no muscle_states are received'
     learner.poll(3.0)  # the clock was set back
     assert learner.report().level == 'ok'

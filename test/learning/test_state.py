@@ -201,7 +201,7 @@ def test_where_no_state_can_be_used_learning_starts_anew_and_says_so(
         damage(tmp_path / name)
     with closing(Learner(arm26, initial, trainer=Prepared, directory=tmp_path)) as learner:
         message = learner.report().values['saved state not used']
-        assert 'starts anew' in message
+        assert 'learning starts again' in message
         assert 'backup-1.state' in message and 'backup-2.state' in message
         assert len(learner.samples) == 0
         accept(learner, stage, 2)
@@ -275,7 +275,9 @@ def test_a_directory_serves_one_learner_at_a_time(tmp_path, arm26):
 @pytest.mark.parametrize('place', ['file/state', 'nul\0'])
 def test_a_directory_that_cannot_be_made_is_named_with_what_to_give(tmp_path, arm26, place):
     (tmp_path / 'file').write_text('x')
-    with pytest.raises(StateError, match=r'state_directory.*cannot be written.*give a directory'):
+    with pytest.raises(
+        StateError, match=r'state_directory.*cannot be written.*set a writable directory'
+    ):
         StateStore(tmp_path / place, arm26)
 
 
@@ -307,7 +309,7 @@ def test_what_came_while_the_disk_was_full_is_counted_and_saved_when_it_is_not(b
         while not learner.updates:
             learner.poll(0.0)
         assert learner.report().level == 'error'
-        assert 'samples that are not on disk yet: 4;' in learner.report().message
+        assert 'samples not on disk yet: 4;' in learner.report().message
         with pytest.raises(StateError, match='not on disk yet: 4;'):
             learner.save()
     learner.poll(0.1)

@@ -61,7 +61,7 @@ def test_false_zeros_are_not_believed_and_cost_nothing(learner, arm, false):
     assert len(learner.samples) == 2
     report = learner.report()
     assert report.level == 'error'
-    assert 'length zeros do not agree' in report.message
+    assert 'length offsets disagree' in report.message
     assert 'estimator/zero' in report.message
     use(learner, np.zeros(6), known=False)
     use(learner, np.full(6, 0.001))  # as estimator/zero finds them
@@ -103,7 +103,7 @@ def test_they_are_dropped_if_other_zeros_are_found(learner, arm):
     arm.off = OFF
     use(learner, OFF)
     arm.rest(POSTURE)
-    assert learner.report().values['samples dropped with wrong length zeros'] == str(held)
+    assert learner.report().values['samples dropped with wrong length offsets'] == str(held)
     assert learner.samples.accepted >= numbers
     for number in learner.samples.numbers:
         assert number == 1 or number > numbers
