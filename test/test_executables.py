@@ -94,7 +94,8 @@ def test_a_signal_ends_a_tool_without_a_traceback(name, number, tmp_path):
     done = signalled(name, number, MOMENTS[number == signal.SIGTERM], *arguments)
     output = done.stdout + done.stderr
     assert not any(word in output for word in ('Traceback', 'Exception ignored')), output
-    assert done.returncode in (0, 130), output  # some are done before
+    # Some are done before, and some have nothing to do.
+    assert done.returncode in (0, 1, 130), output
 
 
 @pytest.mark.parametrize('arguments', [['-p', 'robot:=arm26'], ['robot:=arm26']])

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 'musculoskeletal_ae'
 ROS = re.compile(r'(rclpy|rcl_interfaces|\w+_msgs|\w+_srvs|builtin_interfaces)(\.|$)')
-DOCUMENT = re.compile(r'\b(?:doc|config|bags|bench|notes)/[\w./-]+\.\w+')
+DOCUMENT = re.compile(r'(?<![\w/])(?:doc|config|bags|bench|notes)/[\w./-]+\.\w+')
 
 
 def sources(*folders: Path) -> list[Path]:

@@ -56,7 +56,7 @@ ARM_TOPICS = {
 SET, GET = 'hardware_emulator/set_parameters', 'hardware_emulator/get_parameters'
 DO = (
     'controller/stop', 'controller/reset', 'estimator/reset', 'estimator/restore',
-    'replay/pause', 'replay/resume',
+    'estimator/zero', 'replay/pause', 'replay/resume',
 )  # fmt: skip
 SERVICES = {'controller/explore': SetBool, **dict.fromkeys(DO, Trigger), GET: GetParameters}
 SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}

@@ -36,12 +36,14 @@ CAMERA_FOV = 0.8  # [rad] of the picture's height
 VISIBLE = math.atan(0.7 * math.tan(0.5 * CAMERA_FOV))
 VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
 EXPLORE, RESET, RESTORE, MEND = 'Explore', 'Reset after a stop', 'Restore isolated muscles', 'Mend'
+CALIBRATE = 'Find the length offsets'
 #: what the remedies of stops say, and the button that does it; longer phrases first
 BUTTONS = {
     'call estimator/reset; call controller/reset': RESET,
     'call estimator/reset': RESET,
     'call controller/reset': RESET,
     'call estimator/restore': RESTORE,
+    'call estimator/zero': CALIBRATE,
     'controller/explore explores again': EXPLORE,
 }
 PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
@@ -287,6 +289,7 @@ class Page:
             button('Stop', 'controller/stop', color='red')
             button(EXPLORE, 'controller/explore')
             button(RESET, 'reset')
+            button(CALIBRATE, 'estimator/zero')
             self._restore = gui.add_button(RESTORE, visible=False)
             heed(self._restore.on_click, 'estimator/restore')
             gizmo = gui.add_checkbox('move the hand with the mouse', False)

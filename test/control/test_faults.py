@@ -2,6 +2,7 @@
 """Emulator, estimator and controller stepped together: what each fault of the arm may do."""
 
 import copy
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,18 +55,26 @@ class Loop:
                 self.pulls.append(self.arm.tension)
 
     def read(self, reading):
-        try:
-            data = np.concatenate(reading[1:])
-            message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
+        data = np.concatenate(reading[1:])
+        message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
+        with suppress(MessageError):
             states = read_muscle_states(message, ROBOT.muscle_count)
-            self.controller.muscles(states, self.now)
-            estimate = self.estimator.step(states, self.now, self.now)
-            if estimate is not None:
-                self.controller.estimated(estimate.state.theta, self.now)
-                if estimate.detected:
-                    self.controller.anomaly(True)
-        except MessageError:
-            pass
+            self.estimator.joints(reading.theta, self.now)
+            # Each node reads the message by itself.
+            for take in (self.control, self.estimate):
+                with suppress(MessageError):
+                    take(states)
+
+    def control(self, states):
+        self.controller.muscles(states, self.now)
+
+    def estimate(self, states):
+        estimate = self.estimator.step(states, self.now, self.now)
+        self.controller.use_body(self.estimator.body)
+        if estimate is not None:
+            self.controller.estimated(estimate.state.theta, self.now)
+            if estimate.detected:
+                self.controller.anomaly(True)
 
     def mend(self):
         """Do what a person does then."""
@@ -73,6 +82,7 @@ class Loop:
         self.arm.reset(self.arm.theta)
         self.run(3.0)
         self.estimator.reset()
+        self.controller.use_body(self.estimator.body)
         self.controller.anomaly(False)
         refused = self.controller.reset(self.now)
         self.run(6.0)

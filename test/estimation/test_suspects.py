@@ -23,7 +23,7 @@ def suspects(robot):
     [
         (Kind.SLACK_TENDON, 'stop', True, (), False),
         (Kind.SLACK_TENDON, 'isolate', True, (2,), True),
-        (Kind.LENGTH_JUMP, 'stop', False, (), False),
+        (Kind.LENGTH_JUMP, 'stop', True, (), False),
         (Kind.LENGTH_JUMP, 'isolate', True, (2,), True),
         (Kind.VALUES_MISSING, 'stop', False, (), False),
         (Kind.VALUES_MISSING, 'isolate', False, (2,), False),

@@ -133,7 +133,7 @@ def test_a_jump_in_a_pause_of_the_messages_is_told_from_one_that_was_seen():
 def test_an_isolated_muscle_is_no_longer_displaced():
     stream = MuscleStream(ROBOT)
     jump_together(stream)
-    stream.use_body(HEALTHY.with_isolated([1]))
+    stream.use_body(stream.body.with_isolated([1]))
     assert stream.displaced == {0, 2}
 
 
