@@ -35,7 +35,7 @@ from tqdm import tqdm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.effects import Effects
 from musculoskeletal_ae.emulator.foreign import ForeignArm
-from musculoskeletal_ae.emulator.wires import spooled
+from musculoskeletal_ae.emulator.tendons import spooled
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.body_change import SWEEP
 from musculoskeletal_ae.experiments.least_squares import nominal
@@ -102,7 +102,7 @@ def true_lengths(arm: ForeignArm, theta: Array) -> Array:
     body = arm.individual
     lengths = body.absolute_lengths(theta) - body.length_at_zero
     return np.array(
-        [[spooled(arm.wires, m, each) for m, each in enumerate(row)] for row in lengths]
+        [[spooled(arm.tendons, m, each) for m, each in enumerate(row)] for row in lengths]
     )
 
 

@@ -55,7 +55,7 @@ def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
 def test_the_foreign_emulator_shares_no_code_with_the_first_one_or_the_learner() -> None:
     first = r'emulator\.(arm|individual|wrapping)'
     model = r'(learning|estimation|mae)\b|robot\.(routes|series_elastic|wrapping)'
-    for name in ('effects', 'foreign', 'mjcf', 'wires'):
+    for name in ('effects', 'foreign', 'mjcf', 'tendons'):
         file = PACKAGE / 'emulator' / f'{name}.py'
         pattern = rf'musculoskeletal_ae\.({first}|{model})'
         assert not [n for n in imported(file) if re.match(pattern, n)], file

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm that plays reality: body, dynamics, muscle modules, heat, faults."""
+"""The emulated arm: body, dynamics, muscle modules, heat and faults."""

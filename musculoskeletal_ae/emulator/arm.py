@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first body: rigid bodies by pinocchio, muscles and friction compiled by numba.
+"""Emulator model `kin`: rigid bodies by pinocchio, muscles and friction compiled by numba.
 
-Each muscle is a massless wire between a motor and an elastic unit at its far end:
+Each muscle is a massless tendon between a muscle module and a series elastic element at its far
+end:
 
-    far end    L_e(l_abs, T_end) = f(θ) − l           elastic unit and wire, what pulls the bones
-    friction   T = T_end exp(μ s),  |s| ≤ 1           s follows the wire's sliding (Dahl)
+    bone side  L_e(l_abs, T_end) = f(θ) − l     elongation of element and tendon
+    friction   T = T_end exp(μ s),  |s| ≤ 1     s follows the sliding of the tendon (Dahl)
 
-Joint friction is Dahl's as well, so that the arm rests where it rubs, without creeping.
+Joint friction also follows Dahl's model, so that friction holds the resting arm without creep.
 """
 
 import math
@@ -26,40 +27,40 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
-SLIDING_DISTANCE = 0.0005  # [m] of sliding over which cable friction builds up
+SLIDING_DISTANCE = 0.0005  # [m] of sliding over which tendon friction builds up
 # Joints.
 ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
-STICKING_ANGLE = 0.003  # [rad] of turning over which joint friction builds up; of a pinion
+STICKING_ANGLE = 0.003  # [rad] over which joint friction builds up (of the pinion if prismatic)
 VISCOUS = 0.5  # [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
-STOP_LOAD = 40.0  # [N·m] of weight and muscles at T_bias; stops of a joint with more are firmer
+STOP_LOAD = 40.0  # [N·m] load by weight and muscles at T_bias above which stops are stiffer
 
 
-#: Constants of one individual, as the compiled step wants them: elastic units, wires and sensors of
-#: M muscles; friction and stops of the J−1 joints of the tree, where gear and firmness are what
-#: viscous friction and stops are multiplied by; joint of the end effector and place in it [m].
+#: Constants of one individual for the compiled step: series elastic elements, tendons and sensors
+#: of M muscles; friction and stops of the J−1 joints of the tree; joint of the end effector, and
+#: its position in that joint's frame [m]. `gear` multiplies viscous friction, `firmness` the stops.
 Body = namedtuple(
     'Body',
-    'force rate wire_stretch length_at_zero cable_friction sensor_gain sensor_offset '
+    'force rate wire_stretch length_at_zero tendon_friction sensor_gain sensor_offset '
     'joint_friction lower upper gear firmness effector_joint effector',
 )
-#: q, q̇, friction state in [−1, 1], and generalised torque, each (J−1,), of the tree.
+#: q, q̇, friction state in [−1, 1] and generalised torque of the tree, each (J−1,).
 JointState = namedtuple('JointState', 'q velocity sticking torque')
-#: All that a step reads and writes; `wrench` is the force and torque on the end effector, axes of
-#: the root link, (6,).
+#: Everything that a step reads and writes. `wrench` is the force and torque on the end effector in
+#: the axes of the root link, (6,).
 Parts = namedtuple('Parts', 'routes placed body constants muscle joint command wrench')
 
 
 @njit(cache=True)
 def tension_from_elongation(elongation: float, force: float, rate: float, stretch: float) -> float:
-    """Return T with ln(1 + T/force)/rate + stretch·T = elongation; 0 for a slack wire.
+    """Solve ln(1 + T/force)/rate + stretch·T = elongation for T; return 0 for a slack tendon.
 
-    Newton in u = ln(1 + T/force), where the equation is convex and u = rate·elongation lies
-    beyond the root, so that it converges from there without overshooting.
+    Newton's method in u = ln(1 + T/force). The equation is convex in u, and the start u =
+    rate·elongation lies beyond the root. The iteration therefore converges without overshooting.
     """
     if elongation <= 0.0:
         return 0.0
-    # A cut-off far beyond any tension of a module keeps exp() finite.
+    # This limit, far beyond any tension of a module, keeps exp() finite.
     u = min(rate * elongation, 6.0)
     for _ in range(20):
         grown = math.exp(u)
@@ -73,28 +74,28 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 
 @njit(cache=True)
-def handed(parts: Parts) -> Handle:
-    """Return what a step takes."""
+def make_handle(parts: Parts) -> Handle:
+    """Return a handle to the parts, the argument of a compiled step."""
     return Handle(parts)
 
 
 @njit(cache=True)
 def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
-    """Move joints and motors of `Parts` by one STEP; leave the generalised torque in joint.torque.
+    """Advance joints and motors of `Parts` by one STEP; write generalised torques to joint.torque.
 
-    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION; `acceleration` q̈ from the rigid-body dynamics,
-    (J−1,).
+    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION. `acceleration` is q̈ of the rigid-body
+    dynamics, (J−1,).
     """
     routes, placed, body, constants, muscle, joint, command, wrench = arm.held
     for i in range(joint.q.shape[0]):
         joint.velocity[i] += STEP * acceleration[i]
         joint.q[i] += STEP * joint.velocity[i]
     wrapping.place(routes, joint.q, placed)
-    _wires_and_modules(body, constants, muscle, kind, command, placed.absolute)
+    _step_muscles(body, constants, muscle, kind, command, placed.absolute)
     joint.torque[:] = 0.0
     for i in range(joint.q.shape[0]):
         turned = STEP * joint.velocity[i] * math.sqrt(body.gear[i])
-        joint.sticking[i] = modules.rubbed(joint.sticking[i], turned, STICKING_ANGLE)
+        joint.sticking[i] = modules.friction_state(joint.sticking[i], turned, STICKING_ANGLE)
         joint.torque[i] -= body.joint_friction[i] * joint.sticking[i]
         joint.torque[i] -= body.gear[i] * (VISCOUS * joint.velocity[i])
         beyond = max(0.0, joint.q[i] - body.upper[i]) + min(0.0, joint.q[i] - body.lower[i])
@@ -102,7 +103,8 @@ def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
             stop = STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
             joint.torque[i] -= body.firmness[i] * stop
     for s in range(routes.first.shape[0]):
-        wrapping.add_pull(routes, s, placed, muscle.end_tension[routes.muscle[s]], joint.torque)
+        tension = muscle.end_tension[routes.muscle[s]]
+        wrapping.add_tension_torque(routes, s, placed, tension, joint.torque)
     tree, torque, i = routes.tree, joint.torque, body.effector_joint
     hand = wrapping.point_of(placed, i, body.effector)
     wrapping.add_torque(tree, placed, i, hand, wrench[:3], 1.0, torque)
@@ -114,15 +116,15 @@ def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
 
 
 @njit(cache=True)
-def _wires_and_modules(
+def _step_muscles(
     body: Body, constants: Modules, muscle: MuscleState, kind: int, command: Command,
     absolute: Array,
 ) -> None:  # fmt: skip
     for m in range(absolute.shape[0]):
         reading = muscle.length[m] + command.length_error[m] + command.zero[m]
-        pull = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
-        slid = modules.wind(constants, muscle, kind, command, m, reading, pull)
-        muscle.sliding[m] = modules.rubbed(muscle.sliding[m], slid, SLIDING_DISTANCE)
+        measured = body.sensor_gain[m] * muscle.tension[m] + body.sensor_offset[m]
+        slid = modules.wind(constants, muscle, kind, command, m, reading, measured)
+        muscle.sliding[m] = modules.friction_state(muscle.sliding[m], slid, SLIDING_DISTANCE)
         muscle.end_tension[m] = 0.0
         if muscle.ruptured[m] == 0.0:
             muscle.end_tension[m] = tension_from_elongation(
@@ -131,16 +133,19 @@ def _wires_and_modules(
                 body.rate[m],
                 body.wire_stretch[m] * absolute[m],
             )
-        friction = math.exp(body.cable_friction[m] * muscle.sliding[m])
+        friction = math.exp(body.tendon_friction[m] * muscle.sliding[m])
         muscle.tension[m] = muscle.end_tension[m] * friction
         modules.heat(constants, muscle, command, m)
 
 
 class EmulatedArm(modules.Arm):
-    """An individual of the first body."""
+    """An individual of the emulator model `kin`."""
 
     def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
-        """Build an individual of a robot at rest, modules safe; `seed` is of its noise, too."""
+        """Build an individual of a robot, at rest with its modules in the safe state.
+
+        `seed` selects the individual and seeds its sensor noise.
+        """
         self.individual = individual or Individual(robot, seed)
         super().__init__(robot, seed, self.individual.length_bias)
         self._order = robot.kinematics.tree.order
@@ -150,45 +155,47 @@ class EmulatedArm(modules.Arm):
         self._data = self._model.createData()
         self._body = self._constants()
         self._bare_inertia = self._model.inertias[self._body.effector_joint].copy()
-        true, zero = self.individual, self.individual.length_at_zero
-        span = true.absolute_lengths(robot.random_postures(500, np.random.default_rng(0))) - zero
-        self._wound = self._modules(span, true.elastic.elongation(zero, robot.tension.max))
+        true, at_zero = self.individual, self.individual.length_at_zero
+        theta = robot.random_postures(500, np.random.default_rng(0))
+        span = true.absolute_lengths(theta) - at_zero
+        stretch = true.elastic.elongation(at_zero, robot.tension.max)
+        self._module_constants = self._make_modules(span, stretch)
         self._placed = Placed.empty(true.routes, robot.muscle_count)
         self._joint = JointState(*(np.zeros(self._model.nv) for _ in range(4)))
         self._angles, self._rates = self._joint.q, self._joint.velocity
-        self._hand_over()
+        self._make_handle()
         self.reset()
 
-    def _hand_over(self) -> None:
-        self._handle = handed(
+    def _make_handle(self) -> None:
+        self._handle = make_handle(
             Parts(
-                self.individual.routes, self._placed, self._body, self._wound, self._muscle,
-                self._joint, self._command, self._wrench,
+                self.individual.routes, self._placed, self._body, self._module_constants,
+                self._muscle, self._joint, self._command, self._wrench,
             )
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
-        """Let copies have arrays of their own."""
+        """Exclude the handle, so that a copy makes one to its own arrays."""
         return {**self.__dict__, '_handle': None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._hand_over()
+        self._make_handle()
 
     def _constants(self) -> Body:
-        robot, true, unit = self.robot, self.individual, self.individual.elastic
-        # Joints that follow others have no friction and no stops of their own.
+        robot, true, elastic = self.robot, self.individual, self.individual.elastic
+        # Coupled joints have neither friction nor stops of their own.
         friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
         friction[self._order] = true.joint_friction
         lower[self._order], upper[self._order] = robot.lower, robot.upper
         firmness = self._gear.copy()
-        load = true.load / STOP_LOAD
+        load = true.joint_load / STOP_LOAD
         firmness[self._order] = np.maximum(firmness[self._order], load)
         joint, hand = robot.kinematics.placement(robot.description.end_effector)
         return Body(
-            unit.force, unit.rate, unit.wire_stretch, true.length_at_zero, true.cable_friction,
-            true.tension_gain, true.tension_bias, friction, lower, upper, self._gear, firmness,
-            joint, np.array(hand.translation),
+            elastic.force, elastic.rate, elastic.wire_stretch, true.length_at_zero,
+            true.tendon_friction, true.tension_gain, true.tension_bias, friction, lower, upper,
+            self._gear, firmness, joint, np.array(hand.translation),
         )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:
@@ -197,7 +204,7 @@ class EmulatedArm(modules.Arm):
         self._joint.q[:] = self.robot.kinematics.tree.angles(theta)
 
     def set_payload(self, mass: float) -> None:
-        """Put a mass [kg] into the hand, as a ball of 5 cm radius at the end effector."""
+        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
         load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
         placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
         self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
@@ -211,12 +218,12 @@ class EmulatedArm(modules.Arm):
         muscle_step(self._handle, self._kind, acceleration)
 
     def _coupled_acceleration(self) -> Array:
-        """Return q̈ (J−1,) of a tree whose joints follow others.
+        """Return q̈ (J−1,) of a tree with coupled joints.
 
             q̈ = A θ̈ + Ȧ θ̇,   θ̈ = (Aᵀ M A)⁻¹ Aᵀ (τ − h − M Ȧ θ̇)
 
-        M holds the armature already. Joints that follow by a curve get the q̈ that puts them onto
-        it at the end of the step.
+        M includes the armature. Joints that follow a curve get the q̈ that puts them onto the curve
+        at the end of the step.
         """
         model, data, joint, kin = self._model, self._data, self._joint, self.robot.kinematics
         theta, gear = self.theta, kin.tree.transmission(self.theta)
@@ -232,12 +239,12 @@ class EmulatedArm(modules.Arm):
         after = kin.tree.angles(theta + STEP * (self.velocity + STEP * acceleration))
         return ((after - joint.q) / STEP - joint.velocity) / STEP
 
-    def _sensed(self) -> tuple[Array, Array, Array, Array]:
+    def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
         muscle, true = self._muscle, self.individual
         tension = true.tension_gain * muscle.tension + true.tension_bias
         length = muscle.length + self._command.length_error + self._command.zero
         return self.theta, length, tension, muscle.housing
 
     def route_points(self) -> Array:
-        """True route points in the root link's frame [m], shape (P, 3)."""
+        """Return the true route points in the root link's frame [m], shape (P, 3)."""
         return self._placed.world.copy()

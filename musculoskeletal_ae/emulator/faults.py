@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of wires, motors, sensors and their cables, switched while the arm moves.
+"""Faults of tendons, motors, sensors and communication that can be switched while the arm moves.
 
-A fault is one line, `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]`: 'drop:0.3', 'stuck_motor:biceps',
-'bias:tension:40', 'dead_sensor:elbow'. Without a name it is all muscles.
+A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
+'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. Without a name it affects all
+muscles.
 """
 
 from collections.abc import Iterable
@@ -16,38 +17,38 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES
 
 SPEED_LIMIT = 0.25  # [m/s] of a muscle module's motor; chosen
-SPIKE_SHARE = 0.05  # of the readings have a spike, one muscle each
+SPIKE_SHARE = 0.05  # share of the readings in which one muscle has a spike
 
 
 class Kind(NamedTuple):
-    """What can be broken, and what its size means."""
+    """Properties of a kind of fault, and the meaning of its size."""
 
     meaning: str
-    size: float = 0.0  # by default
-    most: float = 0.0  # 0: it has no size
+    size: float = 0.0  # default
+    largest: float = 0.0  # largest legal size; 0 if the kind has no size
     unit: str = ''
     of_muscle: bool = True
     of_quantity: bool = False
 
 
-#: sizes of spike and bias by quantity, theta of a joint: default, most, unit
+#: size of a spike or bias by quantity (theta: joint angles): default, largest, unit
 SIZES = {'length': (0.05, 1.0, 'm'), 'tension': (100.0, 1e4, 'N'),
          'temperature': (60.0, 1e3, '°C'), 'theta': (0.1, 3.2, 'rad')}  # fmt: skip
 KINDS = {
-    'drop': Kind('readings get lost', 0.5, 1.0, 'share', of_muscle=False),
-    'delay': Kind('readings come late', 0.1, 10.0, 's', of_muscle=False),
-    'duplicate': Kind('readings come twice', 0.5, 1.0, 'share', of_muscle=False),
-    'reorder': Kind('readings come after the next one', 0.5, 1.0, 'share', of_muscle=False),
-    'freeze': Kind('sensors repeat what they read', of_quantity=True),
+    'drop': Kind('readings are lost', 0.5, 1.0, 'share', of_muscle=False),
+    'delay': Kind('readings are delayed', 0.1, 10.0, 's', of_muscle=False),
+    'duplicate': Kind('readings arrive twice', 0.5, 1.0, 'share', of_muscle=False),
+    'reorder': Kind('readings arrive after the next one', 0.5, 1.0, 'share', of_muscle=False),
+    'freeze': Kind('sensors repeat their last value', of_quantity=True),
     'dead_sensor': Kind('sensors read 0', of_quantity=True),
-    'nan_sensor': Kind('sensors say NaN', of_quantity=True),
-    'spike': Kind('sensors are off now and then', *SIZES['length'], of_quantity=True),
-    'bias': Kind('sensors are off', *SIZES['length'], of_quantity=True),
-    'stuck_motor': Kind('motors stand'),
-    'winch_speed': Kind('motors are slower', 0.009, SPEED_LIMIT, 'm/s'),
-    'unzeroed': Kind('lengths are off by 0.4 to 1 times this', 0.13, 1.0, 'm'),
-    'slack': Kind('wires are longer', 0.05, 1.0, 'm'),
-    'overheat': Kind('modules are hot', 90.0, 1e3, '°C'),
+    'nan_sensor': Kind('sensors read NaN', of_quantity=True),
+    'spike': Kind('sensors have spikes of this size', *SIZES['length'], of_quantity=True),
+    'bias': Kind('sensors have this offset', *SIZES['length'], of_quantity=True),
+    'stuck_motor': Kind('motors are jammed'),
+    'winch_speed': Kind('motors have this lower speed limit', 0.009, SPEED_LIMIT, 'm/s'),
+    'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this', 0.13, 1.0, 'm'),
+    'slack': Kind('tendons are longer', 0.05, 1.0, 'm'),
+    'overheat': Kind('modules have at least this temperature', 90.0, 1e3, '°C'),
 }
 LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
@@ -62,7 +63,7 @@ class Readings(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """One line, understood."""
+    """One fault, parsed from a line."""
 
     kind: str
     quantities: tuple[str, ...]
@@ -71,38 +72,39 @@ class Fault(NamedTuple):
 
 
 def read_fault(line: str, robot: Robot) -> Fault:
-    """Return what one line says.
+    """Parse one line.
 
     Raises:
-        MusculoskeletalError: If it says nothing legal; the message says what is.
+        MusculoskeletalError: If the line is not legal; the message lists the legal forms.
     """
     name, *words = (word.strip() for word in line.split(':'))
     if name not in KINDS:
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
     kind = KINDS[name]
     quantities: tuple[str, ...] = QUANTITIES if kind.of_quantity else ()
-    size, most, unit, least = kind.size, kind.most, kind.unit, 0.0
+    size, largest, unit, smallest = kind.size, kind.largest, kind.unit, 0.0
     if kind.of_quantity and words and words[0] in QUANTITIES:
         quantities = (words.pop(0),)
     elif kind.of_quantity and words and words[0] in robot.joints:
         quantities = ('theta',)
     elif kind.size:
-        quantities = quantities[:1]  # of a spike or bias: length
+        quantities = quantities[:1]  # a spike or bias without a quantity is one of length
     if quantities and kind.size:
-        size, most, unit = SIZES[quantities[0]]
-        unit, least = f'{unit} of {quantities[0]}', -most
-    # A muscle may be called like a number.
-    if words and most and ':'.join(words) not in robot.muscles:
+        size, largest, unit = SIZES[quantities[0]]
+        unit, smallest = f'{unit} of {quantities[0]}', -largest
+    # The name of a muscle may be a number.
+    if words and largest and ':'.join(words) not in robot.muscles:
         try:
             size = float(words[-1])
             words.pop()
         except ValueError:
             pass
-    if not least <= size <= most:
-        legal = f'sizes from {least:g} to {most:g} {unit}' if most else 'no size'
+    if not smallest <= size <= largest:
+        legal = f'sizes from {smallest:g} to {largest:g} {unit}' if largest else 'no size'
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
     if words and not kind.of_muscle:
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: {name}[:SIZE], which is of all readings')
+        legal = f'{name}[:SIZE], which affects all readings'
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
     if quantities == ('theta',) and len(words) == 1:
         return Fault(name, quantities, np.array([robot.joints.index(words[0])]), size)
     muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)
@@ -110,35 +112,35 @@ def read_fault(line: str, robot: Robot) -> Fault:
 
 
 class Faults:
-    """All faults of one arm."""
+    """All active faults of one arm."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
-        """Nothing is broken."""
+        """Start without faults."""
         self._robot, self._rng = robot, rng
         self._faults: tuple[Fault, ...] = ()
         self._frozen: dict[tuple[str, int], float] = {}
-        self._held: Readings | None = None  # to come after the next one
+        self._reordered: Readings | None = None  # arrives after the next readings
         self._queue: list[tuple[float, Readings]] = []
-        # What the mechanics follows, each (M,): share of its speed that a motor lacks, wire too
-        # long [m], length read too long [m], and the least temperature of the housing [°C].
+        # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
+        # tendon [m], offset of the length sensor [m], minimum temperature of the housing [°C].
         self.stuck, self.slack, self.zero, self.hot = np.zeros((4, robot.muscle_count))
-        self._forgotten = rng.spawn(1)[0].uniform(0.4, 1.0, (2, robot.muscle_count))
-        self._forgotten = np.where(self._forgotten[1] < 0.7, -1.0, 1.0) * self._forgotten[0]
+        size, sign = rng.spawn(1)[0].uniform(0.4, 1.0, (2, robot.muscle_count))
+        self._unzeroed_factor = np.where(sign < 0.7, -1.0, 1.0) * size
         self.set([])
 
     def set(self, lines: Iterable[str]) -> None:
-        """Break what the lines say and mend all else.
+        """Activate the faults of the lines, and end all others.
 
         Raises:
-            MusculoskeletalError: If one says nothing legal; nothing changes then.
+            MusculoskeletalError: If a line is not legal; the faults are then unchanged.
         """
-        before = self._late()
+        delay = self._delay()
         self._faults = tuple(read_fault(line, self._robot) for line in lines)
-        still = {(name, m) for f in self._of('freeze') for name in f.quantities for m in f.which}
-        self._frozen = {one: read for one, read in self._frozen.items() if one in still}
+        frozen = {(name, m) for f in self._of('freeze') for name in f.quantities for m in f.which}
+        self._frozen = {key: value for key, value in self._frozen.items() if key in frozen}
         if not self._of('reorder'):
-            self._held = None
-        if self._late() != before:  # what is on the way would come between what is newer
+            self._reordered = None
+        if self._delay() != delay:  # queued readings would arrive between newer ones
             self._queue.clear()
         self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
         self.hot[:] = -np.inf
@@ -149,13 +151,13 @@ class Faults:
         for kind, sizes in (('slack', self.slack), ('unzeroed', self.zero), ('overheat', self.hot)):
             for fault in self._of(kind):
                 sizes[fault.which] = fault.size
-        self.zero *= self._forgotten
+        self.zero *= self._unzeroed_factor
 
     def _of(self, *names: str) -> list[Fault]:
         return [fault for fault in self._faults if fault.kind in names]
 
-    def sensed(self, readings: Readings) -> Readings:
-        """Return what the broken sensors read instead."""
+    def apply(self, readings: Readings) -> Readings:
+        """Return the readings with all sensor faults applied."""
         values = {name: getattr(readings, name).copy() for name in (*QUANTITIES, 'theta')}
         for fault in self._of('bias', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'):
             for name in fault.quantities:
@@ -174,22 +176,22 @@ class Faults:
                     value[self._rng.choice(which)] += fault.size
         return readings._replace(**values)
 
-    def _late(self) -> float:
+    def _delay(self) -> float:
         return sum(fault.size for fault in self._of('delay'))
 
     def _happens(self, name: str) -> bool:
         return any(self._rng.random() < fault.size for fault in self._of(name))
 
-    def delivered(self, readings: Readings, now: float) -> list[Readings]:
-        """Return what arrives at `now` [s], in this order, when `readings` have been sent."""
+    def deliver(self, readings: Readings, now: float) -> list[Readings]:
+        """Send `readings` at `now` [s]; return all readings that arrive now, in order."""
         sent = [] if self._happens('drop') else [readings]
         if sent and self._happens('duplicate'):
             sent *= 2
-        if self._held is not None and sent:
-            sent, self._held = [*sent, self._held], None
+        if self._reordered is not None and sent:
+            sent, self._reordered = [*sent, self._reordered], None
         elif sent and self._happens('reorder'):
-            sent, self._held = [], readings
-        self._queue += [(now + self._late(), one) for one in sent]
+            sent, self._reordered = [], readings
+        self._queue += [(now + self._delay(), one) for one in sent]
         due = [one for at, one in self._queue if at <= now]
         self._queue = [(at, one) for at, one in self._queue if at > now]
         return due

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One individual arm: how the true body that `seed` picks differs from its geometric model.
+"""One emulated individual: how its true body differs from the geometric model.
 
-In what, `Spread` says. Masses and link lengths are the model's (paper, §I: assumed
-correct).
+The seed selects the individual, and `Spread` lists the differences. Masses and link lengths equal
+those of the model (paper, §I: assumed correct).
 """
 
 from collections.abc import Callable
@@ -22,23 +22,23 @@ THICKEST_BONE = 0.04  # [m] radius of a bone's head
 
 @dataclass(frozen=True)
 class Spread:
-    """How much individuals differ, calibrated once (`bench/calibration.py`)."""
+    """Sizes of the differences between individuals, calibrated once (`bench/calibration.py`)."""
 
     attachment: float = 0.0085  # standard deviation of each coordinate of each route point [m]
-    #: quantile, over the joint range, of the straight line's distance from the joint centre that
-    #: the bone's head reaches; 0 for no wrapping
+    #: The radius of a bone's head is this quantile, over the joint range, of the distance between
+    #: the straight tendon and the joint centre; 0 for no wrapping.
     wrap: float = 0.4
     elastic: float = 0.15  # standard deviation of the logarithm of each elastic constant
-    cable_friction: float = 0.095  # mean relative tension loss along the route (capstan exponent)
-    #: mean Coulomb torque of a joint, as a share of its own load: the largest torque that the arm's
-    #: weight puts on it, and the most that muscles at T_bias do, pulling either way
+    tendon_friction: float = 0.095  # mean relative tension loss along the route (capstan exponent)
+    #: mean Coulomb torque of a joint, as a share of its load: the largest torque by the arm's
+    #: weight, plus the largest by muscles at T_bias in one direction
     joint_friction: float = 0.0133
-    length_bias: float = 0.0005  # standard deviation of each length sensor's zero error [m]
-    tension_bias: float = 1.0  # of each tension sensor's zero error [N]
-    tension_gain: float = 0.01  # of each tension sensor's relative gain error
+    length_bias: float = 0.0005  # standard deviation of each length sensor's offset [m]
+    tension_bias: float = 1.0  # standard deviation of each tension sensor's offset [N]
+    tension_gain: float = 0.01  # standard deviation of each tension sensor's relative gain error
 
 
-#: No difference at all: the geometric model itself as a body, without friction.
+#: No differences: a body equal to the geometric model, without friction.
 NOMINAL = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -46,12 +46,12 @@ class Individual:
     """True routes, elastic constants, friction and sensor errors of one arm."""
 
     def __init__(self, robot: Robot, seed: int, spread: Spread | None = None) -> None:
-        """Draw individual `seed`, by the calibrated spread or another."""
+        """Draw the individual `seed`, with the calibrated spread by default."""
         spread = spread or Spread()
         rng = np.random.default_rng([seed, 0xB0D1])
         muscles, kin, nominal = robot.muscle_count, robot.kinematics, robot.routes
         self._kinematics, self._muscles = kin, muscles
-        # In one order of memory: code is compiled for each.
+        # Numba compiles separate code for each memory order, so use a single one.
         placements = (
             np.ascontiguousarray(kin.tree.placement_rotation),
             kin.tree.placement_translation,
@@ -63,7 +63,7 @@ class Individual:
         thickness = rng.uniform(0.8, 1.2, len(nominal.first))
 
         def routes(off: Array) -> WrappedRoutes:
-            """Return the true routes of points that are off by so much [m], (P, 3)."""
+            """Return the true routes for deviations of the route points [m], (P, 3)."""
             point = nominal.point + off
             objects = _objects(robot, point, spread.wrap, seed, thickness)
             segments = nominal.first, nominal.second, nominal.muscle, nominal.weight
@@ -73,30 +73,33 @@ class Individual:
         if nominal.objects is not None:
             again = np.random.default_rng([seed, 0x1A7])
             redrawn = again.normal(0.0, spread.attachment, (REDRAWN, *off.shape))
-            self._lay(robot, off, redrawn, routes)
+            self._redraw_jumping_routes(robot, off, redrawn, routes)
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
         constants = zip(vars(robot.series_elastic).values(), factor, strict=True)
-        self.elastic = SeriesElastic(*(each * off for each, off in constants))
-        #: of muscles (M,) and joints [N·m], (D,) in the order of θ
-        self.cable_friction: Array = spread.cable_friction * rng.uniform(0.5, 1.5, muscles)
+        self.elastic = SeriesElastic(*(each * scale for each, scale in constants))
+        #: capstan exponent of each muscle, (M,)
+        self.tendon_friction: Array = spread.tendon_friction * rng.uniform(0.5, 1.5, muscles)
         theta = robot.random_postures(200, rng)
-        #: what weight and muscles at T_bias put on each joint [N·m], (D,)
-        self.load = robot.joint_load(kin.holding_torque(theta), nominal.muscle_jacobian(theta))
-        rubs = rng.uniform(0.5, 1.5, len(self.load))
-        self.joint_friction: Array = spread.joint_friction * self.load * rubs
-        #: of the sensors [m], [N], a factor; each (M,)
+        #: load of each joint by weight and muscles at T_bias [N·m], (D,)
+        self.joint_load = robot.joint_load(
+            kin.holding_torque(theta), nominal.muscle_jacobian(theta)
+        )
+        relative_friction = rng.uniform(0.5, 1.5, len(self.joint_load))
+        #: Coulomb torque of each joint [N·m], (D,)
+        self.joint_friction: Array = spread.joint_friction * self.joint_load * relative_friction
+        #: errors of the sensors, each (M,): [m], [N] and a factor
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
         self.tension_gain: Array = 1.0 + rng.normal(0.0, spread.tension_gain, muscles)
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
 
-    def _lay(
+    def _redraw_jumping_routes(
         self, robot: Robot, off: Array, again: Array, routes: Callable[[Array], WrappedRoutes]
     ) -> None:
-        """Draw points' deviations (P, 3) `again` until wires jump only where the model's do.
+        """Redraw points' deviations (P, 3) until tendons jump only where those of the model do.
 
-        One jumps, by centimetres, where it would slip over the end of what it wraps round: nobody
-        lays it there.
+        A tendon jumps by centimetres if it slips over the end of an object that it wraps round. No
+        one would route a tendon there. `again` holds the deviations to try.
         """
         nominal = robot.routes
         smooth = ~jumping(nominal.absolute_lengths, robot)
@@ -114,15 +117,15 @@ class Individual:
         return wrapped_lengths(self.routes, q, Placed.empty(self.routes, self._muscles))
 
     def absolute_lengths(self, theta: Array) -> Array:
-        """Return the true route lengths [m], θ (N, D) gives (N, M)."""
+        """Return the true route lengths [m] (N, M) for θ (N, D)."""
         return self._evaluate(theta)[0]
 
     def muscle_jacobian(self, theta: Array) -> Array:
-        """Return the true G [m/rad], θ (N, D) gives (N, M, D)."""
+        """Return the true G [m/rad] (N, M, D) for θ (N, D)."""
         return self._kinematics.tree.of_theta(self._evaluate(theta)[1], theta)
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
-        """Return the true l [m] without friction and sensor error, θ (N, D), T (N, M)."""
+        """Return the true l [m] without friction and sensor errors, for θ (N, D) and T (N, M)."""
         absolute = self.absolute_lengths(theta)
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
 
@@ -130,11 +133,12 @@ class Individual:
 def _objects(
     robot: Robot, point: Array, quantile: float, seed: int, thickness: Array
 ) -> WrapObjects:
-    """Return what each segment wraps round: as described, a little thicker or thinner, or a head.
+    """Return the object that each segment wraps round: a described one, or a bone's head.
 
-    A bone's head sits at the joint centre nearest to the line. It is thick enough to touch the line
-    in a share `quantile` of the postures, but never so thick that the wire could slip over to its
-    other side. Nothing ever reaches an attachment, those of the description not the true `point`.
+    A described object has a slightly different radius than in the description. A bone's head is
+    centred at the joint nearest to the tendon. The tendon touches it in a share `quantile` of the
+    postures. Its radius is small enough that the tendon cannot slip over to the other side, and
+    that it encloses neither the described attachments nor the true ones, `point`.
     """
     kin, routes = robot.kinematics, robot.routes
     count = len(routes.first)

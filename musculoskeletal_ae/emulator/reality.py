@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which body plays reality; the one place where nodes and experiments get their arms from."""
+"""Selection of the emulator model; nodes and experiments create their arms here."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -21,30 +21,37 @@ def make_arm(
     friction: bool = True,
     deviates: bool = False,
 ) -> Arm:
-    """Return an individual at rest, or the same body without friction in wires and joints.
+    """Return an emulated arm at rest.
 
-    Realities are 'kin', the first body, which differs from its model in what the learner fits;
-    'foreign', the second one, whose mechanics are foreign too; or a user's MJCF file, whose joints
-    and tendons have the names of the robot's joints and muscles. A file is played as it is, or, if
-    the individual deviates, as its seed draws it (`emulator/deviation.py`).
+    Args:
+        robot: The robot to emulate.
+        seed: Selects the emulated individual, and seeds its noise.
+        reality: The emulator model. The body of 'kin' differs from the geometric model only in ways
+            that the learner can fit; 'foreign' has mechanics that the learner does not model.
+            Otherwise the path of an MJCF file whose joints and tendons have the names of the
+            robot's joints and muscles.
+        friction: False for the same body without tendon friction and joint friction.
+        deviates: Whether the body of an MJCF file is an individual that differs from the file
+            (`emulator/deviation.py`). By default it equals the file.
 
     Raises:
-        MusculoskeletalError: If there is no such reality, or the robot's names are not in the file.
+        MusculoskeletalError: If the reality is neither a model nor a file, or the file lacks a
+            name.
     """
     if reality == KIN:
         individual = Individual(robot, seed)
         if not friction:
-            individual.cable_friction[:] = 0.0
+            individual.tendon_friction[:] = 0.0
             individual.joint_friction[:] = 0.0
         return EmulatedArm(robot, seed, individual)
     file = None
     if reality != FOREIGN:
-        with suppress(RuntimeError, OSError):  # no such home, a name too long
+        with suppress(RuntimeError, OSError):  # unknown home directory, name too long
             file = path if (path := Path(reality).expanduser()).is_file() else None
         if file is None:
             legal = f'{KIN}, {FOREIGN} or an MJCF file'
-            raise MusculoskeletalError(f'reality {reality[:80]!r} is no such file; legal: {legal}')
-    # Only here, so that the first body does not wait for MuJoCo.
+            raise MusculoskeletalError(f'reality {reality[:80]!r} is unknown; legal: {legal}')
+    # Imported here because `kin` does not need MuJoCo.
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Muscle routes that wrap round bones, compiled by numba: the true lengths of the emulated arm.
 
-A segment between two route points may pass a sphere (a bone's head) that the geometric model of
-`robot/routes.py` does not know; where the description itself wraps it, it wraps here too, round an
-object of its own size. How a wire lies on either, `robot/wrapping.py` says.
+A segment between two route points may wrap round a sphere (a bone's head) that the geometric model
+of `robot/routes.py` does not contain. Segments that the robot description wraps also wrap here,
+round an object of a slightly different size. `robot/wrapping.py` computes the path of the tendon on
+either.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from musculoskeletal_ae.robot.wrapping import (
 
 
 class Tree(NamedTuple):
-    """Joints in pinocchio's order, joint 0 being the root link."""
+    """Joints in pinocchio's order; joint 0 is the root link."""
 
     parent: Ints  # (J,)
     rotation: Array  # fixed placement in the parent, (J, 3, 3)
@@ -37,32 +38,32 @@ class Tree(NamedTuple):
 
 
 class WrappedRoutes(NamedTuple):
-    """True routes: points on joints of the tree, segments between them."""
+    """True routes: points on joints of the tree, and segments between them."""
 
     tree: Tree
     point_joint: Ints  # tree joint that carries each point, (P,)
     point: Array  # in that joint's frame [m], (P, 3)
-    first: Ints  # points where each segment starts
-    second: Ints  # and ends, (S,)
-    muscle: Ints  # it belongs to, (S,)
-    weight: Array  # share of its length that counts, and of the tension that pulls, (S,)
-    objects: WrapObjects  # what each segment wraps round, radius 0 for nothing
+    first: Ints  # start point of each segment, (S,)
+    second: Ints  # end point of each segment, (S,)
+    muscle: Ints  # muscle of each segment, (S,)
+    weight: Array  # factor of each segment's length and tension, (S,)
+    objects: WrapObjects  # object that each segment wraps round; radius 0 if none
 
 
 class Placed(NamedTuple):
-    """Where joints, route points and wires are, in the root link's frame; `place` fills it."""
+    """Poses of joints, route points and tendons in the root link's frame; `place` fills them in."""
 
     rotation: Array  # of joints, (J, 3, 3)
-    translation: Array  # [m], (J, 3)
-    axis: Array  # (J, 3)
+    translation: Array  # of joints [m], (J, 3)
+    axis: Array  # of joints, (J, 3)
     world: Array  # route points [m], (P, 3)
     absolute: Array  # lengths of the routes [m], (M,)
-    leave: Array  # unit pulls at the start of each segment, (S, 3)
-    arrive: Array  # and at its end
+    leave: Array  # unit vector along the tendon at the start of each segment, (S, 3)
+    arrive: Array  # the same at its end, (S, 3)
 
     @classmethod
     def empty(cls, routes: WrappedRoutes, muscles: int) -> Placed:
-        """Return room for the places of an arm of M muscles."""
+        """Return uninitialised poses for an arm of M muscles."""
         joints, points, segments = map(len, (routes.tree.parent, routes.point, routes.first))
         poses, ends = ((joints, 3, 3), (joints, 3), (joints, 3)), (segments, 3)
         placed = cls(*(np.zeros(shape) for shape in (*poses, (points, 3), muscles, ends, ends)))
@@ -72,7 +73,7 @@ class Placed(NamedTuple):
 
 @njit(cache=True)
 def _multiply(a: Array, b: Array, product: Array) -> None:
-    """Fill the product of two matrices, all (3, 3)."""
+    """Write the product of two (3, 3) matrices into `product`."""
     for r in range(3):
         for c in range(3):
             product[r, c] = 0.0
@@ -82,7 +83,7 @@ def _multiply(a: Array, b: Array, product: Array) -> None:
 
 @njit(cache=True)
 def point_of(placed: Placed, joint: int, point: Array) -> Vector:
-    """Return a point [m] (3,) of a joint's frame in the root link's."""
+    """Transform a point [m] (3,) from a joint's frame to the root link's."""
     r, t = placed.rotation[joint], placed.translation[joint]
     return (
         t[0] + r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2],
@@ -93,14 +94,14 @@ def point_of(placed: Placed, joint: int, point: Array) -> Vector:
 
 @njit(cache=True)
 def fill(row: Array, values: Vector | Array) -> None:
-    """Fill a row; what numba makes of `row[:] = values` takes it seconds to compile."""
+    """Copy values into a row; numba needs seconds to compile `row[:] = values`."""
     for i in range(len(row)):
         row[i] = values[i]
 
 
 @njit(cache=True)
 def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
-    """Find all places for q (J−1,)."""
+    """Compute all poses for q (J−1,)."""
     tree, fixed = routes.tree, np.zeros((3, 3))
     for i in range(1, tree.parent.shape[0]):
         up = tree.parent[i]
@@ -143,21 +144,23 @@ def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Ar
         place(routes, q[n], placed)
         fill(lengths[n], placed.absolute)
         for s in range(routes.first.shape[0]):
-            add_pull(routes, s, placed, -1.0, jacobian[n, routes.muscle[s]])
+            add_tension_torque(routes, s, placed, -1.0, jacobian[n, routes.muscle[s]])
     return lengths, jacobian
 
 
 @njit(cache=True)
-def add_pull(routes: WrappedRoutes, s: int, placed: Placed, pull: float, torque: Array) -> None:
-    """Add what a tension `pull` of the muscle of segment s does there to torque (J−1,)."""
-    tree, objects, pull = routes.tree, routes.objects, routes.weight[s] * pull
+def add_tension_torque(
+    routes: WrappedRoutes, s: int, placed: Placed, tension: float, torque: Array
+) -> None:
+    """Add the torques of segment s to `torque` (J−1,), for the tension [N] of its muscle."""
+    tree, objects, tension = routes.tree, routes.objects, routes.weight[s] * tension
     ends = (routes.first[s], placed.leave[s]), (routes.second[s], placed.arrive[s])
     for p, away in ends:
-        add_torque(tree, placed, routes.point_joint[p], placed.world[p], away, pull, torque)
+        add_torque(tree, placed, routes.point_joint[p], placed.world[p], away, tension, torque)
     if objects.radius[s] > 0.0:
-        # The wire presses on the object in the lines of its straight parts.
+        # The tendon loads the object along the lines of its two straight parts.
         for p, away in ends:
-            add_torque(tree, placed, objects.joint[s], placed.world[p], away, -pull, torque)
+            add_torque(tree, placed, objects.joint[s], placed.world[p], away, -tension, torque)
 
 
 @njit(cache=True)
@@ -165,7 +168,7 @@ def add_torque(
     tree: Tree, placed: Placed, joint: int, point: Vector, force: Array, scale: float,
     torque: Array,
 ) -> None:  # fmt: skip
-    """Add scale · Jᵀ force of a force at a point of a joint's body to torque (J−1,)."""
+    """Add scale · Jᵀ force to `torque` (J−1,), for a force at a point of a joint's body."""
     while joint > 0:
         axis = placed.axis[joint]
         if tree.prismatic[joint]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements: protocols, plots and reports."""
+"""The experiments of the paper on emulated arms: protocols, plots and reports."""
 
-#: of the experiments, in the order of the report; the first one makes what the others need
+#: names of the experiments in the order of the report; the others need the results of the first
 NAMES = (
     'online_learning',
     'estimation',

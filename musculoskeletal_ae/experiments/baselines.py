@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimators of joint angles from before the autoencoder, small and honest, on the same data.
+"""Earlier estimators of joint angles, evaluated on the same data as the autoencoder.
 
-They learn from the very samples at rest that the autoencoder learned from. Table search, whose
-table cannot be filled from so few postures, is also given the whole stream at 10 Hz.
+They learn from the rest samples of the autoencoder. So few postures cannot fill a table for table
+search; both estimators are therefore also evaluated after learning the whole stream at 10 Hz.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from scipy.spatial import cKDTree
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.least_squares import nominal
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, mean_error
-from musculoskeletal_ae.experiments.study import Rests
+from musculoskeletal_ae.experiments.study import RestSamples
 from musculoskeletal_ae.robot.robot import Robot
 
 STREAM_STRIDE = 10
 
 
 def baseline_errors(
-    robot: Robot, rests: Rests, stream: Recording, held_out: Recording
+    robot: Robot, rests: RestSamples, stream: Recording, held_out: Recording
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error on the held-out motion before and after learning [rad].
 
-    All start from the geometric model. Least squares on it, without weights, has nothing to learn.
+    All start from the geometric model. Unweighted least squares on it has nothing to learn.
     """
     part = stream.part(np.s_[::STREAM_STRIDE])
-    moving = Rests(part.theta_sensor, part.tension, part.length)
+    moving = RestSamples(part.theta_sensor, part.tension, part.length)
     error = nominal(robot, tension_noise=0.0).error(held_out)
-    table = {'geometric model, least squares': {'before_rad': error, 'after_rad': error}}
+    errors = {'geometric model, least squares': {'before_rad': error, 'after_rad': error}}
     for kind in (PolynomialFilter, TableSearch):
         before = _error(kind(robot), held_out)
         for data, name in ((rests, kind.name), (moving, f'{kind.name}, whole stream')):
-            taught = kind(robot)
+            estimator = kind(robot)
             if len(data.theta):
-                taught.learn(*data)
-            table[name] = {'before_rad': before, 'after_rad': _error(taught, held_out)}
-    return table
+                estimator.learn(*data)
+            errors[name] = {'before_rad': before, 'after_rad': _error(estimator, held_out)}
+    return errors
 
 
 def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> float:
@@ -47,10 +47,10 @@ def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> flo
     return mean_error(estimate, held_out.theta)
 
 
-def unstretched(robot: Robot, tension: Array, length: Array) -> Array:
-    """Return l without the elongation that the model expects, l + L_e(l_abs, T) [m].
+def without_elongation(robot: Robot, tension: Array, length: Array) -> Array:
+    """Return the length without the model's elongation, l + L_e(l_abs, T) [m].
 
-    L_e needs the absolute length, which the measured one gives to within the elongation itself.
+    L_e needs the absolute length, for which a first evaluation of L_e corrects the measured length.
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)
@@ -62,17 +62,17 @@ class PolynomialFilter:
 
         l_m + L_e,m(T_m) = Σ_k c_mk x^k + a_m T_m,   x = θ scaled to [−1, 1],  total degree ≤ 3
 
-    The mapping starts as a fit to the geometric model. Learning fits it to the samples; the
-    regression pulls towards the coefficients before, which decides what the samples leave open. The
-    filter takes θ for a random walk and the mapping for its measurement, H = ∂l/∂θ.
+    The mapping starts as a fit to the geometric model. Learning refits it to the samples with the
+    previous coefficients as the prior, which determines everything that the samples leave open. The
+    filter models θ as a random walk and the mapping as its measurement, H = ∂l/∂θ.
     """
 
     name = 'polynomial mapping, EKF'
     DEGREE = 3
     MODEL_SAMPLES = 20_000
-    PRIOR_ROWS = 20.0  # samples that the coefficients before are worth
-    TENSION_SCALE = 1.0 / 200.0  # so that a_m is of the size of the other coefficients
-    WALK = 0.5  # random walk of a joint [rad/√s]; 0.2 gives the same to a per cent
+    PRIOR_ROWS = 20.0  # weight of the prior, in samples
+    TENSION_SCALE = 1.0 / 200.0  # gives a_m the magnitude of the other coefficients
+    WALK = 0.5  # random walk of a joint [rad/√s]; with 0.2 the error differs by about 1 %
     LEAST_NOISE = 5e-4  # [m]
 
     def __init__(self, robot: Robot) -> None:
@@ -80,7 +80,7 @@ class PolynomialFilter:
         self._robot = robot
         every = product(range(self.DEGREE + 1), repeat=robot.joint_count)
         self._powers = np.array([powers for powers in every if sum(powers) <= self.DEGREE])
-        # Slopes of the monomials, as monomials: k x^(k−1) in each joint's direction, (D, K, K).
+        # Derivatives of the monomials in terms of monomials: k x^(k−1) for each joint, (D, K, K).
         units = np.eye(robot.joint_count, dtype=int)
         lower = [(self._powers[:, None] - unit == self._powers).all(axis=-1) for unit in units]
         self._slopes = np.array(lower) * self._powers.T[:, :, None]
@@ -98,9 +98,9 @@ class PolynomialFilter:
         return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Fit the mapping to samples (N, D), (N, M), (N, M), its own coefficients as the prior."""
+        """Fit the mapping to samples (N, D), (N, M), (N, M), with the present one as the prior."""
         design = self._monomials(theta)
-        target = unstretched(self._robot, tension, length)
+        target = without_elongation(self._robot, tension, length)
         for m in range(self._robot.muscle_count):
             rows = np.column_stack([design, self.TENSION_SCALE * tension[:, m]])
             before = self._coefficients[:, m]
@@ -110,17 +110,17 @@ class PolynomialFilter:
             self._noise[m] = (target[:, m] - rows @ self._coefficients[:, m]).std()
 
     def _measurement(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return the mapping's l + L_e [m] (M,) at one (θ, T) and H [m/rad] (M, D)."""
+        """Return the mapping's l + L_e [m] (M,) and H [m/rad] (M, D) at one (θ, T)."""
         monomials = self._monomials(theta[None])[0]
         coefficients, elastic = self._coefficients[:-1], self._coefficients[-1]
         predicted = monomials @ coefficients + elastic * self.TENSION_SCALE * tension
-        turn = 2.0 / (self._robot.upper - self._robot.lower)
-        return predicted, coefficients.T @ (self._slopes @ monomials).T * turn
+        scale = 2.0 / (self._robot.upper - self._robot.lower)
+        return predicted, coefficients.T @ (self._slopes @ monomials).T * scale
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for successive messages T [N] (N, M), l [m] (N, M)."""
         robot = self._robot
-        measured = unstretched(robot, tension, length)
+        measured = without_elongation(robot, tension, length)
         noise = np.diag(np.maximum(self._noise, self.LEAST_NOISE) ** 2)
         theta = 0.5 * (robot.lower + robot.upper)
         spread = np.diag(((robot.upper - robot.lower) / np.sqrt(12.0)) ** 2)
@@ -128,25 +128,25 @@ class PolynomialFilter:
         estimates = np.empty((len(length), robot.joint_count))
         for n in range(len(length)):
             spread = spread + walk
-            # Iterated, because the first message is far from where the mapping is linearised.
+            # The first message is far from the point of linearisation and needs iterations.
             prior = theta
             for _ in range(10 if n == 0 else 1):
-                predicted, slope = self._measurement(theta, tension[n])
-                gain = np.linalg.solve(slope @ spread @ slope.T + noise, slope @ spread).T
-                off = measured[n] - predicted - slope @ (prior - theta)
-                theta = np.clip(prior + gain @ off, robot.lower, robot.upper)
-            spread = spread - gain @ slope @ spread
+                predicted, jacobian = self._measurement(theta, tension[n])
+                gain = np.linalg.solve(jacobian @ spread @ jacobian.T + noise, jacobian @ spread).T
+                innovation = measured[n] - predicted - jacobian @ (prior - theta)
+                theta = np.clip(prior + gain @ innovation, robot.lower, robot.upper)
+            spread = spread - gain @ jacobian @ spread
             estimates[n] = theta
         return estimates
 
 
 class TableSearch:
-    """Table search (Nakanishi 2010): the posture whose lengths are nearest to the measured.
+    """Table search (Nakanishi 2010): the posture whose lengths are nearest to the measured lengths.
 
         θ_est = θ_k,   k = argmin_k ‖l_k − (l + L_e(l_abs, T))‖₂
 
-    Before learning the table holds random postures of the geometric model; learning replaces it by
-    what was measured while exploring, every row with its elongation taken off.
+    Before learning the table holds random postures of the geometric model. Learning replaces it
+    with the samples, with the elongation removed from every row.
     """
 
     name = 'table search'
@@ -159,11 +159,11 @@ class TableSearch:
         self._lengths = cKDTree(robot.routes.relative_lengths(self._theta))
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Replace the table by samples (N, D), (N, M), (N, M)."""
+        """Replace the table with samples (N, D), (N, M), (N, M)."""
         self._theta = theta
-        self._lengths = cKDTree(unstretched(self._robot, tension, length))
+        self._lengths = cKDTree(without_elongation(self._robot, tension, length))
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M)."""
-        row = self._lengths.query(unstretched(self._robot, tension, length))[1]
+        row = self._lengths.query(without_elongation(self._robot, tension, length))[1]
         return self._theta[row]

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control.
 
-Paper (§IV-C). Five random θ_eval, each approached from five random postures, by the geometric
-model, by `first`, `second` and `proposed` after learning: all learned ones far better than
-geometric; `proposed` as exact as `second` with less tension than either.
+Paper (§IV-C). Each of five random θ_eval is approached from five random postures by the geometric
+model, and by `first`, `second` and `proposed` after learning. All learned methods are far better
+than `geometric`. `proposed` is as accurate as `second`, with less tension than `first` and
+`second`.
 
-Here. The same, in closed loop with the estimator and the controller that the nodes
-run, on targets that the true body can hold within [T_bias, T_limit]; read 8 s after the command.
-Starts are reached by moving there, for all methods with `proposed` of the learned network.
-`geometric` is the model’s, the others run on the learned network, those with the name of a preset
-behind them on that of the preset as printed. QP bound: the least ‖T‖ with which the true body holds
-θ_eval. "Bound reached": the same at the posture where the arm came to rest, as an arm that sags
-needs less. What all starts of a target have in common is the model’s error, their scatter is
-hysteresis. Where a controller stopped, the arm's place then counts, and the stop is counted.
+Here. The protocol is the same, in closed loop with the estimator and the controller of the nodes.
+Targets are postures that the true body can hold within [T_bias, T_limit]. Results are read 8 s
+after the command. Before each approach, `proposed` on the learned network moves the arm to the
+start. `geometric` uses the geometric model, and the other methods use the learned network. Methods
+with the suffix of a preset use the network of preset `paper`. QP bound: the least ‖T‖ with which
+the true body holds θ_eval. "Bound reached": the same at the posture where the arm came to rest,
+because an arm that sags needs less. The mean offset over all starts of a target is the error of the
+model; the scatter about it is hysteresis. If the controller stops, the arm’s position at that time
+counts, and so does the stop.
 """
 
 from collections.abc import Mapping
@@ -28,12 +30,19 @@ from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import ClosedLoop
-from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.study import (
+    Experiment,
+    Measured,
+    Plot,
+    Rows,
+    Study,
+    first_individual,
+)
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.tension import holding_tension
 
-#: colours of the methods under test: the controller's, with the name of a preset on its network
+#: colours of the methods; a suffix names the preset whose network a method uses
 METHODS = {
     'geometric': '#999999',
     'first': '#E69F00',
@@ -43,29 +52,29 @@ METHODS = {
     f'second_{AS_PRINTED}': '#99D8C7',
     f'proposed_{AS_PRINTED}': '#CC79A7',
 }
-APPROACHES = 5  # θ_eval, and starts for each
-# `second` is done after 5 s + 2 s; all methods are read at the same time.
+APPROACHES = 5  # number of θ_eval, and of starts for each
+# `second` ends after 5 s + 2 s. All methods are read at the same time.
 DURATION = 8.0  # [s]
-STARTING = 5.0  # [s] to a start
+STARTING = 5.0  # [s] for the motion to a start
 
 
 class Approaches(NamedTuple):
-    """Where P targets, each from S starts, left an arm; dictionaries are by method."""
+    """Final states of an arm for P targets from S starts each; dictionaries are by method."""
 
     target: Array  # θ_eval [rad], (P, D)
     bound: Array  # least ‖T‖ with which the true body holds each [N], (P,)
     offset: dict[str, Array]  # θ − θ_eval at the end [rad], (P, S, D)
     tension: dict[str, Array]  # ‖T‖ there [N], (P, S)
-    #: least ‖T‖ that holds the posture reached [N], (P, S); nan where none does, as in one that
-    #: leans on a joint's stop or rests by friction
+    #: least ‖T‖ that holds the final posture [N], (P, S); NaN if no tensions do, for example if
+    #: the arm rests against a joint stop or by friction
     bound_there: dict[str, Array]
-    stops: dict[str, int]  # approaches on which the controller stopped: they end where it did
+    stops: dict[str, int]  # number of approaches that ended with a stop of the controller
 
 
 def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
     """Approach `count` random targets from as many random starts each, by every method.
 
-    The seed draws targets and starts; networks are by preset.
+    `seed` determines targets and starts; `networks` are by preset.
     """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
     postures = robot.random_postures(TRIES, rng)
@@ -80,7 +89,7 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
                 preset = preset or 'default'
                 loop = ClosedLoop(arm, networks['default'])
                 loop.approach(start, STARTING)
-                if not loop.core.supervisor.is_running:  # the start is then where it stopped
+                if not loop.core.supervisor.is_running:  # start from where the controller stopped
                     loop = ClosedLoop(arm, networks['default'])
                 loop.use(networks[preset])
                 loop.core.configure(Settings(method=method, preset=preset))
@@ -90,7 +99,8 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
                 tension[name][p, s] = np.linalg.norm(arm.tension)
                 there[name][p, s] = _bound(arm)
     bound = np.array([np.linalg.norm(least) for _, least in held])
-    return Approaches(np.array([theta for theta, _ in held]), bound, offset, tension, there, stops)
+    targets = np.array([theta for theta, _ in held])
+    return Approaches(targets, bound, offset, tension, there, stops)
 
 
 def _bound(arm: Arm) -> float:
@@ -102,7 +112,7 @@ def _bound(arm: Arm) -> float:
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the numbers and traces of one individual."""
+    """Return the results and traces of one individual."""
     networks = {'default': study.network(seed), AS_PRINTED: study.network(seed, AS_PRINTED)}
     ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
@@ -112,9 +122,9 @@ def measure(study: Study, seed: int) -> Measured:
         common, held = offset.mean(axis=1, keepdims=True), np.isfinite(there)
         numbers[name] = {
             'error_rad': float(errors[name].mean()),
-            # Around each θ_eval's own mean: the scatter that hysteresis leaves (paper, §IV-C).
+            # About the mean of each θ_eval: the scatter by hysteresis (paper, §IV-C).
             'error_var': float(errors[name].var(axis=1).mean()),
-            # What every start has in common is the model's, what differs is hysteresis.
+            # The mean offset of all starts is the model's error; the scatter is hysteresis.
             'common_rad': float(np.linalg.norm(common, axis=-1).mean()),
             'scatter_rad': float(np.linalg.norm(offset - common, axis=-1).mean()),
             'tension_n': float(tension.mean()),
@@ -124,24 +134,25 @@ def measure(study: Study, seed: int) -> Measured:
             'reached_holdable_share': float(held.mean()),
             'stops': ended.stops[name],
         }
-    smooth = study.arm(seed, friction=False)
-    numbers['proposed_causes'] = _causes(smooth, networks['default'], ended)
+    frictionless = study.arm(seed, friction=False)
+    numbers['proposed_causes'] = _causes(frictionless, networks['default'], ended)
     return Measured(numbers, {'errors': errors, 'tensions': ended.tension, 'bound': ended.bound})
 
 
-def _causes(smooth: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
-    """Return what `proposed` plans, and what comes of it on the same body without friction.
+def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
+    """Return what `proposed` plans, and its result on the same body without friction.
 
-    The plan's ‖T‖ beside the bound is the learned body's error; what the frictionless arm has
-    beyond it comes from the tensions' being commanded as lengths, and the rest is friction.
+    The ratio of the planned ‖T‖ to the bound shows the error of the learned body. The additional
+    ‖T‖ of the frictionless arm arises because tensions are commanded as lengths. The remainder on
+    the arm with friction is friction.
     """
-    robot, rows = smooth.robot, []
+    robot, rows = frictionless.robot, []
     for theta in ended.target:
         torque = robot.kinematics.holding_torque(theta)
-        none = np.full(robot.muscle_count, robot.tension.bias)
-        plan = proposed(robot, mae, theta, torque, none, robot.tension.limit)
-        ClosedLoop(smooth, mae).approach(theta, DURATION)
-        parts = plan.tension, smooth.tension, smooth.theta - theta
+        bias = np.full(robot.muscle_count, robot.tension.bias)
+        plan = proposed(robot, mae, theta, torque, bias, robot.tension.limit)
+        ClosedLoop(frictionless, mae).approach(theta, DURATION)
+        parts = plan.tension, frictionless.tension, frictionless.theta - theta
         rows.append([np.linalg.norm(part) for part in parts])
     planned, tension, error = np.transpose(rows)
     return {
@@ -154,20 +165,20 @@ def _causes(smooth: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
 CAPTION = (
     'Distance from the target and muscle tension at rest for {}; whiskers: standard deviation over '
     '{}. Dashed: the least ‖T‖ with which the true body can hold the target. `first` and `second` '
-    'rest elsewhere and so may need less.'
+    'come to rest elsewhere and may need less tension there.'
 )
 
 
 def control(_: Study, rows: Rows) -> Plot:
-    """Draw the first individual, a group of bars for each θ_eval."""
-    seed, row = first(rows)
+    """Draw the first individual, with a group of bars for each θ_eval."""
+    seed, row = first_individual(rows)
     labels = [f'θ_eval {p + 1}' for p in range(len(row.traces['bound']))]
     figure = _bars(row.traces, labels, f'individual {seed}')
     return figure, CAPTION.format('every target posture', 'starts')
 
 
 def control_all(_: Study, rows: Rows) -> Plot:
-    """Draw all together, a group of bars for each individual, which has its own θ_eval."""
+    """Draw all individuals, with a group of bars for each; individuals have different θ_eval."""
     traces = [row.traces for row in rows.values()]
     together: dict[str, Any] = {
         key: {name: np.array([trace[key][name].ravel() for trace in traces]) for name in METHODS}
@@ -180,7 +191,10 @@ def control_all(_: Study, rows: Rows) -> Plot:
 
 
 def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
-    """Draw groups of bars, by method (groups, approaches), with the bound of each group."""
+    """Draw groups of bars by method, with the bound of each group.
+
+    `trace` holds errors and tensions by method, (groups, approaches).
+    """
     figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']
     whiskers = {'lw': 1, 'capsize': 2}

@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State estimation and anomaly.
+"""State estimation and anomaly detection.
 
-Paper (§IV-B). The same motions before and after learning, 0.414 → 0.186 rad; the error did not rise
-much when a 3.6 kg dumbbell was grasped; when muscle #2 was deactivated, A rose after learning but
-hardly before.
+Paper (§IV-B). The same motions are estimated before and after learning: 0.414 → 0.186 rad. The
+error hardly rose when a 3.6 kg dumbbell was grasped. When muscle #2 was deactivated, A rose after
+learning but hardly before.
 
-Here. One recording, seen by the networks before and after learning: the held-out motion, with 3.6
-kg in the hand from its middle on; then, weight in hand, every muscle in turn is cut for 3 s and
-mended. A cut comes when the muscle carries more than 10 N above T_bias (waiting up to 14 s; a
-muscle that never does is cut all the same, shown in grey, and not counted). Messages go one by one
-through the detector of the estimator node; detection is the first alarm that begins after the cut,
-and a cut that is not noticed counts 3 s. The right muscle is named if it is the suspect in that
-message. In a second recording, with 20 s of motion before and 20 s after the grasp, every muscle in
-turn is switched off instead, as printed: its module is commanded no tension for 3 s, the wire is
-whole ("switched off"). Healthy messages: the held-out motion and another one with the weight
-grasped and released every minute, an hour over all individuals; false alarms are alarms that begin
-in the latter. AUROC compares d of those with d of cut messages from 0.1 s after the cut.
-"Threshold" is the detector’s, for d; A and d "ruptured min" are the smallest, over muscles, of the
-median while cut. The preset as printed decides on A alone.
+Here. The networks before and after learning process one recording: the held-out motion, with 3.6 kg
+in the hand from its middle on. Then, with the payload, every muscle in turn ruptures for 3 s and is
+mended. A muscle ruptures when it carries more than 10 N above T_bias, after a wait of at most 14 s.
+A muscle that never does ruptures at the end of the wait; it is shown in grey and not counted.
+Messages pass one by one through the detector of the estimator node. A rupture is detected by the
+first alarm that starts after it; an undetected rupture counts with 3 s. It is named correctly if
+the muscle is the suspect in that message. In a second recording, with 20 s of motion before and 20
+s after the grasp, every muscle in turn is switched off instead, as in the paper ("switched off"):
+its module is commanded zero tension for 3 s, and its tendon stays intact. Healthy messages are
+those of the held-out motion and of another motion in which the payload is grasped and released
+every minute, one hour in total over all individuals. False alarms are alarms that start in the
+latter. AUROC compares d of healthy messages with d of messages from 0.1 s after a rupture on.
+"Threshold" is the detector’s threshold of d. A and d "ruptured min" are the smallest median, over
+muscles, during a rupture. Preset `paper` decides on A alone.
 """
 
 from collections.abc import Mapping
@@ -28,13 +29,13 @@ import numpy as np
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.baselines import baseline_errors
 from musculoskeletal_ae.experiments.detection import (
-    CUT_TIME,
     PAYLOAD,
-    GraspAndCut,
+    RUPTURE_TIME,
+    GraspAndRupture,
     anomaly_levels,
     detection,
     grasp_and_release,
-    watch,
+    run_detector,
 )
 from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
@@ -46,105 +47,116 @@ from musculoskeletal_ae.experiments.recording import (
     rows_between,
     times,
 )
-from musculoskeletal_ae.experiments.roles import plotted
-from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.roles import plot_unit
+from musculoskeletal_ae.experiments.study import (
+    Experiment,
+    Measured,
+    Plot,
+    Rows,
+    Study,
+    first_individual,
+)
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 
 HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0  # [s] of motion for false alarms, over all individuals
-SHOWN = 60.0  # [s] before the grasp
-TAIL = 3.0  # [s] after the mending
+PLOT_START = 60.0  # [s] of the plots before the grasp
+PLOT_TAIL = 3.0  # [s] of the plots after mending
 OFF_TIME = 40.0  # [s] of motion before muscles are switched off
-#: moments of the appearance [s]: ends of the motion's cycles, without weight and with it
-MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'weight grasped': 29.9, 'weight, 40 s': 39.9}
+#: moments of the pictures [s]: ends of the motion's cycles, without and with the payload
+MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
 OFF = 'switched_off'
-NOTICED = ('detection_s', 'detected_share', 'named_share')  # of muscles switched off
+OFF_KEYS = ('detection_s', 'detected_share', 'named_share')  # reported for switched-off muscles
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the numbers and traces of one individual."""
+    """Return the results and traces of one individual."""
     robot, networks = study.robot, study.networks(seed)
     printed = study.network(seed, AS_PRINTED)
-    plan = GraspAndCut(robot, study.held_out_time, seed)
+    plan = GraspAndRupture(robot, study.held_out_time, seed)
     driven_by = study.network(None, 'default')
-    taken = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
+    faulty = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
     duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
     stream = HEALTHY_STREAM + seed
     healthy = record(study.arm(seed), driven_by, stream, duration, grasp_and_release)
-    plan_idle = GraspAndCut(robot, OFF_TIME, seed, switched_off=True)
-    idle = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan_idle.duration, plan_idle)
-    watched, well, watched_idle = (
-        {when: watch(robot, mae, recording) for when, mae in networks.items()}
-        for recording in (taken, healthy, idle)
+    plan_off = GraspAndRupture(robot, OFF_TIME, seed, switched_off=True)
+    switched_off = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan_off.duration, plan_off)
+    outputs, healthy_outputs, off_outputs = (
+        {when: run_detector(robot, mae, recording) for when, mae in networks.items()}
+        for recording in (faulty, healthy, switched_off)
     )
     numbers: dict[str, Any] = {}
-    for when, seen in watched.items():
+    for when, output in outputs.items():
         for key, rows in (('', plan.free), ('payload_', plan.loaded)):
-            numbers[f'{when}_{key}rad'] = mean_error(seen.theta[rows], taken.theta[rows])
-        off = np.concatenate([(seen.theta - taken.theta)[plan.while_cut(m)] for m in plan.order])
-        numbers[f'{when}_ruptured_rad'] = mean_error(off, np.zeros_like(off))
-    numbers |= anomaly_levels(plan_idle, watched_idle, well, OFF)
-    numbers |= anomaly_levels(plan, watched, well, 'ruptured')
+            numbers[f'{when}_{key}rad'] = mean_error(output.theta[rows], faulty.theta[rows])
+        difference = output.theta - faulty.theta
+        errors = np.concatenate([difference[plan.while_ruptured(m)] for m in plan.order])
+        numbers[f'{when}_ruptured_rad'] = mean_error(errors, np.zeros_like(errors))
+    numbers |= anomaly_levels(plan_off, off_outputs, healthy_outputs, OFF)
+    numbers |= anomaly_levels(plan, outputs, healthy_outputs, 'ruptured')
     numbers['auroc'] = numbers['d_ruptured_auroc']
-    noticed = detection(robot, plan_idle, watched_idle['after'], well['after'], networks['after'])
-    numbers |= {f'{OFF}_{key}': noticed[key] for key in NOTICED}
-    numbers |= detection(robot, plan, watched['after'], well['after'], networks['after'])
-    by_a, well_by_a = (watch(robot, printed, each) for each in (taken, healthy))
-    numbers |= study.keyed(AS_PRINTED, detection(robot, plan, by_a, well_by_a, printed))
+    mae, healthy_after = networks['after'], healthy_outputs['after']
+    off_numbers = detection(robot, plan_off, off_outputs['after'], healthy_after, mae)
+    numbers |= {f'{OFF}_{key}': off_numbers[key] for key in OFF_KEYS}
+    numbers |= detection(robot, plan, outputs['after'], healthy_after, mae)
+    by_a, healthy_by_a = (run_detector(robot, printed, each) for each in (faulty, healthy))
+    numbers |= study.with_prefix(AS_PRINTED, detection(robot, plan, by_a, healthy_by_a, printed))
     held_out = study.stream(seed, 'held_out')
     for when, mae in networks.items():
         numbers[f'{when}_held_out_rad'] = estimation_error(mae, held_out)
     exploring = study.stream(seed, 'exploring')
     numbers['baselines'] = baseline_errors(robot, study.rests(seed), exploring, held_out)
-    second = plan_idle.order[0]
-    at = float(plan_idle.cut[second]) + 0.9 * CUT_TIME
+    second = plan_off.order[0]
+    at = float(plan_off.rupture[second]) + 0.9 * RUPTURE_TIME
     moments = MOMENTS | {f'#{second + 1} switched off': at}
     steps = [round(time / SAMPLE_TIME) for time in moments.values()]
-    postures = {'arm': idle.theta}
-    postures |= {f'{when} learning': seen.theta for when, seen in watched_idle.items()}
-    pulls = idle.tension[steps]
+    postures = {'arm': switched_off.theta}
+    postures |= {f'{when} learning': output.theta for when, output in off_outputs.items()}
+    tension = switched_off.tension[steps]
     traces = {
         'moments': list(moments),
-        'seen': {name: Motion(theta[steps], pulls) for name, theta in postures.items()},
-        'theta': taken.theta,
-        'watched': watched,
+        'motions': {name: Motion(theta[steps], tension) for name, theta in postures.items()},
+        'theta': faulty.theta,
+        'outputs': outputs,
         'grasp': plan.grasp,
-        'first_cut': robot.muscles[plan.order[0]],
-        'cut': float(plan.cut[plan.order[0]]),
+        'first_ruptured': robot.muscles[plan.order[0]],
+        'rupture': float(plan.rupture[plan.order[0]]),
     }
     return Measured(numbers, traces)
 
 
-def _shown(trace: Mapping[str, Any]) -> tuple[slice, Any]:
-    """Return the messages round grasp and first cut, and their times [s]."""
-    start = max(0.0, trace['grasp'] - SHOWN)
-    rows = rows_between(start, trace['cut'] + CUT_TIME + TAIL)
+def _plot_range(trace: Mapping[str, Any]) -> tuple[slice, Any]:
+    """Return the messages from before the grasp to after the first rupture, and times [s]."""
+    start = max(0.0, trace['grasp'] - PLOT_START)
+    rows = rows_between(start, trace['rupture'] + RUPTURE_TIME + PLOT_TAIL)
     return rows, start + times(len(trace['theta'][rows]))
 
 
 def _mark(axes: Any, trace: Mapping[str, Any]) -> None:
     axes.axvline(trace['grasp'], color=plots.MARK, ls='--', lw=1)
-    axes.axvspan(trace['cut'], trace['cut'] + CUT_TIME, color='#F0E442', alpha=0.5, lw=0)
+    start = trace['rupture']
+    axes.axvspan(start, start + RUPTURE_TIME, color='#F0E442', alpha=0.5, lw=0)
 
 
 def grasp_and_cut(_: Study, rows: Rows) -> Plot:
-    """Draw error, A and d through grasp and cut."""
-    seed, (numbers, trace) = first(rows)
-    shown, time = _shown(trace)
+    """Draw the error, A and d from before the grasp to after the first rupture."""
+    seed, (numbers, trace) = first_individual(rows)
+    shown, time = _plot_range(trace)
     figure, panels = plots.new_figure(12.0, 8.0, 3, sharex=True)
     for panel in panels:
         panel.set_yscale('log')
         _mark(panel, trace)
     for when, colour in plots.WHEN.items():
-        seen = trace['watched'][when]
+        output = trace['outputs'][when]
         free, loaded = numbers[f'{when}_rad'], numbers[f'{when}_payload_rad']
-        label = f'{when} learning ({free:.3f} rad,\nwith weight {loaded:.3f} rad)'
-        error = np.linalg.norm(seen.theta - trace['theta'], axis=1)[shown]
+        label = f'{when} learning ({free:.3f} rad,\nwith payload {loaded:.3f} rad)'
+        error = np.linalg.norm(output.theta - trace['theta'], axis=1)[shown]
         plots.line(panels[0], time, error, 50, color=colour, lw=1, label=label)
-        for panel, values in zip(panels[1:], (seen.anomaly, seen.distance), strict=True):
+        for panel, values in zip(panels[1:], (output.anomaly, output.distance), strict=True):
             plots.line(panel, time, values[shown], color=colour, lw=1, label=f'{when} learning')
     panels[2].axhline(numbers['threshold'], color=plots.TRUE, ls=':', label="detector's threshold")
-    for at, text in ('grasp', f'grasps {PAYLOAD:g} kg'), ('cut', f'{trace["first_cut"]} cut'):
+    ruptured = trace['first_ruptured']
+    for at, text in ('grasp', f'grasps {PAYLOAD:g} kg'), ('rupture', f'{ruptured} ruptures'):
         place = {'transform': panels[0].get_xaxis_transform(), 'ha': 'center'}
         panels[0].text(trace[at], 1.02, text, **place)
     plots.tidy(panels[0], '', '‖θ_est − θ‖ [rad], 0.5 s mean', legend='right')
@@ -152,33 +164,33 @@ def grasp_and_cut(_: Study, rows: Rows) -> Plot:
     plots.tidy(panels[2], 'time [s]', 'd [healthy std. dev.]', legend='right')
     figure.suptitle(f'individual {seed}')
     return figure, (
-        'Estimation error, the anomaly A, and the distance d that the detector judges, on '
-        f'the same recording before and after learning: the arm grasps {PAYLOAD:g} kg (dashed), '
-        f'then {trace["first_cut"]} is cut (yellow) and mended.'
+        'Estimation error, anomaly A, and the distance d on which the detector decides, for '
+        f'the same recording before and after learning. The arm grasps {PAYLOAD:g} kg (dashed); '
+        f'then {ruptured} ruptures (yellow) and is mended.'
     )
 
 
 def appearance(study: Study, rows: Rows) -> Plot:
-    """Draw arm and estimates at some moments of the experiment."""
-    seed, (_, trace) = first(rows)
+    """Draw arm and estimates at several moments of the experiment."""
+    seed, (_, trace) = first_individual(rows)
     moments = {name: step for step, name in enumerate(trace['moments'])}
     title = f'individual {seed}, estimated from lengths and tensions'
-    return plots.pictures(study.robot, trace['seen'], moments, title), (
-        f'The arm (true posture) and its estimates along the experiment: it moves, grasps '
-        f'{PAYLOAD:g} kg, and loses a muscle that is switched off. Colours: measured tensions.'
+    return plots.pictures(study.robot, trace['motions'], moments, title), (
+        'The arm (true posture) and its estimates during the experiment: it moves, grasps '
+        f'{PAYLOAD:g} kg, and one muscle is switched off. Colours: measured tensions.'
     )
 
 
 def tracking(study: Study, rows: Rows) -> Plot:
-    """Draw the joint angles through grasp and cut."""
-    (seed, (_, trace)), robot = first(rows), study.robot
-    shown, time = _shown(trace)
+    """Draw the joint angles from before the grasp to after the first rupture."""
+    (seed, (_, trace)), robot = first_individual(rows), study.robot
+    shown, time = _plot_range(trace)
     count = robot.joint_count
     figure, panels = plots.new_figure(12.0, 1.6 * count + 0.8, count, sharex=True)
     for joint, panel in enumerate(panels):
-        factor, unit = plotted(robot, joint)
+        factor, unit = plot_unit(robot, joint)
         for when, colour in plots.WHEN.items():
-            theta = factor * trace['watched'][when].theta[shown, joint]
+            theta = factor * trace['outputs'][when].theta[shown, joint]
             plots.line(panel, time, theta, color=colour, lw=0.8, label=f'{when} learning')
         true = factor * trace['theta'][shown, joint]
         plots.line(panel, time, true, color=plots.TRUE, lw=1.2, label='true')
@@ -189,13 +201,13 @@ def tracking(study: Study, rows: Rows) -> Plot:
     plots.tidy(panels[0], '', panels[0].get_ylabel(), f'individual {seed}', legend='above')
     panels[-1].set_xlabel('time [s]')
     return figure, (
-        'Joint angles of the same minutes: true, and estimated before and after learning. Dashed: '
-        'grasp; yellow: muscle cut.'
+        'True joint angles, and their estimates before and after learning, in the same period. '
+        'Dashed: grasp; yellow: ruptured muscle.'
     )
 
 
 def cuts(study: Study, rows: Rows) -> Plot:
-    """Draw level and detection of every muscle's cut."""
+    """Draw level and detection delay of every muscle's rupture."""
     robot, numbers = study.robot, [row.numbers for row in rows.values()]
     figure, panels = plots.new_figure(12.0, 0.42 * robot.muscle_count + 1.9, 1, 3, sharey=True)
     place = np.arange(robot.muscle_count)
@@ -206,42 +218,42 @@ def cuts(study: Study, rows: Rows) -> Plot:
             for each in numbers:
                 level = each[f'{letter}{prefix}_ruptured']
                 panel.plot(level, place + shift, 'o', color=colour, alpha=0.6, ms=5)
-            calm = max(each[f'{letter}{prefix}_healthy_max'] for each in numbers)
-            panel.plot([], [], 'o', color=colour, label=f'cut, {when} learning')
-            panel.axvline(calm, color=colour, ls='--', lw=1, label=f'largest healthy, {when}')
-        # A logarithmic axis that begins and ends with a labelled tick.
+            largest = max(each[f'{letter}{prefix}_healthy_max'] for each in numbers)
+            panel.plot([], [], 'o', color=colour, label=f'ruptured, {when} learning')
+            panel.axvline(largest, color=colour, ls='--', lw=1, label=f'largest healthy, {when}')
+        # Begin and end the logarithmic axis at labelled ticks.
         low, high = panel.dataLim.intervalx
         panel.set_xscale('log')
         panel.set_xlim(10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high)))
         plots.tidy(panel, label, legend='below')
     panel = panels[2]
     for each in numbers:
-        for m, cut in enumerate(each['cuts'].values()):
-            marker = 'o' if cut['named'] else 'x'
-            colour = plots.AFTER if cut['carried'] else plots.MARK
-            panel.plot(cut['detection_s'], m, marker, color=colour, ms=6, mfc='none')
-    panel.axvline(0.5, color=plots.TRUE, ls=':', label='aim: 0.5 s')
-    panel.axvline(CUT_TIME, color=plots.BEFORE, ls=':', label='not noticed')
+        for m, rupture in enumerate(each['cuts'].values()):
+            marker = 'o' if rupture['named'] else 'x'
+            colour = plots.AFTER if rupture['carried'] else plots.MARK
+            panel.plot(rupture['detection_s'], m, marker, color=colour, ms=6, mfc='none')
+    panel.axvline(0.5, color=plots.TRUE, ls=':', label='goal: 0.5 s')
+    panel.axvline(RUPTURE_TIME, color=plots.BEFORE, ls=':', label='not detected')
     for marker, colour, label in (
-        ('o', plots.AFTER, 'named'),
+        ('o', plots.AFTER, 'correct muscle named'),
         ('x', plots.AFTER, 'other muscle named'),
-        ('o', plots.MARK, 'slack when cut'),
+        ('o', plots.MARK, 'slack when ruptured'),
     ):
         panel.plot([], [], marker, color=colour, mfc='none', label=label)
-    panel.set(xscale='log', xlim=(0.008, 1.3 * CUT_TIME))
+    panel.set(xscale='log', xlim=(0.008, 1.3 * RUPTURE_TIME))
     plots.tidy(panel, 'time to detection [s]', legend='below')
     panels[0].set_yticks(place, robot.muscles)
     panels[0].invert_yaxis()
-    figure.suptitle('every muscle cut in turn, one point per individual')
+    figure.suptitle('every muscle ruptured in turn, one point per individual')
     return figure, (
-        'Median of A and of d while each muscle is cut, beside the largest value in healthy '
-        'motion (points right of the dashed line of their colour can be told from it), and how '
-        'long the calibrated detector took.'
+        'Left and middle: median of A and of d while each muscle is ruptured. Points to the right '
+        'of the dashed line of their colour exceed every value of healthy motion. Right: the time '
+        'until the calibrated detector reported the rupture.'
     )
 
 
 def baselines(study: Study, rows: Rows) -> Plot:
-    """Draw the errors of older estimators beside the autoencoder's."""
+    """Draw the errors of earlier estimators and of the autoencoder."""
     numbers = [row.numbers for row in rows.values()]
     names = [f'autoencoder, preset {study.preset}', *numbers[0]['baselines']]
     groups = {}
@@ -253,9 +265,9 @@ def baselines(study: Study, rows: Rows) -> Plot:
     title = 'estimators on the same data'
     plots.bars(panel, names, groups, 'mean error [rad], held-out motion', title)
     return figure, (
-        'Joint angle error of the autoencoder and of older estimators on the held-out motion. '
-        'Learning: from the same samples at rest; "whole stream": from all messages at 10 Hz. '
-        'Dots: individuals. The geometric model has nothing to learn.'
+        'Joint-angle error of the autoencoder and of earlier estimators on the held-out motion. '
+        'All learn from the same rest samples, or, with "whole stream", from all messages at '
+        '10 Hz. Dots: individuals. Least squares on the geometric model has nothing to learn.'
     )
 
 

@@ -3,10 +3,10 @@
 
     min_θ Σ_m (l_m − l_m(θ, T))² / (σ_l² + (∂L_e/∂T)² (σ_T² + (μ_m T_m)²))
 
-With the true routes and elastic constants this is the oracle that no estimator can be expected to
-beat: friction is taken as zero and the sensors' bias is unknown. With the geometric model it is the
-classical estimator without any learning, and with the body that a learner fitted it tells what the
-samples leave open from what the network adds.
+On the true routes and elastic constants this is the oracle: a reference that estimators without
+further knowledge can hardly beat. It takes friction as zero and does not know the sensors' offsets.
+On the geometric model it is the classical estimator without learning. On the calibrated body of a
+learner it separates the error of the body from that of the network.
 """
 
 from collections.abc import Callable
@@ -24,24 +24,24 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 ITERATIONS = 30
 DAMPING = 1e-3  # of the normal matrix's diagonal
-EVERY = np.s_[::10]  # of a recording's messages; least squares is slow
-DIFFERENCE = 1e-4  # [rad]
+EVERY = np.s_[::10]  # every tenth message of a recording, because least squares is slow
+DIFFERENCE = 1e-4  # [rad] step of finite differences
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Levenberg–Marquardt on a body model, over many samples at once, within the joint limits."""
+    """Levenberg–Marquardt on a body model for many samples at once, within the joint limits."""
 
     robot: Robot
     lengths: Callable[[Array, Array], Array]  # l [m] (N, M) of θ (N, D) and T [N] (N, M)
     muscle_jacobian: Callable[[Array], Array]  # G [m/rad] (N, M, D) of θ (N, D)
     length_at_zero: Array  # l_abs(0) [m], (M,)
     elastic: SeriesElastic
-    tension_noise: float = TENSION_NOISE  # [N]; without it all muscles have one weight
-    friction: Array | float = 0.0  # μ (M,), where it is known how much each wire rubs
+    tension_noise: float = TENSION_NOISE  # [N]; with 0 all muscles have the same weight
+    friction: Array | float = 0.0  # tendon friction μ (M,), if it is known
 
     def estimate(self, tension: Array, length: Array) -> Array:
-        """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M), started at mid-range."""
+        """Return θ [rad] (N, D) for T [N] (N, M) and l [m] (N, M), starting at mid-range."""
         lower, upper = self.robot.lower, self.robot.upper
         theta = np.tile(0.5 * (lower + upper), (len(tension), 1))
         absolute = self.length_at_zero + self.lengths(theta, np.zeros_like(tension))
@@ -59,12 +59,13 @@ class LeastSquares:
             normal += diagonal[:, :, None] * np.eye(theta.shape[1])
             gradient = np.einsum('nmi,nm->ni', weighted, residual)
             step = np.linalg.solve(normal, gradient[..., None])[..., 0]
-            tried = np.clip(theta + step, lower, upper)
-            tried_residual = length - self.lengths(tried, tension)
-            tried_cost = np.sum(weight * tried_residual**2, axis=1)
-            better = tried_cost < cost
-            theta[better], residual[better] = tried[better], tried_residual[better]
-            cost[better] = tried_cost[better]
+            candidate = np.clip(theta + step, lower, upper)
+            candidate_residual = length - self.lengths(candidate, tension)
+            candidate_cost = np.sum(weight * candidate_residual**2, axis=1)
+            better = candidate_cost < cost
+            theta[better] = candidate[better]
+            residual[better] = candidate_residual[better]
+            cost[better] = candidate_cost[better]
             damping = np.clip(np.where(better, damping * 0.3, damping * 10.0), 1e-6, 1e6)
         return theta
 
@@ -87,17 +88,17 @@ def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
     return LeastSquares(robot, *model, robot.series_elastic, tension_noise)
 
 
-def learned(robot: Robot, body: CalibratedBody) -> LeastSquares:
-    """Return least squares on a body that was fitted, wires in the mean of both directions."""
+def on_calibrated_body(robot: Robot, body: CalibratedBody) -> LeastSquares:
+    """Return least squares on a calibrated body, averaged over both friction directions."""
 
     def lengths(theta: Array, tension: Array) -> Array:
         return body.lengths(theta, tension, np.zeros_like(tension))[0]
 
     def jacobian(theta: Array) -> Array:
-        none = np.zeros((len(theta), robot.muscle_count))
+        zero = np.zeros((len(theta), robot.muscle_count))
         steps = DIFFERENCE * np.eye(robot.joint_count)
-        rise = [lengths(theta + step, none) - lengths(theta - step, none) for step in steps]
-        return np.stack(rise, axis=-1) / (2.0 * DIFFERENCE)
+        change = [lengths(theta + step, zero) - lengths(theta - step, zero) for step in steps]
+        return np.stack(change, axis=-1) / (2.0 * DIFFERENCE)
 
     at_zero, elastic = robot.routes.length_at_zero, robot.series_elastic
     return LeastSquares(robot, lengths, jacobian, at_zero, elastic)
@@ -106,8 +107,8 @@ def learned(robot: Robot, body: CalibratedBody) -> LeastSquares:
 def oracle_errors(arm: Arm, seed: int, recording: Recording) -> dict[str, float]:
     """Return the errors of least squares on an arm's true body [rad].
 
-    `oracle_rad` is on the messages as they came; `sensor_rad` on messages made anew without
-    friction, so that noise and bias of the sensors act alone.
+    `oracle_rad` uses the recorded messages. `sensor_rad` uses messages that are recomputed without
+    friction, so that only noise and offsets of the sensors act.
     """
     body, part = arm.individual, recording.part(EVERY)
     estimator = oracle(arm.robot, body)

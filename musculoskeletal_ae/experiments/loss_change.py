@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulation with another loss.
+"""Simulation under external forces and constraints.
 
-Paper (§IV-D). Elbow bent to 90°, −50 N in z and 50 N in y at the hand, then S-p forced to 30°.
+Paper (§IV-D). The elbow is bent to 90°, −50 N in z and 50 N in y act on the hand, then S-p is
+forced to 30°.
 
-Here. The elbow is flexed to 90°; the hand is pushed with −50 N in z, then with 50 N in y; then the
-shoulder is forced to 30° and let go. The command holds the posture by `proposed` on the learned
-network. The emulated arm is pushed alike; its joints cannot be forced, so that the last two phases
-are the simulator’s alone. On robots without elbow_pitch and shoulder_pitch, joints called elbow and
-shoulder, or else the last and the first, play their parts.
+Here. The elbow is flexed to 90°. A force of −50 N in z acts on the hand, then one of 50 N in y.
+Then the shoulder is forced to 30° and released. `proposed` computes the command that holds the
+posture, with the learned network. The same forces act on the emulated arm. Its joints cannot be
+forced, so only the simulator runs the last two phases. On robots without elbow_pitch and
+shoulder_pitch, joints named elbow and shoulder take their roles, or else the last and the first
+joint.
 """
 
 from typing import Any, NamedTuple
@@ -19,8 +21,15 @@ from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import Motion, columns
-from musculoskeletal_ae.experiments.roles import elbow, flexed, plotted, shoulder, within
-from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.roles import elbow, flexed, plot_unit, shoulder, within
+from musculoskeletal_ae.experiments.study import (
+    Experiment,
+    Measured,
+    Plot,
+    Rows,
+    Study,
+    first_individual,
+)
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -31,12 +40,12 @@ FORCED = 30.0  # [deg]
 
 
 class Phase(NamedTuple):
-    """What is done for how long."""
+    """One phase of the experiment: its duration, and the force and constraint that act."""
 
     name: str
     duration: float  # [s]
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)  # on the hand [N]
-    forced: bool = False  # whether the shoulder is held
+    forced: bool = False  # whether the shoulder is forced to `FORCED`
 
 
 PHASES = (
@@ -47,19 +56,19 @@ PHASES = (
     Phase('released', 3.0),
 )
 SETTLING = Phase('settling', 5.0)  # of the emulated arm
-SHARED = PHASES[:3]  # with the emulated arm
-ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1
+SHARED = PHASES[:3]  # phases that the emulated arm goes through as well
+ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1  # steps
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the numbers and traces of one individual."""
+    """Return the results and traces of one individual."""
     robot, networks = study.robot, study.networks(seed)
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[elbow(robot)] = flexed(robot)
     command = _command(robot, networks['after'], theta)
-    traces = {'arm': _pushed(study.arm(seed), command)}
+    traces = {'arm': _run_arm(study.arm(seed), command)}
     for when, mae in networks.items():
-        traces[when] = _simulated(Simulation(robot, mae, study.preset), robot, command)
+        traces[when] = _run_simulator(Simulation(robot, mae, study.preset), robot, command)
     numbers: dict[str, Any] = {
         'flexed_joint': robot.joints[elbow(robot)],
         'flexed_rad': float(theta[elbow(robot)]),
@@ -79,7 +88,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _command(robot: Robot, mae: Mae, theta: Array) -> Array:
-    """Return the lengths that hold a posture, by `proposed` on the learned network."""
+    """Return the lengths with which `proposed` holds a posture, by a network."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
         return robot.muscle_lengths(theta, np.full(robot.muscle_count, robot.tension.bias))
@@ -87,7 +96,7 @@ def _command(robot: Robot, mae: Mae, theta: Array) -> Array:
     return proposed(robot, mae, theta, torque, start.tension, limits.limit).length
 
 
-def _simulated(simulated: Simulation, robot: Robot, command: Array) -> Motion:
+def _run_simulator(simulated: Simulation, robot: Robot, command: Array) -> Motion:
     simulated.command = command[None]
     simulated.settle()
     rows = []
@@ -103,7 +112,7 @@ def _simulated(simulated: Simulation, robot: Robot, command: Array) -> Motion:
     return Motion(*columns(rows))
 
 
-def _pushed(arm: Arm, command: Array) -> Motion:
+def _run_arm(arm: Arm, command: Array) -> Motion:
     rows = []
     for phase in (SETTLING, *PHASES):
         arm.set_wrench(np.array([*phase.force, 0.0, 0.0, 0.0]))
@@ -115,7 +124,7 @@ def _pushed(arm: Arm, command: Array) -> Motion:
 
 
 def _phases(numbers: dict[str, Any]) -> list[str]:
-    """Return the phases' names with the joints and angles of this robot."""
+    """Return the names of the phases, with the joints and angles of this robot."""
     flexed_deg, forced_deg = np.degrees([numbers['flexed_rad'], numbers['forced_rad']])
     names = [phase.name for phase in PHASES]
     names[0] = f'{numbers["flexed_joint"]}\n{flexed_deg:.0f}°'
@@ -124,22 +133,22 @@ def _phases(numbers: dict[str, Any]) -> list[str]:
 
 
 def loss_change(study: Study, rows: Rows) -> Plot:
-    """Draw angles and tensions over time."""
-    (seed, row), robot = first(rows), study.robot
+    """Draw joint angles and tensions over time."""
+    (seed, row), robot = first_individual(rows), study.robot
     figure, panels = plots.new_figure(12.0, 7.4, 2, sharex=True)
     after, arm = row.traces['after'], row.traces['arm']
     time = STEP * np.arange(len(after.theta))
     edges = np.cumsum([0.0, *(phase.duration for phase in PHASES)])
     shared = time < edges[len(SHARED)] - 1e-9
-    degrees = [(*plotted(robot, joint), name) for joint, name in enumerate(robot.joints)]
+    degrees = [(*plot_unit(robot, joint), name) for joint, name in enumerate(robot.joints)]
     newtons = [(1.0, 'N', name) for name in robot.muscles]
     for panel, key, lines in zip(panels, Motion._fields, (degrees, newtons), strict=True):
         for i, (factor, unit, name) in enumerate(lines):
             label = name if unit in ('deg', 'N') else f'{name} [{unit}]'
             simulated = factor * getattr(after, key)[:, i]
             panel.plot(time, simulated, color=f'C{i}', lw=1.6, label=label)
-            moved = np.where(shared, factor * getattr(arm, key)[:, i], np.nan)
-            panel.plot(time, moved, color=f'C{i}', lw=1.0, ls='--')
+            emulated = np.where(shared, factor * getattr(arm, key)[:, i], np.nan)
+            panel.plot(time, emulated, color=f'C{i}', lw=1.0, ls='--')
         panel.plot([], [], color=plots.TRUE, lw=1.6, label='simulator after learning')
         panel.plot([], [], color=plots.TRUE, lw=1.0, ls='--', label='emulated arm')
         for edge in edges[1:-1]:
@@ -152,14 +161,14 @@ def loss_change(study: Study, rows: Rows) -> Plot:
         panels[0].text(at, 1.02, name, transform=panels[0].get_xaxis_transform(), **style)
     figure.suptitle(f'individual {seed}')
     return figure, (
-        'The simulator after learning while the hand is pushed and a joint is forced, beside the '
-        'emulated arm under the same pushes (dashed; its joints cannot be forced).'
+        'The simulator after learning while forces act on the hand and a joint is forced. '
+        'Dashed: the emulated arm under the same forces (its joints cannot be forced).'
     )
 
 
 def loss_change_pictures(study: Study, rows: Rows) -> Plot:
     """Draw the arm at the end of each phase."""
-    seed, (numbers, traces) = first(rows)
+    seed, (numbers, traces) = first_individual(rows)
     names = [name.replace('\n', ' ') for name in _phases(numbers)[:4]]
     moments = dict(zip(names, map(int, ENDS[:4]), strict=True))
     motions = {f'{when} learning': traces[when] for when in plots.WHEN}

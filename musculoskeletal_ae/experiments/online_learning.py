@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Online learning.
 
-Paper (§IV-A). Ten minutes of random motion in three steps (5 s first, 2 s second, 3 s random
-tension, T_bias 30 N, T_limit 200 N) while learning; the exponential fit of the error went from
-0.324 to 0.154 rad.
+Paper (§IV-A). The arm learns during ten minutes of random motion in three steps (5 s `first`, 2 s
+`second`, 3 s random tension, T_bias 30 N, T_limit 200 N). The exponential fit of the error falls
+from 0.324 to 0.154 rad.
 
-Here. The initial network knows the geometric model only. Each preset explores by itself, as the
-nodes do: in closed loop through estimate and controller, with the network that is being learned.
-The preset as printed goes to random postures; the default one takes a quarter of the joints’
-targets at their limits, where stops tell zeros of joint sensors. "Same stream" is that preset
-taught by the messages of the default one’s exploration. All are judged on one held-out motion,
-which follows a fixed list of commands, to random postures, from a stream that is never used for
-learning; its error is the mean over all messages at 100 Hz, moving and resting, of ‖θ_est − θ_true‖
-over all joints, with the true angles of the emulator. Oracle: weighted least squares on one message
-with the true routes, elastic constants and noise, friction taken as zero.
+Here. The initial network knows only the geometric model. Each preset explores by itself, as the
+nodes do: in closed loop through estimator and controller, with the network that is being trained.
+Preset `paper` moves to random postures. The default preset puts a quarter of the joint targets at
+their limits, where stops reveal the offsets of the joint sensors. "Same stream" is preset `paper`
+trained on the messages of the default preset’s exploration. All are evaluated on one held-out
+motion, a fixed list of commands to random postures from a random stream that is never used for
+learning. The error is the mean of ‖θ_est − θ_true‖ over all joints and all messages at 100 Hz, in
+motion and at rest, with the true joint angles of the emulator. Oracle: weighted least squares on
+one message with the true routes, elastic constants and noise; friction is taken as zero.
 """
 
 import json
@@ -27,7 +27,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments import plots
-from musculoskeletal_ae.experiments.least_squares import learned, oracle_errors
+from musculoskeletal_ae.experiments.least_squares import on_calibrated_body, oracle_errors
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
@@ -36,11 +36,18 @@ from musculoskeletal_ae.experiments.recording import (
     Recording,
     columns,
     estimation_error,
-    judge,
+    make_error_function,
     record,
     times,
 )
-from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rests, Rows, Study
+from musculoskeletal_ae.experiments.study import (
+    Experiment,
+    Measured,
+    Plot,
+    RestSamples,
+    Rows,
+    Study,
+)
 from musculoskeletal_ae.learning.collector import SENSOR
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
@@ -52,47 +59,48 @@ from musculoskeletal_ae.mae.units import Mask, State, scale_vector
 from musculoskeletal_ae.presets.registry import AS_PRINTED, PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-CURVE_STRIDE = 10  # of held-out messages, after every update
-FIRST_ERRORS = 10.0  # [s] whose mean starts the exponential fit
+CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
+FIRST_ERRORS = 10.0  # [s] over which the mean error is the start of the exponential fit
 PRINTED_MINUTES = 10.0
 PRINTED = (0.324, 0.154)  # [rad] the printed fit at the start and after ten minutes
-QUICK_STEPS = 600  # of initial training: with fewer a network as printed is rejected
-NOTED, TESTED = 25, 1000  # mini-batches between two of which errors are noted, states of a test
+QUICK_STEPS = 600  # of initial training; with fewer, a network of preset `paper` is rejected
+NOTE_EVERY = 25  # mini-batches between two records of the training errors
+TEST_STATES = 1000  # number of test states
 COLOURS = {AS_PRINTED: plots.AS_PRINTED, 'default': plots.AFTER}
 
-#: told learner, number of a message, true θ and what joint sensors read [rad] (D,); returns the θ
-#: that the learner is told, or None
-See = Callable[[Learner, int, Array, Array], Array | None]
+#: maps the learner, the number of a message, true θ and joint-sensor readings [rad] (D,) to the θ
+#: that the learner receives, or None
+JointView = Callable[[Learner, int, Array, Array], Array | None]
 
 
 class Curve(NamedTuple):
-    """Learning over one stream of N messages."""
+    """The course of learning over one stream of N messages."""
 
-    samples: list[int]  # before learning and after each update
-    errors: list[float]  # held-out error then [rad]
-    running: Array  # ‖θ_est − θ_sensor‖ of each message, by the network of the moment [rad], (N,)
+    samples: list[int]  # number of samples before learning and after each update
+    errors: list[float]  # held-out errors at the same times [rad]
+    running: Array  # ‖θ_est − θ_sensor‖ of each message by the network at the time [rad], (N,)
 
 
 def teach(
     learner: Learner,
     stream: Iterable[tuple[Array, ...]],
-    see: See = lambda _learner, _n, _true, read: read,
+    view: JointView = lambda _learner, _n, _true, read: read,
 ) -> None:
     """Feed messages, rows of a recording, to a learner as the node would.
 
-    θ is what joint sensors read, unless `see` says otherwise.
+    The learner receives the joint-sensor readings, unless `view` replaces them.
     """
     for n, (true, read, length, tension, _) in enumerate(stream):
-        learner.step(n * SAMPLE_TIME, see(learner, n, true, read), tension, length)
+        learner.step(n * SAMPLE_TIME, view(learner, n, true, read), tension, length)
 
 
-def follow(
+def teach_and_evaluate(
     learner: Learner, stream: Iterable[tuple[Array, ...]], held_out: Recording
 ) -> tuple[Curve, Recording]:
-    """Do as `teach`, and judge the learner on the held-out motion; return the messages, too."""
+    """Feed messages to a learner and evaluate it on the held-out motion; return the messages."""
     samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
     errors, mae, direction = list[float](), None, FrictionDirection()
-    error = judge(held_out, CURVE_STRIDE)
+    error = make_error_function(held_out, CURVE_STRIDE)
     for n, row in enumerate(stream):
         if learner.mae is not mae:
             mae = learner.mae
@@ -109,7 +117,7 @@ def follow(
 
 
 def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:
-    """Yield messages of an arm that explores for so long [s] with what the learner has learned."""
+    """Yield messages of an arm that explores for a time [s], always with the learner's network."""
     for _ in range(round(duration / SAMPLE_TIME)):
         if learner.mae is not loop.mae:
             loop.use(learner.mae)
@@ -117,12 +125,12 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
 
 
 def train_initial(study: Study, preset: str) -> None:
-    """Train a network on the geometric model; keep it, and how its errors fell."""
+    """Train a network on the geometric model; save it and the course of its errors."""
     robot, rows = study.robot, list[list[float]]()
-    test = preset_named(preset).training_states(robot, TESTED, np.random.default_rng([0, 2]))
+    test = preset_named(preset).training_states(robot, TEST_STATES, np.random.default_rng([0, 2]))
 
     def note(step: int, _: float, network: Network, batch: Array) -> None:
-        if step % NOTED:
+        if step % NOTE_EVERY:
             return
         mae = to_mae(network, robot.joints, robot.muscles, preset, '')
         joints, muscles = robot.joint_count, robot.muscle_count
@@ -136,49 +144,52 @@ def train_initial(study: Study, preset: str) -> None:
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
 
-def pupil(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
-    """Return a learner that begins with the initial network; see `Learner` for its θ's source."""
+def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
+    """Return a learner that starts with the initial network; `source` is its source of θ."""
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
 
 
-def beginner(study: Study, arm: Arm, seed: int, preset: str) -> tuple[Learner, ClosedLoop]:
-    """Return a pupil and the arm that it is to explore."""
-    learner = pupil(study, seed, preset)
+def new_learner_and_loop(
+    study: Study, arm: Arm, seed: int, preset: str
+) -> tuple[Learner, ClosedLoop]:
+    """Return a learner that starts with the initial network, and the loop of the arm to explore."""
+    learner = new_learner(study, seed, preset)
     settings = Settings(preset=preset)
     return learner, ClosedLoop(arm, learner.mae, settings, EXPLORATION_STREAM + seed)
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Let an individual explore and learn with both presets, and keep all."""
+    """Let an individual explore and learn with both presets; save streams, networks and results."""
     driven_by = study.network(None, 'default')
     held_out = record(study.arm(seed), driven_by, HELD_OUT_STREAM, study.held_out_time)
-    study.keep(seed, held_out=held_out)
+    study.save(seed, held_out=held_out)
     numbers, traces = oracle_errors(study.arm(seed), seed, held_out), {}
     for preset in PRESETS:
         initial = study.network(None, preset)
-        learner, loop = beginner(study, study.arm(seed), seed, preset)
-        curve, stream = follow(learner, explore(loop, learner, 60.0 * study.minutes), held_out)
+        learner, loop = new_learner_and_loop(study, study.arm(seed), seed, preset)
+        exploration = explore(loop, learner, 60.0 * study.minutes)
+        curve, stream = teach_and_evaluate(learner, exploration, held_out)
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         if learner.trainer.body is not None:
-            study.keep(seed, exploring=stream, rests=_rests(learner))
-            body = learned(study.robot, learner.trainer.body)
+            study.save(seed, exploring=stream, rests=_rests(learner))
+            body = on_calibrated_body(study.robot, learner.trainer.body)
             numbers = {'body_rad': body.error(held_out), **numbers}
         values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
-        numbers |= study.keyed(preset, values)
+        numbers |= study.with_prefix(preset, values)
         traces[preset] = curve, values
-    listener = pupil(study, seed, AS_PRINTED)
-    teach(listener, zip(*study.stream(seed, 'exploring'), strict=True))
-    numbers[f'{AS_PRINTED}_same_stream_after_rad'] = estimation_error(listener.mae, held_out)
+    learner = new_learner(study, seed, AS_PRINTED)
+    teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
+    numbers[f'{AS_PRINTED}_same_stream_after_rad'] = estimation_error(learner.mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 
 
-def _rests(learner: Learner) -> Rests:
+def _rests(learner: Learner) -> RestSamples:
     if not len(learner.samples):
-        return Rests(*np.empty((3, 0, 0)))
-    seen = learner.samples.observations()
-    return Rests(seen.theta, seen.tension, seen.length)
+        return RestSamples(*np.empty((3, 0, 0)))
+    stored = learner.samples.observations()
+    return RestSamples(stored.theta, stored.tension, stored.length)
 
 
 def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) -> dict[str, float]:
@@ -189,7 +200,7 @@ def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) 
         'after_rad': estimation_error(learner.mae, held_out),
         'samples': float(curve.samples[-1]),
         'updates': float(learner.updates),
-        # A stream that never halved the error counts with all its samples.
+        # If the error was never halved, count all samples.
         'samples_to_halve': float(curve.samples[-1] if halved is None else halved),
         'halved': float(halved is not None),
         'fit_start_rad': float(fit[0]),
@@ -198,13 +209,13 @@ def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) 
 
 
 def samples_to_halve(curve: Curve) -> int | None:
-    """Return how many samples it took to halve the error for good; None if it never did."""
+    """Return the number of samples after which the error stays halved; None if it never does."""
     above = [i for i, error in enumerate(curve.errors) if error > 0.5 * curve.errors[0]]
     return None if above[-1] + 1 >= len(curve.errors) else curve.samples[above[-1] + 1]
 
 
 def exponential_fit(time: Array, error: Array) -> Array:
-    """Return a + b e^{−t/c} at the times [s] of errors, fitted to them (paper, §IV-A) [rad]."""
+    """Fit a + b e^{−t/c} to errors [rad] at times [s] (paper, §IV-A); return its values there."""
 
     def model(t: Array, a: float, b: float, c: float) -> Array:
         values: Array = a + b * np.exp(-t / c)
@@ -218,7 +229,7 @@ def exponential_fit(time: Array, error: Array) -> Array:
 
 
 def initial_training(study: Study, _: Rows) -> Plot:
-    """Draw each error of both presets over the initial training."""
+    """Draw the errors of both presets during initial training."""
     figure, panels = plots.new_figure(12.0, 6.2, 2, 3, sharex='row')
     for p, (preset, colour) in enumerate(COLOURS.items()):
         step, *errors = np.load(study.folder / f'{preset}_initial.npy').T
@@ -231,9 +242,9 @@ def initial_training(study: Study, _: Rows) -> Plot:
             plots.tidy(panel, 'mini-batches' if p else '', f'mean norm [{unit}]', title)
         panels[3 * p].legend(fontsize=9)
     return figure, (
-        'Errors ‖θ − θ_calc‖, ‖T − T_calc‖ and ‖l − l_calc‖ in initial training, means over the '
-        'three masks: of the mini-batch (thin) and of states of the geometric model that are never '
-        'trained on (bold).'
+        'Errors ‖θ − θ_calc‖, ‖T − T_calc‖ and ‖l − l_calc‖ during initial training, means over '
+        'the three masks. Thin: the mini-batch. Bold: states of the geometric model that are not '
+        'used for training.'
     )
 
 
@@ -266,16 +277,16 @@ def online_learning(study: Study, rows: Rows) -> Plot:
         left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=label)
     oracle = float(np.mean([row.numbers['oracle_rad'] for row in rows.values()]))
     right.axhline(oracle, color=plots.MARK, ls=':', label=f'oracle {oracle:.3f} rad')
-    xlabel, ylabel = 'time of exploration [min]', '‖θ_est − θ_sensor‖ [rad]'
+    xlabel, ylabel = 'exploration time [min]', '‖θ_est − θ_sensor‖ [rad]'
     plots.tidy(left, xlabel, ylabel, 'while exploring', legend='below')
     title = 'held-out motion, each individual'
-    plots.tidy(right, 'samples at rest', 'mean error [rad]', title, legend='below')
+    plots.tidy(right, 'rest samples', 'mean error [rad]', title, legend='below')
     for panel in (left, right):
         panel.set_ylim(bottom=0.0)
     return figure, (
-        'Left: error of the estimate during online learning (10 s running means; bold: mean over '
-        f'individuals {", ".join(map(str, rows))}, pale: each), with the exponential fit of the '
-        'paper. Right: error on the motion never used for learning, after every update.'
+        'Left: estimation error during online learning (10 s running means; bold: mean over '
+        f'individuals {", ".join(map(str, rows))}, pale: each individual), with the exponential '
+        'fit of the paper. Right: error on the held-out motion after every update.'
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all plots share: colours, axes, legends, and pictures of arms in rows and columns."""
+"""Shared plot elements: colours, axes, legends, and pictures of arms in rows and columns."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -13,23 +13,23 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 
-# Told apart by people who see colours differently, and in grey.
-# The page draws the estimated arm in the colour of AFTER.
+# Distinguishable with colour-vision deficiency and in grey.
+# The web page draws the estimated arm in the colour of AFTER.
 BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
 #: before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110
-POINTS = 1500  # most samples that a line is drawn with
+POINTS = 1500  # largest number of points of a line
 
-#: places of legends in which they never hide data
+#: positions of legends that never hide data
 LEGENDS: dict[str, dict[str, Any]] = {
     'right': {'loc': 'center left', 'bbox_to_anchor': (1.0, 0.5)},
     'above': {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncols': 4, 'frameon': False},
     'below': {'loc': 'upper center', 'bbox_to_anchor': (0.5, -0.16), 'ncols': 2},
 }
 MARGIN = 0.03  # [m] round an arm
-HEADER = 0.9  # [inch] for the titles
-VIEW = (12.0, -35.0)  # [deg] elevation, azimuth: from the front, a little from the side
+HEADER = 0.9  # [inch] height of the titles
+VIEW = (12.0, -35.0)  # [deg] elevation, azimuth: mainly from the front
 STYLES: dict[str, dict[str, Any]] = {
     'bones': {'linewidth': 6.0, 'solid_capstyle': 'round', 'zorder': 1},
     'muscles': {'linewidth': 2.0, 'zorder': 2},
@@ -37,13 +37,13 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> Any:
-    """Return a figure [inch] and its axes, row by row."""
+    """Return a figure of a size [inch], and its axes row by row."""
     figure = Figure(figsize=(width, height), layout='constrained')
     return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
 
 def tidy(axes: Any, xlabel: str = '', ylabel: str = '', title: str = '', legend: str = '') -> None:
-    """Label axes that are drawn: light grid, no box, a legend in one of the places of `LEGENDS`."""
+    """Label axes; add a light grid and a legend at a position of `LEGENDS`, and remove the box."""
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.set_title(title, loc='left' if legend == 'above' else 'center')
     axes.grid(alpha=0.25)
@@ -54,9 +54,9 @@ def tidy(axes: Any, xlabel: str = '', ylabel: str = '', title: str = '', legend:
 
 
 def line(axes: Any, x: Any, y: Any, window: int = 1, **style: Any) -> None:
-    """Draw a line of at most `POINTS` points through y, or its centred mean over a window."""
+    """Draw the centred mean of y over `window` samples as a line of at most `POINTS` points."""
     step, kernel = max(1, len(x) // POINTS), np.ones(max(1, min(window, len(y))))
-    # Shorter windows at the ends.
+    # The window is shorter at the ends.
     count = np.convolve(np.ones(len(y)), kernel, mode='same')
     axes.plot(x[::step], (np.convolve(y, kernel, mode='same') / count)[::step], **style)
 
@@ -64,9 +64,9 @@ def line(axes: Any, x: Any, y: Any, window: int = 1, **style: Any) -> None:
 def bars(
     panel: Any, names: Sequence[str], groups: Mapping[str, tuple[str, Any]], xlabel: str, title: str
 ) -> None:
-    """Draw means over N individuals as bars with their numbers, and a dot for each individual.
+    """Draw means over N individuals as bars with their values, and a dot for each individual.
 
-    Groups, by their label, are colours and values (N, K) of the K names; NaN: there is none.
+    `groups` maps labels to a colour and values (N, K) of the K names; NaN stands for no value.
     """
     place, height = np.arange(len(names)), 0.8 / len(groups)
     for g, (label, (colour, values)) in enumerate(groups.items()):
@@ -93,7 +93,7 @@ def ranked_bars(
 ) -> None:
     """Draw one bar per name: the mean over individuals, a dot for each, and the mean in a column.
 
-    Values are by name; None: there is none.
+    `values` are by name; None stands for no value.
     """
     place = np.arange(len(values))
     numbers = {name: np.array(each, dtype=float) for name, each in values.items()}
@@ -102,7 +102,7 @@ def ranked_bars(
     for at, each, mean in zip(place, numbers.values(), means):
         panel.plot(each, [at] * len(each), 'o', color=TRUE, ms=4, mfc='white', mew=1.0)
         text = 'none' if np.isnan(mean) else f'{mean:.{digits}f}'
-        # In a column beside the axes, where it hides no dot.
+        # The column lies beside the axes, where it hides no dot.
         style = {'textcoords': panel.get_yaxis_transform(), 'va': 'center', 'fontsize': 9}
         panel.annotate(text, (0.0, at), (1.02, at), annotation_clip=False, **style)
     heading = {'va': 'bottom', 'fontsize': 9, 'fontweight': 'bold'}
@@ -116,22 +116,22 @@ def ranked_bars(
 def pictures(
     robot: Robot, motions: Mapping[str, Motion], moments: Mapping[str, int], title: str
 ) -> Figure:
-    """Draw arms, a row for each motion and a column for each moment (which step), by their names.
+    """Draw arms in a grid: a row for each motion, and a column for each moment (index of a step).
 
-    Bones are grey, muscles green at T_bias and red at T_limit.
+    Bones are grey; muscles are green at T_bias and red at T_limit.
     """
     rows, columns = len(motions), len(moments)
     height = 2.6 * rows + HEADER
     figure = Figure(figsize=(2.5 * columns + 0.4, height))
-    # A layout engine would make room for the empty corners of the boxes that arms stand in.
+    # A layout engine would reserve space for the empty corners of the 3D boxes.
     figure.subplots_adjust(0.04, 0.02, 1.0, 1.0 - HEADER / height, 0.0, 0.05)
     steps = list(moments.values())
     postures = np.concatenate([motion.theta[steps] for motion in motions.values()])
     tips = [robot.kinematics.end_effector_pose(theta).translation for theta in postures]
     points = np.vstack([robot.routes.points(postures).reshape(-1, 3), *tips, np.zeros(3)])
     low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
-    every = product(motions.items(), moments.items())
-    for place, ((name, motion), (moment, step)) in enumerate(every):
+    cells = product(motions.items(), moments.items())
+    for place, ((name, motion), (moment, step)) in enumerate(cells):
         axes: Any = figure.add_subplot(rows, columns, place + 1, projection='3d')
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         axes.set_box_aspect(tuple(high - low), zoom=1.5)

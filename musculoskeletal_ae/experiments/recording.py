@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulated arms driven in closed loop or by a list of commands, and what their sensors said."""
+"""Emulated arms driven in closed loop or by a list of commands, and recordings of their sensors."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions, end_tension
 
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
-#: random streams of the exploration (plus the individual's seed), and of the held-out motion
+#: random seeds of the exploration (plus the individual's seed) and of the held-out motion
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
-#: told the arm and the time [s] before every step; may put weights into its hand or cut muscles,
-#: and says which ones (M,) are switched off, if any are
+#: called with the arm and the time [s] before every step; may attach a payload or rupture muscles,
+#: and returns which muscles (M,) are switched off, or None
 Script = Callable[[Arm, float], Bools | None]
 
 
@@ -36,13 +36,13 @@ class Recording(NamedTuple):
     """N samples of one arm at 100 Hz."""
 
     theta: Array  # true joint angles [rad], (N, D)
-    theta_sensor: Array  # what the joint sensors read [rad], (N, D)
+    theta_sensor: Array  # joint-sensor readings [rad], (N, D)
     length: Array  # measured [m], (N, M)
     tension: Array  # measured [N], (N, M)
     command: Array  # l_target [m], (N, M)
 
     def part(self, rows: slice) -> Recording:
-        """Return some of the samples."""
+        """Return a part of the samples."""
         return Recording(*(column[rows] for column in self))
 
 
@@ -54,50 +54,51 @@ class Motion(NamedTuple):
 
 
 class ClosedLoop:
-    """An arm, its controller and the estimate, as the nodes connect them.
+    """An arm, the estimate and the controller, connected as the nodes connect them.
 
     sense → estimate → control → command
     """
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
-        """Connect an arm where it is; the random seed is that of the exploration."""
+        """Connect an arm in its present posture; `seed` is that of the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self._direction = FrictionDirection()
         self._read, self._now = arm.sense(), 0.0
         self.use(mae)
 
     def use(self, mae: Mae) -> None:
-        """Estimate and control by another network."""
+        """Use a network for estimation and control."""
         self.mae = mae
         self.core.use(mae)
 
     def step(self) -> tuple[Array, ...]:
-        """Let a message's time pass; return the columns of a recording."""
+        """Advance by one message; return a row of a recording."""
         arm, core, read, now = self.arm, self.core, self._read, self._now
-        with suppress(MessageError):  # which nodes count, and control waits for better ones
+        with suppress(MessageError):  # the nodes count and drop bad messages
             core.muscles(np.array([read.length, read.tension, read.temperature]), now)
             core.estimated(self.estimate(read, now), now)
         command = core.step(now)
-        self.commanded(command, now)
+        self.on_command(command, now)
         if command is not None:
             follow = arm.command_length if command.kind == LENGTH else arm.command_tension
             follow(command.value)
         arm.step(SAMPLE_TIME)
-        self._read, self._now = arm.sense(), now + SAMPLE_TIME
-        told, sent = self._read, read.length if command is None else command.value
-        return arm.theta, told.theta, told.length, told.tension, sent
+        reading = arm.sense()
+        self._read, self._now = reading, now + SAMPLE_TIME
+        sent = read.length if command is None else command.value
+        return arm.theta, reading.theta, reading.length, reading.tension, sent
 
-    def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (of others)
-        """Return θ [rad] (D,) from what was read at `now` [s]."""
+    def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (for subclasses)
+        """Estimate θ [rad] (D,) from the readings at `now` [s]."""
         friction, length = self.mae.friction, read.length
         end = self._direction.end_tension(friction, read.tension, length)
         return self.mae.estimate(end, length).theta
 
-    def commanded(self, command: Command | None, now: float) -> None:
-        """Take what is commanded at `now` [s]."""
+    def on_command(self, command: Command | None, now: float) -> None:
+        """Handle the command at `now` [s]; subclasses override this."""
 
     def explore(self) -> tuple[Array, ...]:
-        """Make a step of exploring; what stopped the arm is reset once its cause is gone."""
+        """Make a step of exploration; first reset a stop whose cause has cleared."""
         core = self.core
         supervisor = core.supervisor
         if not supervisor.is_running and core.reset(self._now) is None:
@@ -107,7 +108,7 @@ class ClosedLoop:
         return self.step()
 
     def go(self, theta: Array, duration: float) -> None:
-        """Go to θ [rad] (D,) within a time [s].
+        """Move to θ [rad] (D,) within a time [s].
 
         Raises:
             MusculoskeletalError: If the controller stopped on the way.
@@ -116,7 +117,7 @@ class ClosedLoop:
         self.check()
 
     def approach(self, theta: Array, duration: float) -> None:
-        """Go towards θ [rad] (D,) for a time [s]; whether the controller stopped is not asked."""
+        """Move towards θ [rad] (D,) for a time [s]; a stop of the controller is not reported."""
         self.target(theta)
         self.wait(duration)
 
@@ -127,11 +128,11 @@ class ClosedLoop:
             raise MusculoskeletalError(f'control stopped: {condition}')
 
     def target(self, theta: Array) -> None:
-        """Let θ [rad] (D,) be the target."""
+        """Set the target θ [rad] (D,)."""
         self.core.target(dict(zip(self.arm.robot.joints, ((t, 0.0) for t in theta.tolist()))))
 
     def wait(self, duration: float) -> None:
-        """Let time pass [s]."""
+        """Advance the time by `duration` [s]."""
         for _ in range(round(duration / SAMPLE_TIME)):
             self.step()
 
@@ -139,16 +140,22 @@ class ClosedLoop:
 def record(
     arm: Arm, mae: Mae, stream: int | Iterable[Step], duration: float, script: Script | None = None
 ) -> Recording:
-    """Drive an arm on through the exploration's three steps, as one fixed list of commands.
+    """Drive an arm through the three steps of exploration with a fixed list of commands.
 
-    Each command is `first`'s. `second` needs the tension of the moment, which a fixed list cannot
-    know: the least tension that holds the posture on the geometric model stands in for it. While a
-    muscle is switched off all are commanded tensions: its own is 0 N, the others' as MSC has them.
-    The stream is the random seed of the postures, or the steps themselves; the duration [s] is
-    rounded up to whole steps.
+    Every command is that of `first`. `second` needs the current tension, which a fixed list cannot
+    contain; the least tension that holds the posture on the geometric model replaces it. While a
+    muscle is switched off, all modules follow tensions: 0 N for this muscle, and the tensions of
+    MSC for the others.
+
+    Args:
+        arm: The arm.
+        mae: The network that computes the commands.
+        stream: Random seed of the postures, or the steps themselves.
+        duration: Duration [s], rounded up to whole steps.
+        script: Called before every message.
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
-    # The first ramp starts where the arm is, so that it does not jump.
+    # The first ramp starts at the present lengths, so that the command does not jump.
     robot, read = arm.robot, arm.sense()
     command = read.length
     for step in Exploration(robot, stream, AS_PRINTED) if isinstance(stream, int) else stream:
@@ -176,7 +183,7 @@ def columns(rows: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 
 def times(count: int) -> Array:
-    """Return the times of so many rows of a recording [s]."""
+    """Return the times of the first `count` rows of a recording [s]."""
     return np.asarray(SAMPLE_TIME * np.arange(count), dtype=np.float64)
 
 
@@ -191,15 +198,15 @@ def mean_error(estimate: Array, truth: Array) -> float:
 
 
 def end_tensions(mae: Mae, recording: Recording) -> Array:
-    """Return T_end [N] (N, M) of what was recorded, by a network's friction, as nodes know it."""
+    """Return T_end [N] (N, M) of a recording by a network's friction, as the nodes compute it."""
     direction = directions(recording.length)
     return end_tension(mae.friction, recording.tension, direction)
 
 
-def judge(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
-    """Return what gives a network's mean error on every so many messages [rad].
+def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
+    """Return a function that computes a network's mean error on every `stride`-th message [rad].
 
-    Which way wires slid is found once for all networks that are asked.
+    The function reuses the friction directions for all networks.
     """
     direction = directions(recording.length)[::stride]
     part = recording.part(np.s_[::stride])
@@ -212,5 +219,5 @@ def judge(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
 
 
 def estimation_error(mae: Mae, recording: Recording, stride: int = 1) -> float:
-    """Return the mean error of a network's estimate on every so many messages [rad]."""
-    return judge(recording, stride)(mae)
+    """Return the mean error of a network's estimate on every `stride`-th message [rad]."""
+    return make_error_function(recording, stride)(mae)

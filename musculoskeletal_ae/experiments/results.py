@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `experiment` does, and leaves in its folder: result.json, plots, report, results table.
+"""Run of `experiment`, and its output folder: result.json, plots, report and results table.
 
-python -m musculoskeletal_ae.experiments.results doc/results.md
+    python -m musculoskeletal_ae.experiments.results doc/results.md
 
-writes the table of a page anew from the result.json files in doc/results; `experiment … --readme
-doc/results.md` first puts what it measured there.
+rewrites the table of a page from the result.json files in doc/results. `experiment … --readme
+doc/results.md` first copies its own result.json files there.
 """
 
 import base64
@@ -27,20 +27,20 @@ from tqdm import tqdm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
-from musculoskeletal_ae.experiments.study import Measured, Rows, Study, rounded
+from musculoskeletal_ae.experiments.study import Measured, Rows, Study, round_numbers
 from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
-#: result.json of every experiment that was run, by name
+#: result.json of every experiment that was run, by its name
 Results = Mapping[str, Mapping[str, Any]]
 
-#: counted in all, not per individual, of either preset: the healthy hour is spread over the seeds
+#: sums over individuals instead of means, because the healthy time is divided among the individuals
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
 TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
-BEGIN, END = '<!-- results -->', '<!-- /results -->'  # of the results table
+BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers of the results table
 KEPT = Path('doc/results')
 BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 TEMPLATE = 'report.html.jinja'  # beside this file
@@ -48,10 +48,10 @@ NOTHING = '–'
 
 
 def measure(args: Namespace) -> None:
-    """Measure as the options say and write results, plots and report."""
+    """Run the experiments as the options specify; write results, plots and report."""
     start = time.perf_counter()
     names, robot = args.names, Robot.load(args.robot)
-    if args.readme:  # before the work, which takes hours
+    if args.readme:  # check the file before hours of work
         _around_table(args.readme)
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
@@ -70,23 +70,25 @@ def measure(args: Namespace) -> None:
         files += update_readme(args.readme, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
     measured = read(args.out)
-    if lost := failures({name: measured[name] for name in names}):
-        raise MusculoskeletalError(f'the rest is written, but this failed: {"; ".join(lost)}')
+    if failed := failures({name: measured[name] for name in names}):
+        problem = f'some experiments failed: {"; ".join(failed)}'
+        raise MusculoskeletalError(f'{problem}; the results of all others are written')
 
 
 def write(
     study: Study, measured: Mapping[str, Mapping[int, Measured | str]], out: Path
 ) -> list[Path]:
-    """Write result.json and plots of every experiment below a folder; return the files.
+    """Write result.json and the plots of every experiment to a folder; return the files.
 
     Raises:
         MusculoskeletalError: If a number is not finite.
     """
     files = []
-    for name, said in measured.items():
-        rows = {seed: row for seed, row in said.items() if isinstance(row, Measured)}
-        folder, result, plots = out / name, combined(study, rows), EXPERIMENTS[name].plots
-        if failed := {str(seed): text for seed, text in said.items() if isinstance(text, str)}:
+    for name, by_seed in measured.items():
+        rows = {seed: row for seed, row in by_seed.items() if isinstance(row, Measured)}
+        folder, result, plots = out / name, combine(study, rows), EXPERIMENTS[name].plots
+        failed = {str(seed): text for seed, text in by_seed.items() if isinstance(text, str)}
+        if failed:
             result['failed'] = failed
         drawn = {f'{draw.__name__}.png': draw(study, rows) for draw in plots if rows}
         result['plots'] = [{'file': file, 'caption': text} for file, (_, text) in drawn.items()]
@@ -95,8 +97,8 @@ def write(
         write_whole(folder / 'result.json', f'{text}\n'.encode())
         for file, (figure, _) in drawn.items():
             figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
-            figure.set_layout_engine('none')  # it stays where it is now
-            # Vector graphics; without a date, so that the same numbers give the same file.
+            figure.set_layout_engine('none')  # keep the layout of the PNG
+            # Without a creation date, the same numbers give the same PDF.
             vector = (folder / file).with_suffix('.pdf')
             figure.savefig(vector, bbox_inches='tight', metadata={'CreationDate': None})
         files += [folder / file for file in ('result.json', *drawn)]
@@ -104,7 +106,7 @@ def write(
 
 
 class About(Strict, frozen=True):
-    """What was measured."""
+    """Options of the run that measured a result."""
 
     robot: str
     preset: str
@@ -115,14 +117,14 @@ class About(Strict, frozen=True):
 
 
 class Plot(Strict, frozen=True):
-    """A picture beside result.json."""
+    """A plot file beside result.json."""
 
     file: str
     caption: str
 
 
 class Result(Struct, frozen=True):
-    """What every result.json holds, beside the numbers of its experiment."""
+    """Contents that all result.json files share, beside the numbers of their experiment."""
 
     about: About
     seeds: dict[str, dict[str, Any]]  # numbers by individual
@@ -131,10 +133,7 @@ class Result(Struct, frozen=True):
 
 
 def read(folder: Path) -> Results:
-    """Return every result.json below a folder, by experiment.
-
-    One that is damaged is left out, with a warning.
-    """
+    """Read every result.json in a folder, by experiment; skip damaged files with a warning."""
     results: dict[str, Any] = {}
     for name in EXPERIMENTS:
         file = folder / name / 'result.json'
@@ -148,7 +147,7 @@ def read(folder: Path) -> Results:
 
 def _read_result(file: Path) -> dict[str, Any]:
     def fail(problem: str) -> MusculoskeletalError:
-        return MusculoskeletalError(f'{file} is no result of an experiment: {problem}')
+        return MusculoskeletalError(f'{file} is not a valid result of an experiment: {problem}')
 
     try:
         result: dict[str, Any] = msgspec.json.decode(file.read_bytes())
@@ -158,13 +157,13 @@ def _read_result(file: Path) -> dict[str, Any]:
     return result
 
 
-def combined(study: Study, rows: Rows) -> dict[str, Any]:
+def combine(study: Study, rows: Rows) -> dict[str, Any]:
     """Return result.json of one experiment, without its plots."""
     numbers = {str(seed): row.numbers for seed, row in rows.items()}
     about: dict[str, Any] = {'robot': study.robot.description.directory.name}
     about |= {key: getattr(study, key) for key in ('preset', 'reality', 'minutes', 'quick')}
     about['seeds'] = list(study.seeds)
-    return rounded({**_mean(list(numbers.values())), 'about': about, 'seeds': numbers})
+    return round_numbers({**_mean(list(numbers.values())), 'about': about, 'seeds': numbers})
 
 
 def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -185,7 +184,7 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 class Cells(NamedTuple):
-    """One line of the table as text."""
+    """One row of the table as text."""
 
     quantity: str
     printed: str
@@ -197,28 +196,29 @@ class Cells(NamedTuple):
 
 
 class Row(Strict, frozen=True):
-    """One quantity of an experiment; keys are paths into its result.json, parts joined by dots."""
+    """One quantity of an experiment; keys are dotted paths in its result.json."""
 
     quantity: str  # with its unit
     default: str  # key of the value with the preset of the run
-    printed: str = NOTHING  # on Musashi
-    as_printed: str = ''  # key of the value with the preset as printed, whose name is {preset}
-    bound: str = ''  # key of what nothing can beat
-    aim: float | None = None  # highest value aimed at; lowest, if `more_is_better`
+    printed: str = NOTHING  # value that the paper prints for Musashi
+    as_printed: str = ''  # key of the value with preset `paper`, whose name replaces {preset}
+    bound: str = ''  # key of the reference
+    aim: float | None = None  # goal: the highest value, or the lowest if `more_is_better`
     digits: int = 3
     more_is_better: bool = False
     worst: bool = False  # show the worst individual instead of the mean
 
     def number(self, result: Mapping[str, Any], key: str) -> float | None:
-        """Return what was measured, or None."""
+        """Return the measured value of a key, or None."""
         if not self.worst:
             return _flat(result).get(key)
         every = [_flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
         known = [number for number in every if number is not None]
-        return (min if self.more_is_better else max)(known, default=None)
+        worst = min if self.more_is_better else max
+        return worst(known, default=None)
 
     def cells(self, result: Mapping[str, Any]) -> Cells:
-        """Return the line for a result.json."""
+        """Return the row for a result.json."""
         as_printed_key = self.as_printed.format(preset=AS_PRINTED)
         numbers = [self.number(result, key) for key in (as_printed_key, self.default, self.bound)]
         as_printed, default, bound = (
@@ -233,12 +233,12 @@ class Row(Strict, frozen=True):
         return Cells(self.quantity, self.printed, as_printed, default, bound, aim, verdict)
 
 
-#: by experiment
+#: rows of the results table, by experiment
 ROWS = read_table(__file__, 'table.yaml', dict[str, tuple[Row, ...]])
 
 
 def table(results: Results) -> list[Cells]:
-    """Return the lines of the results table, of the experiments that were run."""
+    """Return the rows of the results table for the experiments that were run."""
     return [
         row.cells(results[name])
         for name in EXPERIMENTS
@@ -248,12 +248,12 @@ def table(results: Results) -> list[Cells]:
 
 
 def individuals(seeds: Sequence[int]) -> str:
-    """Return whose numbers these are, such as 'individual 0'."""
+    """Return the individuals' names, such as 'individual 0'."""
     return f'individual{"s" * (len(seeds) > 1)} {", ".join(map(str, seeds))}'
 
 
 def readme_table(results: Results) -> str:
-    """Return what stands between the markers of a page."""
+    """Return the text between the markers of a page."""
     if not results:
         return '\n\nNothing measured yet: `experiment all --readme doc/results.md`.\n\n'
     about = next(iter(results.values()))['about']
@@ -277,21 +277,25 @@ def readme_table(results: Results) -> str:
 
 
 def failures(results: Results) -> list[str]:
-    """Return what failed, and why, a line for each reason."""
-    lost: dict[tuple[str, str], list[str]] = {}
+    """Return the failed experiments with their reasons, one line for each reason."""
+    failed: dict[tuple[str, str], list[str]] = {}
     for name, result in results.items():
         for seed_reason in result.get('failed', {}).items():
-            lost.setdefault(seed_reason, []).append(name)
-    return [f'{", ".join(names)} of individual {at}: {why}' for (at, why), names in lost.items()]
+            failed.setdefault(seed_reason, []).append(name)
+    return [
+        f'{", ".join(names)} of individual {seed}: {reason}'
+        for (seed, reason), names in failed.items()
+    ]
 
 
 def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
-    """Write the table of a README from the results kept beside it; return the files written.
+    """Rewrite the table of a page from the results beside it; return the files written.
 
-    The result.json files of the folder `measured` are kept first.
+    The result.json files of the folder `measured` are first copied there.
 
     Raises:
-        OSError, MusculoskeletalError: If the README has no place between markers.
+        OSError: If the page cannot be read or written.
+        MusculoskeletalError: If the page does not have the two markers.
     """
     (head, rest), files = _around_table(readme), list[Path]()
     kept = readme.parent / (KEPT.name if readme.parent.resolve().name == 'doc' else KEPT)
@@ -315,7 +319,7 @@ def _around_table(readme: Path) -> tuple[str, str]:
 
 
 def write_report(folder: Path) -> Path:
-    """Write report.html from all that is in a folder, of this call or an earlier one.
+    """Write report.html from all results in a folder, including those of earlier runs.
 
     Raises:
         MusculoskeletalError: If a result.json lacks numbers that the report shows.
@@ -324,8 +328,8 @@ def write_report(folder: Path) -> Path:
     try:
         page = _page(folder, read(folder))
     except (UndefinedError, LookupError, TypeError, AttributeError) as error:
-        problem = f'{file} was not written, since a result.json in {folder} lacks a number: {error}'
-        raise MusculoskeletalError(f'{problem}; measure into an empty folder') from error
+        problem = f'{file} was not written: a result.json in {folder} lacks a number: {error}'
+        raise MusculoskeletalError(f'{problem}; use an empty output folder') from error
     file.write_text(page, encoding='utf-8')
     return file
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation.
 
-Paper (§IV-D). Arm and simulator under the same commands: 0.335 → 0.162 rad and 105 → 92.2 N by
-learning.
+Paper (§IV-D). Arm and simulator follow the same commands. Learning reduces their difference from
+0.335 to 0.162 rad and from 105 to 92.2 N.
 
-Here. Arm and simulator follow the commands of the held-out motion, and all messages are compared;
-the simulator starts in the arm’s first posture and sees nothing else of it. θ beside the true
-angles, T beside the measured tensions. The bound is the emulated individual itself without any
-friction: what a perfect simulator without hysteresis would be left with.
+Here. Arm and simulator follow the commands of the held-out motion, and all messages are compared: θ
+with the true joint angles, T with the measured tensions. The simulator starts in the first posture
+of the arm and receives nothing but commands after that. The reference is the emulated individual
+itself without any friction, which has the error of a perfect simulator without hysteresis.
 """
 
 from typing import Any
@@ -17,28 +17,35 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Motion, Recording, columns, times
-from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study, first
+from musculoskeletal_ae.experiments.study import (
+    Experiment,
+    Measured,
+    Plot,
+    Rows,
+    Study,
+    first_individual,
+)
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 PRINTED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
-CYCLE = 10.0  # [s] of the exploration's three steps
+CYCLE = 10.0  # [s] duration of the exploration's three steps
 MOMENTS = 5
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the numbers and traces of one individual."""
+    """Return the results and traces of one individual."""
     recording = study.stream(seed, 'held_out')
     arm = Motion(recording.theta, recording.tension)
     numbers, traces = dict[str, Any](), {'arm': arm}
     for preset in dict.fromkeys([study.preset, AS_PRINTED]):
         for when, mae in study.networks(seed, preset).items():
-            moved = simulate(study.robot, mae, preset, recording)
-            numbers |= study.keyed(preset, _errors(when, moved, arm))
+            motion = simulate(study.robot, mae, preset, recording)
+            numbers |= study.with_prefix(preset, _errors(when, motion, arm))
             if preset == study.preset:
-                traces[when] = moved
+                traces[when] = motion
     body, rows = study.arm(seed, friction=False), []
     for command in recording.command:
         body.command_length(command)
@@ -59,43 +66,44 @@ def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motio
     return Motion(*columns(rows))
 
 
-def _distances(moved: Motion, arm: Motion) -> dict[str, Array]:
-    """Return how far a motion is from the arm's, in θ [rad] and T [N], message by message."""
+def _distances(motion: Motion, arm: Motion) -> dict[str, Array]:
+    """Return the distance of a motion from the arm's in θ [rad] and T [N] for each message."""
     return {
-        'rad': np.linalg.norm(moved.theta - arm.theta, axis=1),
-        'n': np.linalg.norm(moved.tension - arm.tension, axis=1),
+        'rad': np.linalg.norm(motion.theta - arm.theta, axis=1),
+        'n': np.linalg.norm(motion.tension - arm.tension, axis=1),
     }
 
 
-def _errors(name: str, moved: Motion, arm: Motion) -> dict[str, float]:
-    return {f'{name}_{unit}': float(far.mean()) for unit, far in _distances(moved, arm).items()}
+def _errors(name: str, motion: Motion, arm: Motion) -> dict[str, float]:
+    distances = _distances(motion, arm)
+    return {f'{name}_{unit}': float(each.mean()) for unit, each in distances.items()}
 
 
 def simulation_pictures(study: Study, rows: Rows) -> Plot:
-    """Draw arm and simulator at some moments."""
-    seed, (_, traces) = first(rows)
-    # The ends of as many cycles: at rest, with the random tensions of the third step.
+    """Draw arm and simulator at several moments."""
+    seed, (_, traces) = first_individual(rows)
+    # Moments near the ends of cycles, where the arm rests at the random tensions of the third step.
     cycles = np.arange(len(traces['arm'].theta) * SAMPLE_TIME // CYCLE)
     chosen = np.linspace(0, len(cycles) - 1, min(MOMENTS, len(cycles))).round().astype(int)
     steps = ((cycles[chosen] * CYCLE + 9.9) / SAMPLE_TIME).astype(int)
     moments = {f'{SAMPLE_TIME * n:.0f} s': int(n) for n in steps}
     motions = {'arm': traces['arm']}
     motions |= {f'simulator {when} learning': traces[when] for when in plots.WHEN}
-    title = f'individual {seed}, the same commands'
+    title = f'individual {seed}, same commands'
     return plots.pictures(study.robot, motions, moments, title), (
-        'The emulated arm (true posture, measured tensions, drawn with the model’s routes) and '
-        'the simulator before and after learning, at the same moments of the same commands.'
+        'The emulated arm (true posture, measured tensions, drawn with the model’s routes), and '
+        'the simulator before and after learning under the same commands.'
     )
 
 
 def simulation_errors(_: Study, rows: Rows) -> Plot:
     """Draw the errors over time."""
-    seed, (numbers, traces) = first(rows)
+    seed, (numbers, traces) = first_individual(rows)
     figure, panels = plots.new_figure(12.0, 5.6, 2, sharex=True)
-    far = {when: _distances(traces[when], traces['arm']) for when in plots.WHEN}
+    distances = {when: _distances(traces[when], traces['arm']) for when in plots.WHEN}
     for panel, key, unit, symbol in zip(panels, PRINTED, ('rad', 'N'), 'θT', strict=True):
         for when, colour in plots.WHEN.items():
-            values = far[when][key]
+            values = distances[when][key]
             label = f'{when} learning: mean {numbers[f"{when}_{key}"]:.3g} {unit}'
             plots.line(panel, times(len(values)), values, 25, color=colour, lw=0.9, label=label)
         before, after = PRINTED[key]
@@ -107,7 +115,7 @@ def simulation_errors(_: Study, rows: Rows) -> Plot:
     panels[1].set_xlabel('time [s]')
     return figure, (
         'Distance of the simulator from the arm under the same commands (0.25 s running mean). '
-        'Dotted: the printed mean after learning.'
+        'Dotted: the mean after learning that the paper prints.'
     )
 
 

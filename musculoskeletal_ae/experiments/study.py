@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one call of `experiment` measures, what an experiment is, and what experiments share.
+"""Interfaces that all experiments share, and the options and intermediate files of one run.
 
-An individual's sensor streams and learned networks are made once (`online_learning`) and kept in a
-folder; the other experiments read them there, each in its own process if cores allow.
+The experiment `online_learning` creates the sensor streams and trained networks of each individual
+and saves them in a folder. The other experiments load them from there and may run in separate
+processes.
 
-A new experiment is a file beside this one that ends in `EXPERIMENT = Experiment(__doc__, …)`, its
-name in `NAMES`, and what table.yaml says of it.
+To add an experiment, add a file to this folder that ends in `EXPERIMENT = Experiment(__doc__, …)`,
+add its name to `NAMES`, and add its rows to table.yaml.
 """
 
 import math
@@ -27,11 +28,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 
-DIGITS = 6  # significant, of numbers; more is noise
+DIGITS = 6  # significant digits of results; further digits are noise
 
 
-class Rests(NamedTuple):
-    """The N samples at rest that a learner stored."""
+class RestSamples(NamedTuple):
+    """The N rest samples that a learner stored."""
 
     theta: Array  # [rad], (N, D)
     tension: Array  # [N], (N, M)
@@ -40,99 +41,110 @@ class Rests(NamedTuple):
 
 @dataclass(frozen=True)
 class Study:
-    """Options of one call, and what its experiments hand each other."""
+    """Options of one run, and access to the files that its experiments share."""
 
     robot: Robot
-    preset: str  # of the networks that are shown as `before` and `after`
-    seeds: tuple[int, ...]  # individuals
+    preset: str  # of the networks that plots show as `before` and `after`
+    seeds: tuple[int, ...]  # of the individuals
     minutes: float  # duration of the exploration
-    quick: bool  # a fraction of everything, to try things out
-    folder: Path  # where streams and networks are kept
-    reality: str = 'kin'  # the body of the individuals, see `make_arm`
+    quick: bool  # whether to shorten everything, for a trial run
+    folder: Path  # of streams and networks
+    reality: str = 'kin'  # emulator model of the individuals, see `make_arm`
 
     @property
     def held_out_time(self) -> float:
-        """Duration of the motion never used for learning [s]."""
+        """Duration of the motion that is never used for learning [s]."""
         return 10.0 if self.quick else 300.0
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
-        """Return an individual at rest; without friction it is the same body otherwise."""
+        """Return an individual at rest; with friction False, the same body without friction."""
         return make_arm(self.robot, seed, self.reality, friction)
 
     def network_file(self, preset: str, seed: int | None) -> Path:
-        """Return the file of a network: initial (None), or learned on an individual."""
+        """Return the file of a network: initial (seed None), or after learning on an individual."""
         return self.folder / f'{preset}_{"initial" if seed is None else seed}.safetensors'
 
     def numbers_file(self, seed: int) -> Path:
-        """Return the file of what `online_learning` measured of an individual."""
+        """Return the file with the results of `online_learning` for an individual."""
         return self.folder / f'online_learning_{seed}.json'
 
     def network(self, seed: int | None, preset: str = '') -> Mae:
-        """Return a network: initial (None), or learned on an individual."""
+        """Load a network: initial (seed None), or after learning on an individual."""
         return checkpoint.load(self.network_file(preset or self.preset, seed), self.robot)
 
     def networks(self, seed: int, preset: str = '') -> dict[str, Mae]:
-        """Return the networks `before` and `after` learning on an individual."""
+        """Load the networks `before` and `after` learning on an individual."""
         return {'before': self.network(None, preset), 'after': self.network(seed, preset)}
 
-    def keep(self, seed: int, **arrays: Recording | Rests) -> None:
-        """Keep an individual's streams `exploring` and `held_out`, or the learner's `rests`."""
+    def save(self, seed: int, **arrays: Recording | RestSamples) -> None:
+        """Save an individual's streams `exploring` and `held_out`, or the learner's `rests`."""
         for name, values in arrays.items():
             np.savez(self.folder / f'{name}_{seed}.npz', *values)
 
     def stream(self, seed: int, name: str) -> Recording:
-        """Return a stream that was kept."""
-        return Recording(*self._kept(seed, name))
+        """Load a saved stream."""
+        return Recording(*self._load(seed, name))
 
-    def rests(self, seed: int) -> Rests:
-        """Return the samples at rest that were kept."""
-        return Rests(*self._kept(seed, 'rests'))
+    def rests(self, seed: int) -> RestSamples:
+        """Load the saved rest samples."""
+        return RestSamples(*self._load(seed, 'rests'))
 
-    def _kept(self, seed: int, name: str) -> list[Array]:
+    def _load(self, seed: int, name: str) -> list[Array]:
         with np.load(self.folder / f'{name}_{seed}.npz') as arrays:
             return list(arrays.values())
 
-    def keyed(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a preset's numbers as result.json names them: those as printed get a prefix."""
-        named = ('', self.preset), (f'{AS_PRINTED}_', AS_PRINTED)
-        prefixes = [prefix for prefix, name in named if name == preset]
-        return {prefix + key: value for prefix in prefixes for key, value in numbers.items()}
+    def with_prefix(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a preset's numbers under their keys in result.json.
+
+        Numbers of preset `paper` have its name as a prefix. If it is the preset of the run, they
+        are also returned without the prefix.
+        """
+        prefixed = dict[str, Any]()
+        if preset == self.preset:
+            prefixed |= numbers
+        if preset == AS_PRINTED:
+            prefixed |= {f'{AS_PRINTED}_{key}': value for key, value in numbers.items()}
+        return prefixed
 
 
 class Measured(NamedTuple):
-    """What an experiment says of one individual."""
+    """The results of an experiment for one individual."""
 
     numbers: dict[str, Any]  # for result.json: nested dictionaries of finite numbers, text or lists
     traces: dict[str, Any]  # for the plots
 
 
-def rounded(value: Any) -> Any:
-    """Return the same with floats shortened; JSON cannot say what is not finite."""
+def round_numbers(value: Any) -> Any:
+    """Return a value with its floats rounded to `DIGITS` digits, ready for JSON.
+
+    Raises:
+        MusculoskeletalError: If a number is not finite, which JSON cannot represent.
+    """
     if isinstance(value, Mapping):
-        return {key: rounded(part) for key, part in value.items()}
+        return {key: round_numbers(part) for key, part in value.items()}
     if isinstance(value, list):
-        return [rounded(part) for part in value]
+        return [round_numbers(part) for part in value]
     if isinstance(value, float):
         if not math.isfinite(value):
-            raise MusculoskeletalError('an experiment brought a number that is not finite')
+            raise MusculoskeletalError('a result of an experiment is not a finite number')
         return float(f'{value:.{DIGITS}g}')
     return value
 
 
-Rows = Mapping[int, Measured]  # what an experiment says of its individuals, by seed
-Plot = tuple[Figure, str]  # and its caption
+Rows = Mapping[int, Measured]  # the results of an experiment, by the individuals' seeds
+Plot = tuple[Figure, str]  # a figure and its caption
 
 
-def first(rows: Rows) -> tuple[int, Measured]:
-    """Return the individual that plots of a single one show, with its seed."""
+def first_individual(rows: Rows) -> tuple[int, Measured]:
+    """Return the seed and results of the individual that single-individual plots show."""
     return next(iter(rows.items()))
 
 
 class Experiment(NamedTuple):
-    """One experiment: how it is measured on an individual, drawn and explained."""
+    """One experiment: its description, its measurement on an individual, and its plots."""
 
-    #: the module's docstring: heading; "Paper (section). …", what it did and found; "Here. …"
+    #: the module's docstring in three paragraphs: heading; "Paper (section). …"; "Here. …"
     text: str | None
-    measure: Callable[[Study, int], Measured]  # of the individual of a seed
-    plots: tuple[Callable[[Study, Rows], Plot], ...]  # functions named as the files they draw
-    weight: float  # how long it takes beside the others; for order and progress bar only
+    measure: Callable[[Study, int], Measured]  # measures the individual of a seed
+    plots: tuple[Callable[[Study, Rows], Plot], ...]  # each has the name of its file
+    weight: float  # relative duration, for scheduling and the progress bar

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Touch, a part of the experiment `motion`: pushes that are felt, and an arm that a hand moves."""
+"""Contact, a part of the experiment `motion`: estimated external forces, and hand guiding."""
 
 from dataclasses import replace
 from typing import Any
@@ -20,56 +20,58 @@ from musculoskeletal_ae.signals.friction import FrictionDirection
 
 TOUCH_STREAM = 7000
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
-TRIED = 20  # moments for each collision, at most: it hits an arm that moves
+TRIES_PER_COLLISION = 20  # at most, because a collision needs a moving arm
 HEALTHY = 3600.0  # [s] over all individuals
-LEAST, MOST = 10.0, 50.0  # [N]
-LIGHT, FIRM = 15.0, 20.0  # [N] of a hand that moves a floating arm
-MOVE, PUSH, JUDGED, APART = 4.0, 1.5, 0.5, 3.0  # [s]
-FLOATING, MOVED = 30.0, 1.0  # [s]
-SOON = 0.1  # [s] in which a collision is to be noticed
-INSIDE = 0.1  # share of the joint ranges that postures stay inside of the limits
+LEAST, MOST = 10.0, 50.0  # [N] external forces
+LIGHT, FIRM = 15.0, 20.0  # [N] forces that guide an arm under gravity compensation
+MOVE = 4.0  # [s] to a posture
+PUSH, EVALUATED = 1.5, 0.5  # [s] duration of a push, and its last part that is evaluated
+APART = 3.0  # [s] longest time between collisions
+FLOATING, MOVED = 30.0, 1.0  # [s] duration of the drift test, and of a collision or hand guiding
+SOON = 0.1  # [s] within which a collision should be detected
+INSIDE = 0.1  # distance of postures from the joint limits, share of the joint ranges
 
 
-class FeelingLoop(ClosedLoop):
-    """A closed loop that is asked what pushes the arm."""
+class ContactLoop(ClosedLoop):
+    """A closed loop that estimates external forces."""
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
-        self._contact, self._sliding = ContactEstimator(arm.robot), FrictionDirection()
+        self._contact, self._friction = ContactEstimator(arm.robot), FrictionDirection()
         super().__init__(arm, mae, settings, seed)
 
     def use(self, mae: Mae) -> None:
-        """Estimate, control and feel by another network."""
+        """Use a network for estimation, control and contact estimation."""
         super().use(mae)
         self._contact.use(mae)
 
-    def feel(self, exploring: bool = False) -> Contact:
-        """Let a message's time pass; return what it says of the outside."""
+    def contact(self, exploring: bool = False) -> Contact:
+        """Advance by one message; return its contact estimate."""
         _ = self.explore() if exploring else self.step()
         length, friction = self._read.length, self.mae.friction
-        end = self._sliding.end_tension(friction, self._read.tension, length)
+        end = self._friction.end_tension(friction, self._read.tension, length)
         return self._contact.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
-    def feel_during(self, duration: float, exploring: bool = False) -> list[Contact]:
-        """Let time pass [s]; return what each message says."""
-        return [self.feel(exploring) for _ in range(round(duration / SAMPLE_TIME))]
+    def contacts_during(self, duration: float, exploring: bool = False) -> list[Contact]:
+        """Advance by a time [s]; return the contact estimate of each message."""
+        return [self.contact(exploring) for _ in range(round(duration / SAMPLE_TIME))]
 
     def rest(self, theta: Array) -> None:
-        """Go to θ [rad] (D,), with a reset if a push stopped the arm before."""
+        """Move to θ [rad] (D,), after a reset if a push stopped the arm."""
         self.push(np.zeros(3))
         self.core.reset(self._now)
         self.target(theta)
-        self.feel_during(MOVE)
+        self.contacts_during(MOVE)
 
     def push(self, force: Array) -> None:
-        """Push the hand by a force [N] (3,)."""
+        """Apply a force [N] (3,) to the hand."""
         self.arm.set_wrench(np.concatenate([force, np.zeros(3)]))
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Push an individual that has learned, at rest, in motion and afloat."""
+    """Push an individual that has learned, at rest, in motion and under gravity compensation."""
     robot, rng = study.robot, np.random.default_rng([seed, TOUCH_STREAM])
     settings, share = Settings(first_duration=2.0), 0.005 if study.quick else 1.0
-    loop = FeelingLoop(study.arm(seed), study.network(seed), settings, TOUCH_STREAM + seed)
+    loop = ContactLoop(study.arm(seed), study.network(seed), settings, TOUCH_STREAM + seed)
 
     def count(whole: float) -> int:
         return max(1, round(share * whole))
@@ -77,15 +79,15 @@ def measure(study: Study, seed: int) -> Measured:
     pushes = []
     for _ in range(count(POSTURES)):
         loop.rest(_holdable(robot, rng))
-        pushes += [_pushed(loop, _force(robot, rng, LEAST, MOST)) for _ in range(2)]
-    hits, delays = _collisions(loop, rng, count(COLLISIONS))
+        pushes += [_push_at_rest(loop, _force(robot, rng, LEAST, MOST)) for _ in range(2)]
+    forces, delays = _collisions(loop, rng, count(COLLISIONS))
     soon = delays <= SOON + 1e-9
     loop.arm.reset()
     seconds = share * HEALTHY / len(study.seeds)
     contacts = _healthy(loop, seconds)
-    drift, moved = zip(*(_afloat(study, seed, rng) for _ in range(count(FLOATS))))
-    true, felt, free = columns(pushes)
-    size, angle = _errors(true, felt)
+    drift, moved = zip(*(_guide_by_hand(study, seed, rng) for _ in range(count(FLOATS))))
+    true, estimated, free = columns(pushes)
+    size, angle = _errors(true, estimated)
     numbers: dict[str, Any] = {
         'wrench_error': float(size.mean()),
         'wrench_error_deg': float(angle.mean()),
@@ -95,30 +97,31 @@ def measure(study: Study, seed: int) -> Measured:
         'float_drift_rad': float(np.max(drift)),
         'float_moved_m': float(np.mean(moved)),
     }
-    if len(hits):
+    if len(forces):
         numbers['collision_s'] = float(np.median(delays))
         numbers['collisions_soon_share'] = float(soon.mean())
-    if (firm := hits > 0.5 * (LEAST + MOST)).any():
+    if (firm := forces > 0.5 * (LEAST + MOST)).any():
         numbers['firm_collisions_soon_share'] = float(soon[firm].mean())
     if free.any():
         numbers['wrench_free_error'] = float(size[free].mean())
         numbers['wrench_free_error_deg'] = float(angle[free].mean())
-    return Measured(numbers, {'true': true, 'felt': felt, 'free': free})
+    return Measured(numbers, {'true': true, 'estimated': estimated, 'free': free})
 
 
-def _errors(true: Array, felt: Array) -> tuple[Array, Array]:
-    """Return relative errors in size and those in direction [deg] of forces (N, 3)."""
-    sizes, felt_sizes = np.linalg.norm(true, axis=1), np.linalg.norm(felt, axis=1)
-    cosine = (true * felt).sum(axis=1) / np.maximum(sizes * felt_sizes, 1e-9)
-    return np.abs(felt_sizes - sizes) / sizes, np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+def _errors(true: Array, estimated: Array) -> tuple[Array, Array]:
+    """Return the relative errors of the magnitudes and the errors of direction [deg], (N,)."""
+    sizes, estimated_sizes = np.linalg.norm(true, axis=1), np.linalg.norm(estimated, axis=1)
+    cosine = (true * estimated).sum(axis=1) / np.maximum(sizes * estimated_sizes, 1e-9)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return np.abs(estimated_sizes - sizes) / sizes, angle
 
 
 def _force(robot: Robot, rng: np.random.Generator, least: float, most: float) -> Array:
-    """Draw a force [N] (3,) that the joints can feel somewhere: in the plane of a planar arm."""
+    """Draw a force [N] (3,) in directions that produce joint torques (in the plane if planar)."""
     postures = robot.random_postures(20, rng)
     jacobians = [robot.kinematics.end_effector_jacobian(theta)[:3] for theta in postures]
-    felt = np.abs(np.concatenate(jacobians, axis=1)).max(axis=1) > 1e-6
-    direction = rng.normal(size=3) * felt
+    observable = np.abs(np.concatenate(jacobians, axis=1)).max(axis=1) > 1e-6
+    direction = rng.normal(size=3) * observable
     force: Array = rng.uniform(least, most) * direction / np.linalg.norm(direction)
     return force
 
@@ -129,50 +132,59 @@ def _holdable(robot: Robot, rng: np.random.Generator) -> Array:
     return theta
 
 
-def _pushed(loop: FeelingLoop, force: Array) -> tuple[Array, Array, bool]:
-    """Push the resting hand; return the force, the felt one [N], and if no joint met its stop."""
-    robot, felt, free = loop.arm.robot, list[Array](), True
+def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
+    """Push the hand of the resting arm.
+
+    Returns:
+        The force and its estimate [N], each (3,), and whether all joints stayed off their stops.
+    """
+    robot, estimates, free = loop.arm.robot, list[Array](), True
     loop.push(force)
     for _ in range(round(PUSH / SAMPLE_TIME)):
-        felt.append(loop.feel().force())
+        estimates.append(loop.contact().force())
         theta = loop.arm.theta
         free &= bool(((theta > robot.lower) & (theta < robot.upper)).all())
     loop.push(np.zeros(3))
-    loop.feel_during(MOVED)
-    return force, np.mean(felt[-round(JUDGED / SAMPLE_TIME) :], axis=0), free
+    loop.contacts_during(MOVED)
+    evaluated = estimates[-round(EVALUATED / SAMPLE_TIME) :]
+    return force, np.mean(evaluated, axis=0), free
 
 
-def _collisions(loop: FeelingLoop, rng: np.random.Generator, count: int) -> Array:
-    """Return sizes of pushes of the moving arm [N], and how long until they are noticed [s]."""
-    robot, found = loop.arm.robot, list[tuple[float, float]]()
-    for _ in range(TRIED * count):
-        if len(found) == count:
+def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Array:
+    """Push the moving arm; return the forces [N] and the delays of their detection [s], (2, N)."""
+    robot, collisions = loop.arm.robot, list[tuple[float, float]]()
+    for _ in range(TRIES_PER_COLLISION * count):
+        if len(collisions) == count:
             break
-        *_, before = loop.feel_during(rng.uniform(0.5, 1.0) * APART, exploring=True)
+        *_, before = loop.contacts_during(rng.uniform(0.5, 1.0) * APART, exploring=True)
         if before.is_contact or np.linalg.norm(loop.arm.velocity) < 0.1:
             continue
         force = _force(robot, rng, LEAST, MOST)
         loop.push(force)
-        noticed = [felt.is_contact for felt in loop.feel_during(MOVED, exploring=True)]
+        detected = [each.is_contact for each in loop.contacts_during(MOVED, exploring=True)]
         loop.push(np.zeros(3))
-        delay = (noticed.index(True) + 1) * SAMPLE_TIME if any(noticed) else MOVED
-        found.append((float(np.linalg.norm(force)), delay))
-    return np.array(found).reshape(-1, 2).T
+        delay = (detected.index(True) + 1) * SAMPLE_TIME if any(detected) else MOVED
+        collisions.append((float(np.linalg.norm(force)), delay))
+    return np.array(collisions).reshape(-1, 2).T
 
 
-def _healthy(loop: FeelingLoop, seconds: float) -> int:
-    """Return how often a contact begins in so much healthy exploration [s], the first 5 s apart."""
+def _healthy(loop: ContactLoop, seconds: float) -> int:
+    """Return the number of contacts that begin during healthy exploration, after its first 5 s."""
     contacts, before = 0, False
     for n in range(round((seconds + 5.0) / SAMPLE_TIME)):
-        now = loop.feel(exploring=True).is_contact and n * SAMPLE_TIME > 5.0
+        now = loop.contact(exploring=True).is_contact and n * SAMPLE_TIME > 5.0
         contacts, before = contacts + (now and not before), now
     return contacts
 
 
-def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, float]:
-    """Return how far a floating joint drifts [rad], and how far a hand moves the hand [m]."""
+def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, float]:
+    """Measure gravity compensation.
+
+    Returns:
+        The largest drift of a joint [rad], and the distance [m] by which a force moves the hand.
+    """
     settings, arm = Settings(first_duration=2.0), study.arm(seed)
-    loop = FeelingLoop(arm, study.network(seed), settings, seed)
+    loop = ContactLoop(arm, study.network(seed), settings, seed)
     loop.rest(_holdable(study.robot, rng))
     loop.core.configure(replace(settings, method='float'))
     loop.wait(MOVED)
@@ -188,17 +200,21 @@ def _afloat(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, f
 
 
 def forces(_: Study, rows: Rows) -> Plot:
-    """Draw sizes and directions of all pushes."""
-    parts = [[row.traces[key] for key in ('true', 'felt', 'free')] for row in rows.values()]
-    true, felt, free = map(np.concatenate, zip(*parts))
-    sizes, angle = np.linalg.norm(true, axis=1), _errors(true, felt)[1]
+    """Draw magnitudes and directions of all pushes."""
+    keys = 'true', 'estimated', 'free'
+    parts = [[row.traces[key] for key in keys] for row in rows.values()]
+    true, estimated, free = map(np.concatenate, zip(*parts))
+    sizes, angle = np.linalg.norm(true, axis=1), _errors(true, estimated)[1]
     figure, (left, right) = plots.new_figure(9.0, 3.6, columns=2)
-    kinds = (free, plots.AFTER, 'free'), (~free, plots.MARK, 'a joint at its stop')
+    kinds = (free, plots.AFTER, 'no joint at a stop'), (~free, plots.MARK, 'a joint at its stop')
     for which, colour, name in kinds:
         style = {'color': colour, 's': 12, 'label': name}
-        left.scatter(sizes[which], np.linalg.norm(felt[which], axis=1), **style)
+        left.scatter(sizes[which], np.linalg.norm(estimated[which], axis=1), **style)
         right.scatter(sizes[which], angle[which], **style)
     left.plot([0.0, MOST], [0.0, MOST], color=plots.TRUE, linewidth=0.8)
-    plots.tidy(left, 'push [N]', 'estimated [N]', 'size', 'above')
-    plots.tidy(right, 'push [N]', 'error [deg]', 'direction')
-    return figure, f'{len(sizes)} pushes of the hand at rest, one second after they began.'
+    plots.tidy(left, 'force [N]', 'estimated force [N]', 'magnitude', 'above')
+    plots.tidy(right, 'force [N]', 'error [deg]', 'direction')
+    return figure, (
+        f'Estimates of {len(sizes)} external forces on the hand of the resting arm, one second '
+        'after the force began.'
+    )

@@ -101,10 +101,10 @@ class HardwareEmulator(Arm):
             message = ClockMessage()
             message.clock.sec, message.clock.nanosec = divmod(self.time, 10**9)
             self.clock_publisher.publish(message)
-        if self.arm.broken:
+        if self.arm.has_diverged:
             return
         self.reading = self.arm.sense()
-        for reading in self.arm.faults.delivered(self.reading, now):
+        for reading in self.arm.faults.deliver(self.reading, now):
             self.publish_state(*reading)
         if self.imu is not None:
             self._publish_imu(self.imu)
@@ -131,7 +131,7 @@ class HardwareEmulator(Arm):
 
     def _lines(self) -> list[Line]:
         arm = self.arm
-        if arm.broken:
+        if arm.has_diverged:
             return []
         return draw_arm(self.robot, arm.theta, arm.tension, arm.route_points())
 
@@ -139,7 +139,7 @@ class HardwareEmulator(Arm):
         """Return what /diagnostics shows."""
         hottest = np.fmax.reduce(self.reading.temperature)  # NaN only where all are
         values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
-        if self.arm.broken:
+        if self.arm.has_diverged:
             return Report('error', 'broken by forces beyond all bounds: reset it', values)
         if self.arm.safe:
             return Report('warn', 'modules safe: no commands', values)

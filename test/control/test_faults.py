@@ -46,7 +46,7 @@ class Loop:
         for _ in range(round(seconds / DT)):
             self.now += DT
             self.arm.step(DT)
-            for reading in self.arm.faults.delivered(self.arm.sense(), self.now):
+            for reading in self.arm.faults.deliver(self.arm.sense(), self.now):
                 self.read(reading)
             command = self.controller.step(self.now)
             if command is not None:

@@ -50,7 +50,7 @@ class Driver:
         if self.now - self._sent < self.period - 1e-9:
             return []
         self._sent = self.now
-        read = self.arm.faults.delivered(self.arm.sense(), self.now)
+        read = self.arm.faults.deliver(self.arm.sense(), self.now)
         return [(each.theta, self.publish(np.stack(each[1:]))) for each in read]
 
     def command(self, target: np.ndarray) -> None:

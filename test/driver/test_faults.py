@@ -458,8 +458,9 @@ def unclipped(robot):
     """Return a driver at rest; the module of the emulator would clip by itself."""
     driver = Driver(robot)
     driver.listen(2.0)
-    driver.arm._wound = driver.arm._wound._replace(tension_max=np.full(M, 500.0))
-    driver.arm._hand_over()
+    constants = driver.arm._module_constants
+    driver.arm._module_constants = constants._replace(tension_max=np.full(M, 500.0))
+    driver.arm._make_handle()
     return driver
 
 

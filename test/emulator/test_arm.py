@@ -153,7 +153,7 @@ def test_a_length_offset_shifts_the_controlled_posture(robot, nominal):
 
 def test_temperatures_settle_at_the_steady_state_of_the_thermal_model(robot):
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
-    muscle, module = arm._muscle, arm._wound
+    muscle, module = arm._muscle, arm._module_constants
     assert np.ptp(module.loss) > 0.1 * module.loss.mean()  # no two modules are the same
     for _ in range(20):  # the housing's time constant is minutes: start it near its end
         muscle.housing[:] = modules.AMBIENT + module.housing_resistance * (
@@ -207,13 +207,13 @@ def test_no_legal_wrench_breaks_the_emulator_and_a_reset_mends_it(name, reality)
             arm.reset(theta)
             arm.set_wrench(MOST_WRENCH * rng.choice([-1.0, 1.0], 6))
             arm.step(1.0)
-            assert not arm.broken
+            assert not arm.has_diverged
     arm.set_wrench(np.full(6, 1e7))
     arm.step(1.0)
-    assert arm.broken
+    assert arm.has_diverged
     arm.reset()
     arm.step(1.0)
-    assert not arm.broken
+    assert not arm.has_diverged
     assert np.abs(arm.velocity).max() < 10.0
 
 

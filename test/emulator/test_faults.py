@@ -26,7 +26,7 @@ def numbered(robot, i):
 def delivered(robot, line, count=400, period=0.0078125):
     faults = Faults(robot, np.random.default_rng(0))
     faults.set([line])
-    arrived = [faults.delivered(numbered(robot, i), i * period) for i in range(count)]
+    arrived = [faults.deliver(numbered(robot, i), i * period) for i in range(count)]
     return [[int(one.length[0]) for one in readings] for readings in arrived]
 
 
@@ -50,12 +50,12 @@ def test_ending_a_delay_discards_the_delayed_messages(robot):
     faults = Faults(robot, np.random.default_rng(0))
     for i, lines in enumerate(['delay:0.25'] * 50 + [''] * 50):
         faults.set([lines] if lines else [])
-        last = [int(one.length[0]) for one in faults.delivered(numbered(robot, i), i * 0.0078125)]
+        last = [int(one.length[0]) for one in faults.deliver(numbered(robot, i), i * 0.0078125)]
         assert last == ([i] if not lines else [i - 32] if i >= 32 else [])
     faults.set(['reorder:1'])
-    assert faults.delivered(numbered(robot, 100), 1.0) == []
+    assert faults.deliver(numbered(robot, 100), 1.0) == []
     faults.set([])
-    assert len(faults.delivered(numbered(robot, 101), 1.1)) == 1
+    assert len(faults.deliver(numbered(robot, 101), 1.1)) == 1
 
 
 def test_a_frozen_sensor_stays_frozen_when_another_fault_is_added(arm, robot):
@@ -192,6 +192,6 @@ def test_every_kind_of_fault_can_be_set_by_name_and_mended(name, arm, robot):
     arm.faults.set([name])
     hold(arm, robot, [name], 0.2)
     hold(arm, robot, [], 0.5)
-    assert arm.faults.delivered(arm.sense(), 100.0)
+    assert arm.faults.deliver(arm.sense(), 100.0)
     assert not arm.faults.stuck.any() and not arm.faults.slack.any()
     assert np.isfinite(arm.theta).all()

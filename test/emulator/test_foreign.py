@@ -14,7 +14,7 @@ from musculoskeletal_ae.emulator import foreign
 from musculoskeletal_ae.emulator.effects import NONE, Effects
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.emulator.wires import law
+from musculoskeletal_ae.emulator.tendons import law
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.robot.robot import Robot
@@ -108,9 +108,9 @@ def test_switching_one_effect_off_keeps_the_random_draws_of_the_others(robot):
     whole, part = (
         ForeignArm(robot, 1, effects) for effects in (Effects(), replace(Effects(), hysteresis=0.0))
     )
-    for name, values in whole.wires._asdict().items():
+    for name, values in whole.tendons._asdict().items():
         if name != 'hysteresis':
-            np.testing.assert_array_equal(values, getattr(part.wires, name))
+            np.testing.assert_array_equal(values, getattr(part.tendons, name))
     np.testing.assert_array_equal(whole._model.site_pos, part._model.site_pos)
 
 
@@ -121,7 +121,7 @@ def test_hysteresis_raises_tension_while_stretching_and_lowers_it_while_shorteni
         for each in tensions:
             arm.command_tension(np.full(robot.muscle_count, each))
             arm.step(0.02)
-        middle = [law(arm.wires, m, x) for m, x in enumerate(memory.elongation)]
+        middle = [law(arm.tendons, m, x) for m, x in enumerate(memory.elongation)]
         assert np.all(side * memory.loop > 0.5)
         assert np.all(side * (tension - middle) > 0.5)
 

@@ -4,7 +4,11 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.experiments.baselines import PolynomialFilter, TableSearch, unstretched
+from musculoskeletal_ae.experiments.baselines import (
+    PolynomialFilter,
+    TableSearch,
+    without_elongation,
+)
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -30,7 +34,7 @@ def errors(estimate, theta):
 
 def test_the_elongation_is_removed_exactly(robot, motion):
     theta, tension, length = motion
-    off = unstretched(robot, tension, length) - robot.routes.relative_lengths(theta)
+    off = without_elongation(robot, tension, length) - robot.routes.relative_lengths(theta)
     assert np.abs(off).max() < 1e-5  # second order in wire stretch times elongation
 
 

@@ -7,14 +7,14 @@ import pytest
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments.detection import (
     CARRYING,
-    CUT_TIME,
-    LATEST_CUT,
+    LATEST_RUPTURE,
     PAYLOAD,
+    RUPTURE_TIME,
     SLOT,
-    GraspAndCut,
-    Watched,
+    DetectorOutput,
+    GraspAndRupture,
+    alarm_starts,
     auroc,
-    begins,
     detection,
     grasp_and_release,
 )
@@ -42,7 +42,7 @@ class Fake:
 
 
 def test_the_script_grasps_midway_and_ruptures_and_mends_every_muscle_once(arm26):
-    plan = GraspAndCut(arm26, 4.0, seed=0)
+    plan = GraspAndRupture(arm26, 4.0, seed=0)
     arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
     arm.follow(plan, plan.duration)
     assert [time for time, what in arm.done if what == PAYLOAD] == [2.0]
@@ -52,25 +52,25 @@ def test_the_script_grasps_midway_and_ruptures_and_mends_every_muscle_once(arm26
     assert plan.order[0] == 1  # the muscle that the paper deactivates
     for (cut, names), (mended, none) in zip(cuts[::2], cuts[1::2], strict=True):
         assert names and not none
-        assert mended - cut == pytest.approx(CUT_TIME, abs=0.02)
+        assert mended - cut == pytest.approx(RUPTURE_TIME, abs=0.02)
         assert (cut - 4.0) // SLOT == (mended - 4.0) // SLOT
 
 
 def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(arm26):
-    plan = GraspAndCut(arm26, 4.0, seed=0)
+    plan = GraspAndRupture(arm26, 4.0, seed=0)
     Fake(arm26, arm26.tension.bias).follow(plan, plan.duration)
     assert not plan.carried.any()
-    np.testing.assert_allclose((plan.cut - 4.0) % SLOT, LATEST_CUT, atol=0.011)
+    np.testing.assert_allclose((plan.rupture - 4.0) % SLOT, LATEST_RUPTURE, atol=0.011)
     assert plan.counted.tolist() == list(range(arm26.muscle_count))  # rather all than none
 
 
 def test_a_switched_off_muscle_is_not_ruptured_but_commanded_no_tension(arm26):
-    plan = GraspAndCut(arm26, 4.0, seed=0, switched_off=True)
+    plan = GraspAndRupture(arm26, 4.0, seed=0, switched_off=True)
     arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
     arm.follow(plan, plan.duration)
     assert not any(what for _, what in arm.done if isinstance(what, tuple))
     off = np.array(arm.off)
-    np.testing.assert_allclose(0.01 * off.sum(axis=0), CUT_TIME, atol=0.02)
+    np.testing.assert_allclose(0.01 * off.sum(axis=0), RUPTURE_TIME, atol=0.02)
     assert off.sum(axis=1).max() == 1
 
 
@@ -93,21 +93,21 @@ def test_the_payload_changes_every_minute(arm26):
 
 
 def test_only_an_alarm_that_begins_after_the_rupture_counts_as_detection(arm26, trained):
-    plan = GraspAndCut(arm26, 4.0, seed=0)
+    plan = GraspAndRupture(arm26, 4.0, seed=0)
     count, muscles = round(plan.duration / 0.01), arm26.muscle_count
-    plan.cut, plan.carried = 4.0 + SLOT * np.arange(muscles) + 1.0, np.ones(muscles, dtype=bool)
+    plan.rupture, plan.carried = 4.0 + SLOT * np.arange(muscles) + 1.0, np.ones(muscles, dtype=bool)
     alarm, suspect = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
-    starts = np.round(plan.cut / 0.01).astype(int)
+    starts = np.round(plan.rupture / 0.01).astype(int)
     alarm[starts[0] + 9 : starts[0] + 20] = True  # noticed after 0.1 s, named rightly
     alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, and muscle 0 is named
     alarm[starts[2] - 50 : starts[2] + 400] = True  # was on before
-    observed = Watched(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
-    well = Watched(*(np.zeros(5, dtype=bool) for _ in range(5)))
+    observed = DetectorOutput(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
+    well = DetectorOutput(*(np.zeros(5, dtype=bool) for _ in range(5)))
     numbers = detection(arm26, plan, observed, well, trained['default'])
     cuts = list(numbers['cuts'].values())
     assert [cut['detected'] for cut in cuts[:3]] == [True, True, False]
     assert [cut['named'] for cut in cuts[:3]] == [True, False, False]
-    assert [cut['detection_s'] for cut in cuts[:3]] == pytest.approx([0.1, 0.2, CUT_TIME])
+    assert [cut['detection_s'] for cut in cuts[:3]] == pytest.approx([0.1, 0.2, RUPTURE_TIME])
     assert numbers['detected_share'] == pytest.approx(2.0 / muscles)
     assert numbers['false_alarms'] == 0 and numbers['false_alarms_beside_cuts'] == 1
 
@@ -120,6 +120,6 @@ def test_auroc_is_the_share_of_correctly_ordered_pairs():
 
 
 def test_alarms_are_counted_when_they_begin():
-    assert begins(np.array([True, True, False, True, False, False, True, True])).sum() == 3
-    assert not begins(np.zeros(5, dtype=bool)).any()
-    assert not begins(np.zeros(0, dtype=bool)).any()
+    assert alarm_starts(np.array([True, True, False, True, False, False, True, True])).sum() == 3
+    assert not alarm_starts(np.zeros(5, dtype=bool)).any()
+    assert not alarm_starts(np.zeros(0, dtype=bool)).any()

@@ -134,14 +134,16 @@ def test_the_report_names_missed_aims_and_their_difference(quick, tmp_path):
     (folder / 'control' / 'result.json').write_text(json.dumps(content), encoding='utf-8')
     page = write_report(folder).read_text(encoding='utf-8')
     assert '<span class="missed">missed by 0.440</span>' in page
-    assert 'proposed, distance from θ_eval [rad]' in page.split('Aims missed:')[1].split('</p>')[0]
+    assert 'proposed, distance from θ_eval [rad]' in page.split('Goals missed:')[1].split('</p>')[0]
 
 
 def test_the_report_of_one_experiment_contains_only_that_one(quick, tmp_path):
     shutil.copytree(quick / 'body_change', tmp_path / 'body_change')
     page = write_report(tmp_path).read_text(encoding='utf-8')
     assert page.count('<h2 id=') == 1
-    assert 'experiment body_change --robot arm26' in page and 'Beside the paper' not in page
+    assert (
+        'experiment body_change --robot arm26' in page and 'Comparison with the paper' not in page
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import (
-    learned,
     nominal,
+    on_calibrated_body,
     oracle,
     oracle_errors,
 )
@@ -33,7 +33,11 @@ def body(robot, name):
         fitted = CalibratedBody(robot)
         for parameters in fitted.parameters:
             parameters += 1e-3 * np.random.default_rng(0).standard_normal(len(parameters))
-        return learned(robot, fitted), lambda *at: fitted.lengths(*at, np.zeros_like(at[1]))[0]
+
+        def lengths(theta, tension):
+            return fitted.lengths(theta, tension, np.zeros_like(tension))[0]
+
+        return on_calibrated_body(robot, fitted), lengths
     return nominal(robot), robot.muscle_lengths
 
 
@@ -51,7 +55,7 @@ def test_least_squares_is_exact_on_its_own_body(robot, name):
 
 def test_the_jacobian_of_the_learned_body_is_its_slope(robot):
     theta = robot.random_postures(5, np.random.default_rng(0))
-    geometric = learned(robot, CalibratedBody(robot)).muscle_jacobian(theta)
+    geometric = on_calibrated_body(robot, CalibratedBody(robot)).muscle_jacobian(theta)
     np.testing.assert_allclose(geometric, robot.routes.muscle_jacobian(theta), atol=1e-4)
 
 

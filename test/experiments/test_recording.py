@@ -64,8 +64,8 @@ def test_a_script_changes_the_arm_from_its_time_on(arm26, mae, plain):
 def test_an_arm_without_friction_is_otherwise_the_same_body(arm26, tmp_path):
     study = Study(arm26, 'default', (3,), 1.0, True, tmp_path)
     smooth, rubbing = study.arm(3, friction=False).individual, study.arm(3).individual
-    assert not smooth.cable_friction.any() and not smooth.joint_friction.any()
-    assert rubbing.cable_friction.all() and rubbing.joint_friction.all()
+    assert not smooth.tendon_friction.any() and not smooth.joint_friction.any()
+    assert rubbing.tendon_friction.all() and rubbing.joint_friction.all()
     theta = arm26.random_postures(3, np.random.default_rng(0))
     np.testing.assert_array_equal(smooth.absolute_lengths(theta), rubbing.absolute_lengths(theta))
 

@@ -15,7 +15,7 @@ from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.experiments import online_learning, results, robustness, runner
 from musculoskeletal_ae.experiments.results import (
     KEPT,
-    combined,
+    combine,
     read,
     readme_table,
     write_report,
@@ -33,7 +33,7 @@ def test_result_json_has_means_of_the_seeds_that_have_them_but_counts_alarms(arm
     }
     rows[0] |= {'hand_circle_m': None, 'ellipsoid_share': None}  # it found no circle
     rows[1] |= {'hand_circle_m': 0.01, 'ellipsoid_share': None}
-    content = combined(study, {seed: Measured(row, {}) for seed, row in rows.items()})
+    content = combine(study, {seed: Measured(row, {}) for seed, row in rows.items()})
     assert content['after_rad'] == 0.2
     assert content['false_alarms'] == 3
     assert content['first']['error_rad'] == pytest.approx(0.3)
@@ -45,7 +45,7 @@ def test_result_json_has_means_of_the_seeds_that_have_them_but_counts_alarms(arm
 def test_a_number_that_json_cannot_say_is_refused(arm26, tmp_path):
     study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
     with pytest.raises(MusculoskeletalError, match='finite'):
-        combined(study, {0: Measured({'deep': {'list': [1.0, float('nan')]}}, {})})
+        combine(study, {0: Measured({'deep': {'list': [1.0, float('nan')]}}, {})})
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_what_is_no_result_is_left_out_of_the_report(kept, text, capsys):
     file.write_text(text)
     page = write_report(kept).read_text('utf-8')
     assert 'id="control"' in page and 'id="estimation"' not in page
-    assert f'{file} is no result of an experiment' in capsys.readouterr().err
+    assert f'{file} is not a valid result of an experiment' in capsys.readouterr().err
 
 
 def test_a_number_that_was_not_measured_is_a_dash(kept):
@@ -186,11 +186,11 @@ def test_a_network_is_read_whole_while_another_individual_brings_it(arm26, tmp_p
     study = Study(arm26, 'default', (0, 1), 1.0, True, tmp_path)
     for preset in PRESETS:
         study.network_file(preset, None).write_text('first')
-    part = robustness._learned(study, 0, FOREIGN)
+    part = robustness._study_of_model(study, 0, FOREIGN)
     file = part.network_file('default', None)
     with file.open() as reading:
         study.network_file('default', None).write_text('second')
-        robustness._learned(study, 1, FOREIGN)
+        robustness._study_of_model(study, 1, FOREIGN)
         assert reading.read() == 'first'
     assert file.read_text() == 'second'
     assert len(list(part.folder.iterdir())) == len(PRESETS)

@@ -11,7 +11,7 @@ from musculoskeletal_ae.experiments.roles import (
     elbow,
     elbows,
     flexed,
-    plotted,
+    plot_unit,
     shoulder,
     within,
 )
@@ -44,5 +44,5 @@ def test_without_known_names_the_first_and_last_revolute_joints_are_shoulder_and
     assert shoulder(robot) == 0
     assert elbow(robot) == robot.joint_count - 2
     assert np.flatnonzero(elbows(robot)).tolist() == [elbow(robot)]
-    assert plotted(robot, robot.joint_count - 1) == (1000.0, 'mm')
+    assert plot_unit(robot, robot.joint_count - 1) == (1000.0, 'mm')
     assert robot.lower[elbow(robot)] <= flexed(robot) <= robot.upper[elbow(robot)]

@@ -9,7 +9,7 @@ import pytest
 from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
-from musculoskeletal_ae.experiments.least_squares import learned
+from musculoskeletal_ae.experiments.least_squares import on_calibrated_body
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.covariance import ellipsoids, estimate_covariance
 from musculoskeletal_ae.learning.fit import fit_body
@@ -90,7 +90,7 @@ def test_learning_without_joint_angles_improves_the_estimate(arm26, tmp_path, ot
     observed, test = resting.observations(40), resting.observations(40)
 
     def estimate(body, at):
-        return learned(robot, body).estimate(at.tension, at.length)
+        return on_calibrated_body(robot, body).estimate(at.tension, at.length)
 
     before, body = CalibratedBody(robot), CalibratedBody(robot)
     fit_body(body, blind(observed), guess=estimate(before, observed))
@@ -168,10 +168,8 @@ def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_sample
         resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
         observed, test = resting.observations(60), resting.observations(40)
         body = CalibratedBody(arm26)
-        fit = fit_body(
-            body, blind(observed), guess=learned(arm26, body).estimate(*observed.state()[1:])
-        )
-        estimate = learned(arm26, body).estimate
+        estimate = on_calibrated_body(arm26, body).estimate
+        fit = fit_body(body, blind(observed), guess=estimate(*observed.state()[1:]))
         exact = SimpleNamespace(
             estimate=lambda *observed, e=estimate: SimpleNamespace(theta=e(*observed))
         )

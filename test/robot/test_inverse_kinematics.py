@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from musculoskeletal_ae.emulator.modules import seen_by_camera
+from musculoskeletal_ae.emulator.modules import camera_reading
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, SPREADS, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -30,6 +30,6 @@ def test_noise_of_the_camera_turns_joints_by_less_than_0_2_rad():
     """A search to the end turns them by 0.41 rad; one that is pulled to within 0.2 rad, by 0.17."""
     rng = np.random.default_rng(1)
     theta = ARM.random_postures(400, rng)
-    observed = [seen_by_camera(ARM.kinematics.end_effector_pose(each), rng) for each in theta]
+    observed = [camera_reading(ARM.kinematics.end_effector_pose(each), rng) for each in theta]
     found = [inverse_kinematics(ARM, *known).theta for known in zip(observed, theta, strict=True)]
     assert np.linalg.norm(np.array(found) - theta, axis=1).max() < 0.2

@@ -36,7 +36,7 @@ class Motors:
             modules.HOUSING_CAPACITY, modules.WINDING_RESISTANCE, modules.HOUSING_RESISTANCE,
         )  # fmt: skip
         own = dict(zip(modules.Modules._fields[-5:], np.array(mean)[:, None] * factors))
-        self.wound = self.arm._wound._replace(**own)
+        self.wound = self.arm._module_constants._replace(**own)
         self.heat = Heat(ROBOT)
         self.errors, self.pulled, self.read = [], TENSION.bias, None
 
