@@ -146,7 +146,7 @@ def _error_with_effects(
 
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
     explorer = seed if run is None else run
-    learner, loop = online_learning.beginner(study, arm(), explorer, study.preset)
+    learner, loop = online_learning.new_learner_and_loop(study, arm(), explorer, study.preset)
     stream = online_learning.explore(loop, learner, 60.0 * study.minutes)
     online_learning.teach(learner, stream)
     return estimation_error(learner.mae, held_out)
@@ -201,7 +201,7 @@ def ablation(_: Study | None, rows: Rows) -> Plot:
     figure, (panel,) = plots.new_figure(8.0, 4.6)
     colours = [plots.AFTER] * len(changes)
     title = 'Change of the error after learning without one group of effects'
-    xlabel = 'change of the mean error on held-out motion [mrad]; negative: effects increase it'
+    xlabel = 'change of the mean error [mrad]; negative: the effects increase the error'
     plots.ranked_bars(panel, changes, colours, xlabel, title, digits=1)
     panel.axvline(0.0, color=plots.TRUE, lw=1.0)
     whole = float(np.mean([numbers[FOREIGN]['after_rad'] for numbers in known.values()]))

@@ -106,7 +106,7 @@ def sensors(_: Study | None, rows: Rows) -> Plot:
     ranked = sorted(BARS, key=means.__getitem__, reverse=True)
     values = {BARS[key]: [row.numbers[key] for row in rows.values()] for key in ranked}
     colours = [plots.BEFORE if key == 'before_rad' else plots.AFTER for key in ranked]
-    title = 'Joint-angle error by sensors of the learner'
+    title = 'Joint-angle error with fewer joint sensors'
     plots.ranked_bars(panel, values, colours, 'mean error on held-out motion [rad]', title)
     return figure, (
         'Mean joint-angle error on held-out motion, by the sensors that the learner uses. Each dot '
