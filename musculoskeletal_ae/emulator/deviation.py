@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How an individual deviates from the MJCF file that it is played from.
+"""Random deviations of an emulated individual from the MJCF file that describes it.
 
-A file says what a body should be; nobody builds exactly that. A seed draws what is different:
+A built robot never equals its description exactly. The seed draws these differences:
 
     attachment points    σ = 10 % of the muscle's typical moment arm, at most 5 mm, each coordinate
-    slack                σ = 5 % of the same, at most 2 mm, of each tendon's length
+    slack                σ = 5 % of the typical moment arm, at most 2 mm, of each tendon's length
     elastic elements     up to 20 % stiffer or softer
     tendon friction      15 to 20 % of the tension along the route, where the file has none
     joint friction       1.1 to 1.5 % of the joint's largest load by weight and muscles at T_bias
     masses               σ = 10 % of the mass of each body, with its inertia
-    tension sensors      σ = 2 % of the gain, 1 % of T_limit of the zero
-    joint sensors        σ = 1° of the zero
+    tension sensors      σ = 2 % of the gain, 1 % of T_limit of the offset
+    joint sensors        σ = 1° of the offset
 
-The typical moment arm is the root mean square over the workspace, so that a finger deviates as much
-as a shoulder does. Without a seed the file is played as it is.
+The typical moment arm is the root mean square over the workspace. The deviations of a finger are
+therefore in proportion to those of a shoulder.
 """
 
 from dataclasses import replace
@@ -30,11 +30,11 @@ ATTACHMENT, FARTHEST = 0.1, 0.005  # share of the typical moment arm; [m]
 SLACK, LONGEST = 0.05, 0.002  # share of the typical moment arm; [m]
 MASS = 0.1  # σ of the logarithm
 ZERO = 0.01  # of tension sensors, share of T_limit
-POSTURES = 200  # over which moment arms are typical
+POSTURES = 200  # over which moment arms are averaged
 
 
 def effects(robot: Robot) -> Effects:
-    """Return what sensors, springs and friction deviate by."""
+    """Return the deviations of sensors, series elastic elements and friction."""
     return replace(
         NONE,
         stiffness=0.2,
@@ -56,28 +56,32 @@ def typical_arms(robot: Robot) -> Array:
 
 
 def slack(robot: Robot, draw: Draw) -> Array:
-    """Return by how much each length sensor reads too much at the start [m], (M,)."""
+    """Return the initial offset of each length sensor [m], (M,)."""
     sigma = np.minimum(SLACK * typical_arms(robot), LONGEST)
     return sigma * draw.rng('slack').normal(size=len(sigma))
 
 
 class Attachments:
-    """Moves the sites of a model's tendons, and moves those of some muscles anew."""
+    """Random displacements of the sites of a model's tendons, which can be redrawn by muscle."""
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
-        """Look at a model whose tendons have the names of the robot's muscles."""
+        """Take a model whose tendons have the names of the robot's muscles, and move its sites."""
         self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
         sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
         self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]
-        #: of each site, the least of the muscles that pass it [m]
+        #: σ of each site: the smallest of all muscles that pass it [m]
         self._sigma = np.zeros(model.nsite)
-        for own, most in zip(self._sites, sigma.tolist()):
-            free = self._sigma[own] == 0.0
-            self._sigma[own] = np.where(free, most, np.minimum(self._sigma[own], most))
+        for own, size in zip(self._sites, sigma.tolist()):
+            is_new = self._sigma[own] == 0.0
+            self._sigma[own] = np.where(is_new, size, np.minimum(self._sigma[own], size))
         self.move(np.ones(len(self._sites), dtype=bool))
 
     def move(self, muscles: Bools) -> None:
-        """Draw where the sites of some muscles (M,) are; none gets into what it wraps round."""
+        """Draw the positions of the sites of some muscles (M,).
+
+        A site that would lie inside an object that a tendon wraps round keeps its original
+        position.
+        """
         own = [self._sites[m] for m in np.flatnonzero(muscles)]
         for s in np.unique(np.concatenate(own)).tolist():
             shift = self._sigma[s] * self._rng.normal(size=3)
@@ -94,7 +98,7 @@ def _sites(model: Any, tendon: int) -> Array:
 
 
 def _is_inside(model: Any, site: int) -> bool:
-    """Return whether a site lies in or on something of its own body that a tendon wraps round."""
+    """Return whether a site lies inside a wrapped geom of its own body."""
     kinds = mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER
     for w in np.flatnonzero(np.isin(model.wrap_type, kinds)).tolist():
         geom = model.wrap_objid[w]
@@ -111,7 +115,7 @@ def _is_inside(model: Any, site: int) -> bool:
 
 
 def change_masses(model: Any, draw: Draw) -> None:
-    """Make each body of a model heavier or lighter."""
+    """Scale mass and inertia of each body by a random factor."""
     factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
     model.body_mass[:] *= factor
     model.body_inertia[:] *= factor[:, None]

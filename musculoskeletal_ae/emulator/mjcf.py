@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot as a MuJoCo model: built from its directory, or a user's own MJCF file.
+"""MuJoCo model of a robot, built from its directory or from a user's MJCF file.
 
-MuJoCo does rigid bodies, wrapping, joint stops and joint friction. Our muscle modules pull at its
-tendons; the actuators of a file are left out.
+MuJoCo simulates rigid bodies, wrapping, joint stops and joint friction. Our muscle modules act on
+its tendons; the actuators of a file are removed.
 """
 
 from collections.abc import Iterator
@@ -31,9 +31,9 @@ ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; ch
 LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # [m], [rad] of `Effects.links`
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # share, [m]
 THICKEST = 0.045  # [m] radius of a bone's head or a muscle
-POSTURES = 300  # in which they are fitted
-# MuJoCo makes a coupling as soft as either joint alone moves, whatever the ratio: by default, a
-# slider that follows a joint that turns would lag by centimetres.
+POSTURES = 300  # random postures over which their radii are fitted
+# MuJoCo ignores the ratio of a coupling when it scales its stiffness. With the default, a prismatic
+# joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 HAND = 'hand of the emulator'
 OF_MOTORS = (
@@ -42,40 +42,41 @@ OF_MOTORS = (
     *('forcerange', 'gainprm', 'gaintype', 'gear', 'group', 'nsample'),
 )
 
-Place = tuple[int, Array]  # joint, and where in its frame [m]
-Obstacle = tuple[int, Array, Array]  # the same of its middle, and its axis
+Place = tuple[int, Array]  # joint, and position in its frame [m]
+Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame
 
 check_mujoco()
-mujoco.set_mju_user_warning(lambda _: None)  # by default it writes a file where it was started
+mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the current directory
 
 
 def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
-    """Return the body that a robot directory describes, individually off, as an MjSpec.
+    """Return the body of a robot directory with the deviations of an individual, as an MjSpec.
 
-    By how much the route points of muscles are off is drawn `again` so often (M,).
+    `again` holds how often the deviations of each muscle's route points are redrawn, (M,).
     """
     spec, bodies = skeleton(robot, draw)
     add_routes(robot, draw, again, spec, bodies)
     joint, at = robot.kinematics.placement(robot.description.end_effector)
     _add_hand(bodies[joint], at)
-    return _pulled(spec, robot)
+    return _with_motors(spec, robot)
 
 
 def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
-    """Return the links and joints of a robot, individually off, and the body of each joint."""
+    """Return the links and joints of a robot with deviations, and the body of each joint."""
     kin, spec = robot.kinematics, mujoco.MjSpec()
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
-    spec.compiler.boundmass = 1e-6  # of links that weigh nothing
+    spec.compiler.boundmass = 1e-6  # for links without mass
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
     bodies, gear = [spec.worldbody], joint_gear(kin)
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
-        long = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD  # two axes in one place stay so
-        place = at.translation + LENGTH_SPREAD * off[i, 0] * long
-        moved = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
-        body = bodies[model.parents[i]].add_body(**moved)
+        # Joints at a common point stay there.
+        is_apart = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD
+        place = at.translation + LENGTH_SPREAD * off[i, 0] * is_apart
+        placement = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
+        body = bodies[model.parents[i]].add_body(**placement)
         scale = np.exp(MASS_SPREAD * off[i, 1, 0])
         body.mass, body.explicitinertial = scale * inertia.mass, True
         body.ipos = inertia.lever + CENTRE_SPREAD * off[i, 2]
@@ -92,8 +93,9 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
         else:
             coupling, data = robot.description.couplings[name], np.zeros(mujoco.mjNEQDATA)
             if len(coupling.terms) > 5:
-                told = f'joint {name!r} follows by a polynomial of degree {len(coupling.terms) - 1}'
-                raise MusculoskeletalError(f'reality foreign: {told}; MuJoCo knows up to 4')
+                degree = len(coupling.terms) - 1
+                problem = f'the coupling of joint {name!r} is a polynomial of degree {degree}'
+                raise MusculoskeletalError(f'reality foreign: {problem}; MuJoCo allows up to 4')
             data[: len(coupling.terms)] = coupling.terms
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}
             link |= {'data': data, 'solimp': STIFF}
@@ -103,7 +105,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
 
 
 def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
-    """Add the wires: route points that are off, what is described to wrap round, and heads."""
+    """Add the tendons: route points with deviations, described wrap objects, and bones' heads."""
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.tree.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
     bellies = _bellies(robot)
@@ -115,12 +117,13 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
             place, name, side = at.act(item.xyz), f'{muscle}, {n}', ''
             if isinstance(item, Wrap):
                 axis = None if item.axis is None else at.rotation @ item.axis
-                # Described ones are a little off as well.
+                # Described objects deviate in size as well.
                 scale = rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0
                 _add_round(bodies[joint], name, place, axis, scale * item.radius)
                 if item.side is not None:
                     side = f'{name} side'
-                    beside = item.xyz + scale * (item.side - item.xyz)  # a ring stays one
+                    # Scale the side site with the object, so that a ring stays a ring.
+                    beside = item.xyz + scale * (item.side - item.xyz)
                     carrier, place = joint, at.act(beside)
                     if item.side_link is not None:
                         carrier, place = kin.attach(item.side_link, item.side)
@@ -150,7 +153,7 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
 
 
 def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
-    """Return the middle of each run of each muscle and how it lies, where joints are mid-range."""
+    """Return the centre and direction of every section of every muscle at mid-range."""
     kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
     poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
@@ -175,11 +178,11 @@ def _obstacle(
     kink: float,
     cylinder: bool,
 ) -> tuple[int, Array, Array, float]:
-    """Return what a wire is bent by between two ends, with its radius [m]; 0: by nothing.
+    """Return the object that bends a tendon between two ends, with its radius [m]; 0 if none.
 
-    It is the head of a bone at a joint between them, or another muscle's belly: what can make its
-    way longer by `kink` [m] in one of the postures, or by most. A wire may slip over it to its
-    other side.
+    Candidates are the heads of bones at joints between the ends, and the bellies of other muscles.
+    The object lengthens the tendon by `kink` [m] in at least one posture, or by as much as
+    possible. The tendon may slip over it to the other side.
     """
     between = kin.tree.hangs_on[ends[0][0]] ^ kin.tree.hangs_on[ends[1][0]]
     joints = np.flatnonzero(between & ~kin.tree.prismatic)
@@ -189,7 +192,7 @@ def _obstacle(
         turn, origin = poses.rotation[:, carrier], poses.translation[:, carrier]
         away = [poses.rotation[:, c] @ at + poses.translation[:, c] - origin for c, at in ends]
         local = [np.einsum('nji,nj->ni', turn, each) - middle for each in away]
-        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder it winds as on a screw
+        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder the path is a helix
         local = [each - cylinder * np.outer(each @ axis, axis) for each in local]
         apart = [np.linalg.norm(each, axis=1) for each in local]
         radius = np.linspace(0.0, min(0.8 * min(map(np.min, apart)), THICKEST), 30)[:, None]
@@ -199,7 +202,7 @@ def _obstacle(
         for each in apart:
             touching = touching - np.arccos(radius / np.maximum(each, 1e-12))
             way = way + np.sqrt(each**2 - radius**2)
-        # Two straight runs that touch it, and the arc between them.
+        # Two straight tangents, and the arc between them.
         bent = np.hypot(way + radius * touching, along)
         straight = np.hypot(np.linalg.norm(local[1] - local[0], axis=1), along)
         longer = np.max(np.where(touching > 0.0, bent - straight, 0.0), axis=1)
@@ -210,7 +213,7 @@ def _obstacle(
 
 
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
-    """Add a sphere or a cylinder that wires wrap round and nothing else touches."""
+    """Add a sphere or a cylinder for tendons to wrap round, without collisions."""
     kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -220,40 +223,41 @@ def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: f
 
 
 def _turn(rotation: Array) -> Array:
-    """Return a rotation as MuJoCo's quaternion."""
+    """Return a rotation matrix as a MuJoCo quaternion."""
     coefficients: Array = pin.Quaternion(rotation).coeffs()
     return np.roll(coefficients, 1)
 
 
 def _add_hand(body: Any, at: pin.SE3) -> None:
-    """Add the end effector, which holds the payload; its axes are those of its link."""
+    """Add the end effector in the axes of its link; it carries the payload."""
     hand = body.add_body(name=HAND, pos=at.translation, quat=_turn(at.rotation))
     hand.explicitinertial, hand.ipos = True, np.zeros(3)
 
 
 @contextmanager
 def _loading(file: Path) -> Iterator[None]:
-    """Say of a file that MuJoCo refuses it, and why."""
+    """Translate errors of MuJoCo into a MusculoskeletalError that names the file."""
     try:
         yield
     except (OSError, ValueError, mujoco.FatalError) as error:
-        raise _refusal(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
+        problem = f'MuJoCo does not load it: {" ".join(str(error).split())}'
+        raise _file_error(file, problem) from error
 
 
 def from_file(robot: Robot, file: Path) -> Any:
-    """Return the model of a user's own MJCF arm; other joints than the robot's are held.
+    """Return the model of a user's MJCF file; joints that the robot does not have are held.
 
-    They are held where `import_robot` holds them.
+    They are held in the position that `import_robot` uses.
 
     Raises:
-        MusculoskeletalError: If MuJoCo does not load it, or what the robot's directory names is not
-            in it.
+        MusculoskeletalError: If MuJoCo cannot load the file, or the file lacks a joint, tendon or
+            body that the robot directory names.
     """
     with _loading(file):
         spec = open_mjcf(file)
     followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
     links = _links_of_the_hand(robot)
-    hand = _as_imported(spec, file, [*followers, *robot.muscles], [*links])
+    hand = _rename_as_imported(spec, file, [*followers, *robot.muscles], [*links])
     _split_balls(spec, followers)
     tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
     for kind, present, wanted in (
@@ -263,51 +267,58 @@ def from_file(robot: Robot, file: Path) -> Any:
     ):
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
-            told = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
-            raise _refusal(file, f'{told}; it has: {", ".join(filter(None, names))}; import_robot')
-    given_kinds = {joint.name: joint.type for joint in spec.joints}
+            available = ', '.join(filter(None, names))
+            problem = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
+            remedy = f'it has: {available}; create the robot with import_robot'
+            raise _file_error(file, f'{problem}; {remedy}')
+    joint_types = {joint.name: joint.type for joint in spec.joints}
     for name, slides in zip(followers, robot.kinematics.tree.prismatic[1:], strict=True):
-        due, given = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE, given_kinds[name]
-        if given != due:
-            what, legal = (each.name.removeprefix('mjJNT_').lower() for each in (given, due))
-            told = f'joint {name!r} is a {what}, of {robot.description.directory} a {legal}'
-            raise _refusal(file, f'{told}; import_robot')
-    for thing in [*spec.actuators, *spec.sensors, *spec.keys, *spec.tuples]:  # which name others
+        expected = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE
+        actual = joint_types[name]
+        if actual != expected:
+            there, here = (t.name.removeprefix('mjJNT_').lower() for t in (actual, expected))
+            problem = f'joint {name!r} is a {there}, but in {robot.description.directory} a {here}'
+            raise _file_error(file, f'{problem}; create the robot with import_robot')
+    # Delete these first, because they refer to other elements.
+    for thing in [*spec.actuators, *spec.sensors, *spec.keys, *spec.tuples]:
         spec.delete(thing)
     held = [joint for joint in spec.joints if joint.name not in followers]
-    gone = {joint.name for joint in held if joint.name}
-    ties = _ties(spec, mujoco.mjtEq.mjEQ_JOINT, gone)
-    bound = [t for t in spec.tendons if t not in tendons]
-    bound = [t for t in bound if not gone.isdisjoint(wrap.target.name for wrap in t.path)]
-    loose = _ties(spec, mujoco.mjtEq.mjEQ_TENDON, {tendon.name for tendon in bound})
-    moved = list[tuple[Any, dict[str, Array]]]()
-    if ties:
+    held_names = {joint.name for joint in held if joint.name}
+    joint_equalities = _equalities(spec, mujoco.mjtEq.mjEQ_JOINT, held_names)
+    fixed_tendons = [t for t in spec.tendons if t not in tendons]
+    fixed_tendons = [
+        t for t in fixed_tendons if not held_names.isdisjoint(wrap.target.name for wrap in t.path)
+    ]
+    tendon_names = {tendon.name for tendon in fixed_tendons}
+    tendon_equalities = _equalities(spec, mujoco.mjtEq.mjEQ_TENDON, tendon_names)
+    placements = list[tuple[Any, dict[str, Array]]]()
+    if joint_equalities:
         with _loading(file):
-            whole = spec.compile()
-        moved = _moved_by(whole, spec, held)
-    for thing in [*ties, *loose, *bound, *held]:
+            complete = spec.compile()
+        placements = _placements_of_held(complete, spec, held)
+    for thing in [*joint_equalities, *tendon_equalities, *fixed_tendons, *held]:
         spec.delete(thing)
-    for pair in [*spec.pairs]:  # MuJoCo stops at a contact of two bodies that stand
+    for pair in [*spec.pairs]:  # MuJoCo rejects a contact pair of two immobile bodies
         if not any(map(_moves, (spec.geom(pair.geomname1), spec.geom(pair.geomname2)))):
             spec.delete(pair)
-    for joint in spec.joints:  # limits of what the file's own actuators do
+    for joint in spec.joints:  # these limits are for the file's own actuators
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    # By name MuJoCo finds none that was named since it was compiled.
+    # MuJoCo does not find by name what was renamed after compilation, so search for the body.
     at = links.get(hand) or next(at for link, at in links.items() if safe_name(hand, '') == link)
     _add_hand(next(body for body in spec.bodies if body.name == hand), at)
     with _loading(file):
-        model = _pulled(spec, robot).compile()
+        model = _with_motors(spec, robot).compile()
     tie_rims(model)
-    for thing, values in moved:
+    for thing, values in placements:
         for name, value in values.items():
             getattr(model, name)[thing.id] = value
-    if moved:
+    if placements:
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 
 def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
-    """Return the end effector and the links that it is fixed to, with its pose in each of them."""
+    """Return the end effector's pose in its own link and in all links rigidly connected to it."""
     model, name = robot.description.model, robot.description.end_effector
     joint, hand = link_placement(model, name)
     frame, links = model.getFrameId(name, pin.FrameType.BODY), dict[str, pin.SE3]()
@@ -320,21 +331,22 @@ def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
 
 
 def _split_balls(spec: Any, followers: list[str]) -> None:
-    """Put three hinges in the place of each ball joint whose parts the robot has."""
+    """Replace ball joints by three hinges where the robot has their parts."""
     wanted = set(followers)
     for ball in [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_BALL]:
         parts = [f'{safe_name(ball.name, "")}_{axis}' for axis in 'xyz']
         if wanted.isdisjoint(parts):
             continue
-        body, most = ball.parent, float(ball.range[1])
-        given = {'pos': ball.pos, 'damping': ball.damping, 'stiffness': ball.stiffness}
-        given |= {'armature': ball.armature, 'frictionloss': ball.frictionloss}
-        limited = ball.limited != mujoco.mjtLimited.mjLIMITED_FALSE and most > 0.0
+        body, limit = ball.parent, float(ball.range[1])
+        names = 'pos', 'damping', 'stiffness', 'armature', 'frictionloss'
+        properties = {name: getattr(ball, name) for name in names}
+        properties['type'] = mujoco.mjtJoint.mjJNT_HINGE
+        limited = ball.limited != mujoco.mjtLimited.mjLIMITED_FALSE and limit > 0.0
         spec.delete(ball)
         for name, axis in zip(parts, np.eye(3)):
-            hinge = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, **given)
+            hinge = body.add_joint(name=name, axis=axis, **properties)
             if limited:
-                hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-most, most]
+                hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
 
 
 def _moves(geom: Any) -> bool:
@@ -344,16 +356,18 @@ def _moves(geom: Any) -> bool:
     return bool(body.joints)
 
 
-def _ties(spec: Any, kind: Any, names: set[str]) -> list[Any]:
-    """Return the equalities of a kind that name one of some joints or tendons."""
-    ties = [tie for tie in spec.equalities if tie.type == kind]
-    return [tie for tie in ties if not names.isdisjoint([tie.name1, tie.name2])]
+def _equalities(spec: Any, kind: Any, names: set[str]) -> list[Any]:
+    """Return the equalities of a kind that refer to one of the named joints or tendons."""
+    equalities = [each for each in spec.equalities if each.type == kind]
+    return [each for each in equalities if not names.isdisjoint([each.name1, each.name2])]
 
 
-def _moved_by(model: Any, spec: Any, held: list[Any]) -> list[tuple[Any, dict[str, Array]]]:
-    """Return bodies and joints of a file that stand elsewhere in their parents, as joints are held.
+def _placements_of_held(
+    model: Any, spec: Any, held: list[Any]
+) -> list[tuple[Any, dict[str, Array]]]:
+    """Return the bodies and joints whose placement in their parent depends on held joints.
 
-    Each comes with values for the model that has no such joints any more.
+    Each comes with its values for the model without the held joints.
     """
     rest, data = resting_joints(model), mujoco.MjData(model)
     for joint in held:
@@ -361,23 +375,26 @@ def _moved_by(model: Any, spec: Any, held: list[Any]) -> list[tuple[Any, dict[st
             data.qpos[model.jnt_qposadr[joint.id]] = rest[joint.id]
     mujoco.mj_kinematics(model, data)
     poses = [pin.SE3(turn.reshape(3, 3), at) for turn, at in zip(data.xmat, data.xpos)]
-    holders, moved = {joint.parent.id for joint in held}, list[tuple[Any, dict[str, Array]]]()
+    holders = {joint.parent.id for joint in held}
+    placements = list[tuple[Any, dict[str, Array]]]()
     for body in spec.bodies:
         if body.id in holders:
             pose = poses[model.body_parentid[body.id]].actInv(poses[body.id])
-            moved.append((body, {'body_pos': pose.translation, 'body_quat': _turn(pose.rotation)}))
+            values = {'body_pos': pose.translation, 'body_quat': _turn(pose.rotation)}
+            placements.append((body, values))
     for joint in spec.joints:
-        if joint.parent.id in holders and joint not in held:  # on which a held one may follow
+        # A held joint of the same body may come after this one and move it.
+        if joint.parent.id in holders and joint not in held:
             pose, i = poses[joint.parent.id], joint.id
             axis = pose.rotation.T @ data.xaxis[i]
-            moved.append((joint, {'jnt_pos': pose.actInv(data.xanchor[i]), 'jnt_axis': axis}))
-    return moved
+            placements.append((joint, {'jnt_pos': pose.actInv(data.xanchor[i]), 'jnt_axis': axis}))
+    return placements
 
 
-def _as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> str:
-    """Let joints and tendons have the names that `import_robot` gives them; return the hand's.
+def _rename_as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> str:
+    """Give joints and tendons the names that `import_robot` gives them; return the hand's body.
 
-    That is the first of several links that is a body of the file.
+    The hand's body is the first of `hands` that the file contains.
     """
     kinds = {'joint': spec.joints, 'tendon': spec.tendons, 'body': spec.bodies}
     bodies = {body.name for body in spec.bodies}
@@ -385,51 +402,53 @@ def _as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> 
     if {hand, *wanted} <= {thing.name for things in kinds.values() for thing in things}:
         return hand
     with _loading(file):
-        spec.compile()  # gives each its place
+        spec.compile()  # assigns ids
     new: dict[str, dict[str, str]] = {'joint': {}, 'tendon': {}, 'body': {}}
     fixed = [t for t in spec.tendons if t.path[0].type == mujoco.mjtWrap.mjWRAP_JOINT]
     bound = {wrap.target.name: tendon.name for tendon in fixed for wrap in tendon.path}
     for kind, things in kinds.items():
         ordered = sorted(things, key=lambda thing: thing.id)
         names = names_of_all(kind, (thing.name for thing in ordered))
-        called = list[tuple[Any, str]]()
+        renamed = list[tuple[Any, str]]()
         for thing, name in zip(ordered, names, strict=True):
             before = thing.name
-            # What has a name that another is to have has to give it up.
-            called_so = kind != 'body' and not {before, name}.isdisjoint(wanted)
-            if kind == 'joint' and before in bound and name != before and called_so:
-                told = f'tendon {bound[before]!r} is of joint {before!r}, which import_robot calls'
-                raise _refusal(file, f'{told} {name!r}; call it so in the file')
-            if not before or called_so:
-                called.append((thing, name))
+            # This also renames a thing whose name another one needs.
+            is_renamed = kind != 'body' and not {before, name}.isdisjoint(wanted)
+            if kind == 'joint' and before in bound and name != before and is_renamed:
+                problem = f'import_robot renames joint {before!r} to {name!r}, but MuJoCo cannot'
+                problem = f'{problem} rename it in tendon {bound[before]!r}'
+                raise _file_error(file, f'{problem}; use the new name in the file')
+            if not before or is_renamed:
+                renamed.append((thing, name))
                 thing.name = ''
             new[kind][before or name] = name
-        for thing, name in called:
+        for thing, name in renamed:
             thing.name = name
-    ties = {mujoco.mjtEq.mjEQ_JOINT: 'joint', mujoco.mjtEq.mjEQ_TENDON: 'tendon'}
-    for tie in [e for e in spec.equalities if e.type in ties]:
-        pairs = new[ties[tie.type]].items()
-        again = {old: name for old, name in pairs if not {old, name}.isdisjoint(wanted)}
-        tie.name1, tie.name2 = (again.get(name, name) for name in (tie.name1, tie.name2))
-    given = {safe: name for name, safe in new['body'].items()}
-    return next((given[name] for name in hands if name in given), hand)
+    kind_of_equality = {mujoco.mjtEq.mjEQ_JOINT: 'joint', mujoco.mjtEq.mjEQ_TENDON: 'tendon'}
+    for each in [e for e in spec.equalities if e.type in kind_of_equality]:
+        pairs = new[kind_of_equality[each.type]].items()
+        new_names = {old: name for old, name in pairs if not {old, name}.isdisjoint(wanted)}
+        each.name1 = new_names.get(each.name1, each.name1)
+        each.name2 = new_names.get(each.name2, each.name2)
+    own_names = {safe: name for name, safe in new['body'].items()}
+    return next((own_names[name] for name in hands if name in own_names), hand)
 
 
 def bodies_as_imported(model: Any) -> dict[str, int]:
-    """Return the bodies of a file by their own names and by those that `import_robot` gives."""
+    """Return the ids of a file's bodies by their own names and by those of `import_robot`."""
     own = {model.body(i).name: i for i in range(model.nbody)}
     del own[HAND]
-    ours = [i for i in range(model.nbody) if model.body(i).name != HAND]
-    given = names_of_all('body', (model.body(i).name for i in ours))
-    return own | dict(zip(given, ours, strict=True))
+    ids = [i for i in range(model.nbody) if model.body(i).name != HAND]
+    imported = names_of_all('body', (model.body(i).name for i in ids))
+    return own | dict(zip(imported, ids, strict=True))
 
 
-def _pulled(spec: Any, robot: Robot) -> Any:
+def _with_motors(spec: Any, robot: Robot) -> Any:
     """Return the model with a motor on the tendon of each muscle."""
     spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # A body that is thrown out of this world stays there until it is reset.
+    # A diverged simulation stays diverged until `Arm.reset`.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # Nothing that a file says of its own actuators, by default or at its tendons, is of ours.
+    # Settings that the file makes for its own actuators must not affect our motors.
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     spec.option.disableactuator = 0
     plain = mujoco.MjSpec().add_actuator()
@@ -441,5 +460,5 @@ def _pulled(spec: Any, robot: Robot) -> Any:
     return spec
 
 
-def _refusal(file: Path, problem: str) -> MusculoskeletalError:
+def _file_error(file: Path, problem: str) -> MusculoskeletalError:
     return MusculoskeletalError(f'reality {file}: {problem}')
