@@ -44,7 +44,7 @@ from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import MOTOR_GAIN, Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
-from musculoskeletal_ae.experiments import plots, touch
+from musculoskeletal_ae.experiments import contact, plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, times
 from musculoskeletal_ae.experiments.study import (
     Experiment,
@@ -265,8 +265,8 @@ def measure(study: Study, seed: int) -> Measured:
     errors = [np.linalg.norm(true - desired, axis=1).mean() for desired, true in laps]
     numbers['hand_circle_m'] = float(np.mean(errors)) if laps else None
     traces['laps'] = laps
-    contact = touch.measure(study, seed)
-    return Measured(numbers | contact.numbers, traces | contact.traces)
+    contacts = contact.measure(study, seed)
+    return Measured(numbers | contacts.numbers, traces | contacts.traces)
 
 
 def _summary(runs: list[TrackedMotion]) -> dict[str, float]:
@@ -319,5 +319,5 @@ def motion_hand(_: Study, rows: Rows) -> Plot:
     return figure, f'Circles of the hand at {SPEED} m/s by target_pose, individual {seed}.'
 
 
-PLOTS = motion, motion_hand, touch.forces
+PLOTS = motion, motion_hand, contact.forces
 EXPERIMENT = Experiment(__doc__, measure, PLOTS, 16.0)

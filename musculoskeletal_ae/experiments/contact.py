@@ -18,7 +18,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-TOUCH_STREAM = 7000
+CONTACT_STREAM = 7000
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
 TRIES_PER_COLLISION = 20  # at most, because a collision needs a moving arm
 HEALTHY = 3600.0  # [s] over all individuals
@@ -69,9 +69,9 @@ class ContactLoop(ClosedLoop):
 
 def measure(study: Study, seed: int) -> Measured:
     """Push an individual that has learned, at rest, in motion and under gravity compensation."""
-    robot, rng = study.robot, np.random.default_rng([seed, TOUCH_STREAM])
+    robot, rng = study.robot, np.random.default_rng([seed, CONTACT_STREAM])
     settings, share = Settings(first_duration=2.0), 0.005 if study.quick else 1.0
-    loop = ContactLoop(study.arm(seed), study.network(seed), settings, TOUCH_STREAM + seed)
+    loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed)
 
     def count(whole: float) -> int:
         return max(1, round(share * whole))
