@@ -65,7 +65,7 @@ class Arm(RuleBasedStateMachine):
                 self.judge(command)
 
     def messages(self):
-        for read in self.arm.faults.delivered(self.arm.sense(), self.now):
+        for read in self.arm.faults.deliver(self.arm.sense(), self.now):
             if 'muscles' not in self.blind:
                 with suppress(MessageError):
                     states = np.array([read.length, read.tension, read.temperature])
