@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learns MuJoCo models of others, and says what became of them.
+
+    python -m bench mujoco NAME=FILE[:joints=A,B][:without=C,D][:end=E] … --out DIR [--minutes 10]
+
+The models are public ones that you have fetched; nothing of them is part of this repository:
+
+    arm26           google-deepmind/mujoco, model/tendon_arm/arm26.xml (Apache-2.0)
+    elbow           MyoHub/myo_sim, elbow/myoelbow_2dof6muscles.xml (Apache-2.0)
+    shoulder        MyoHub/myo_sim, arm/myoarm.xml with five joints (Apache-2.0)
+    aero_hand       google-deepmind/mujoco_playground, aero_hand/xmls/right_hand.xml, a hand of
+                    TetherIA (Apache-2.0), with its meshes of mujoco_menagerie
+
+Each seed is an individual that deviates from the file (`emulator/deviation.py`). A row says: the
+error of the estimate on the held-out motion before and after learning, preset `paper` beside it
+[rad, norm over the joints]; how many ruptures were detected and named; the error while the arm
+follows trajectories of 2 s between holdable postures [rad]; by how much moment arms of the exported
+model are off from those of the learned network, and how large these are [mm, median of the
+muscles]; how many seconds of the model a core computes in a second; and how long the initial
+training took on a core [s].
+"""
+
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from musculoskeletal_ae.control.exploration import holdable_postures
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import motion, online_learning
+from musculoskeletal_ae.experiments.detection import GraspAndCut, detection, watch
+from musculoskeletal_ae.experiments.recording import estimation_error, record
+from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.exporting.mjcf import export
+from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.options import Parser, seeds
+from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.robot.robot import Robot
+
+HEAD = (
+    'model', 'seed', 'joints', 'muscles', 'before [rad]', '`paper`', 'after', 'detected', 'named',
+    'trajectory [rad]', 'export [mm]', 'of', 'real time', 'training [s]',
+)  # fmt: skip
+MOTIONS, DURATION, TRIES = 4, 2.0, 400
+LISTS = 'joints', 'muscles', 'without'
+
+
+class Individuals(Study):
+    """Individuals of a MuJoCo file, instead of one of the package's own bodies."""
+
+    def arm(self, seed: int, friction: bool = True) -> Arm:
+        """Return an individual at rest."""
+        return make_arm(self.robot, seed, self.reality, friction, deviates=True)
+
+
+def parse(text: str) -> tuple[str, Path, dict[str, Any]]:
+    """Return name, file and what is to be kept of a model."""
+    name, _, rest = text.partition('=')
+    file, *options = rest.split(':')
+    chain: dict[str, Any] = {}
+    for option in options:
+        key, _, value = option.partition('=')
+        chain[key] = value.split(',') if key in LISTS else value
+    return name, Path(file), chain
+
+
+def speed(arm: Arm) -> float:
+    """Return how many seconds of an arm a core computes in a second."""
+    arm.step(0.2)
+    start = time.process_time()
+    arm.step(2.0)
+    return 2.0 / (time.process_time() - start)
+
+
+def followed(study: Study, seed: int) -> float:
+    """Return the mean error on the way between holdable postures [rad]."""
+    robot, rng, mae = study.robot, np.random.default_rng([seed, 0x307]), study.network(seed)
+    arm = study.arm(seed)
+    postures = robot.random_postures(TRIES, rng)
+    held = holdable_postures(robot, postures, MOTIONS + 1, arm.individual.muscle_jacobian)
+    ways = [theta for theta, _ in held]
+    loop = motion.loop_at(study.arm(seed), mae, ways[0], motion.OURS, DURATION)
+    runs = [motion.follow(loop, a, b, motion.OURS, DURATION) for a, b in pairwise(ways)]
+    return float(np.concatenate([run.error for run in runs]).mean())
+
+
+def measured(study: Study, name: str, seed: int, training: float) -> list[str]:
+    """Return the cells of one individual."""
+    robot = study.robot
+    held_out = record(study.arm(seed), study.network(None), 0xB0 + seed, study.held_out_time)
+    cells = [name, str(seed), str(robot.joint_count), str(robot.muscle_count)]
+    cells.append(f'{estimation_error(study.network(None), held_out):.4f}')
+    for preset in (AS_PRINTED, study.preset):
+        learner, loop = online_learning.beginner(study, study.arm(seed), seed, preset)
+        online_learning.teach(learner, online_learning.explore(loop, learner, 60.0 * study.minutes))
+        checkpoint.save(learner.mae, study.network_file(preset, seed))
+        cells.append(f'{estimation_error(learner.mae, held_out):.4f}')
+    cells += [*detected(study, seed), attempt(lambda: f'{followed(study, seed):.4f}')]
+    out = study.folder / f'model_{seed}'
+    report = export(robot, study.network(seed), out)
+    cells += [f'{1e3 * np.median(part):.2f}' for part in (report.arms, report.arm_size)]
+    return [*cells, f'{speed(study.arm(seed)):.1f}', f'{training:.0f}']
+
+
+def detected(study: Study, seed: int) -> list[str]:
+    """Return how many ruptures of muscles that carried tension were detected, and rightly named."""
+    robot, mae = study.robot, study.network(seed)
+    plan = GraspAndCut(robot, study.held_out_time, seed)
+    driven = study.network(None)
+    cut = record(study.arm(seed), driven, 0xC0 + seed, plan.duration, plan)
+    well = record(study.arm(seed), driven, 0xD0 + seed, study.held_out_time)
+    seen, healthy = watch(robot, mae, cut), watch(robot, mae, well)
+    found = detection(robot, plan, seen, healthy, mae)
+    count = found['counted_cuts']
+    return [f'{round(found[k] * count)} of {count}' for k in ('detected_share', 'named_share')]
+
+
+def attempt(cell: Callable[[], str]) -> str:
+    """Return a cell, or why there is none."""
+    try:
+        return cell()
+    except MusculoskeletalError as error:
+        return str(error)[:80]
+
+
+def model_rows(
+    name: str, file: Path, chain: dict[str, Any], args: Namespace
+) -> Iterator[list[str]]:
+    """Import a model, train, and yield the row of each individual."""
+    folder = args.out / name
+    folder.mkdir(parents=True)
+    robot: Robot = import_robot(file, folder / 'robot', **chain).robot
+    study = Individuals(
+        robot, 'default', args.seeds, args.minutes, quick=args.quick, folder=folder,
+        reality=str(file),
+    )  # fmt: skip
+    start = time.process_time()
+    online_learning.train_initial(study, study.preset)
+    training = time.process_time() - start
+    online_learning.train_initial(study, AS_PRINTED)
+    for seed in args.seeds:
+        yield measured(study, name, seed, training)
+
+
+def main(argv: list[str]) -> None:
+    """Print the table, row by row."""
+    parser = Parser('mujoco', 'Learns MuJoCo models that you have fetched.')
+    text = 'as arm26=arm26.xml, or arm=myoarm.xml:joints=elbow_flexion,pro_sup:without=A,B'
+    parser.add_argument('models', nargs='+', type=parse, metavar='NAME=FILE…', help=text)
+    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='a new directory')
+    parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='individuals')
+    parser.add_minutes('duration of the exploration', 10.0)
+    parser.add_quick('short initial training and held-out motion, to try things out')
+    args = parser.parse_args(argv)
+
+    print(f'| {" | ".join(HEAD)} |\n{"|---" * len(HEAD)}|', flush=True)
+    for name, file, chain in args.models:
+        try:
+            for cells in model_rows(name, file, chain, args):
+                print(f'| {" | ".join(cells)} |', flush=True)
+        except MusculoskeletalError as error:
+            print(f'| {name} | {error} |', flush=True)
