@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the driver of a real arm keeps its contract (doc/howto/your_robot.md, without ROS)."""
+"""Check the driver of a real arm against its contract (doc/howto/your_robot.md), without ROS."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the messages of a driver say about it while nothing is commanded.
+"""Check the messages of a driver while nothing is commanded.
 
-By what values are possible at all and, where θ is known, by l beside the geometric model's
-(doc/explanation/control_and_safety.md, Judging a driver).
+The checks use the range of possible values. If θ is known, they also compare l with the geometric
+model (doc/explanation/control_and_safety.md, Judging a driver).
 """
 
 import math
@@ -28,30 +28,30 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-MOST_REPEATED = 0.2  # share of messages that say what the one before said, to the last digit
-QUIET = 3  # values that a sensor without noise may have while nothing moves, but not one alone
-TEMPERATURES = -20.0, 130.0  # [°C]
-BEYOND = 0.1, 1.0  # [m] that l may lie beyond what the routes allow, with and without known zeros
-BEYOND_JOINT = 0.3  # [rad]
-# What T may be off while nothing is commanded: the sensor's own error, and that of a zero.
-RESTING_TENSION, RESTING_SHARE = 15.0, 0.5  # [N], share of T_bias; the smaller one counts
-PULLS = 0.3, 3.0  # shares of T_bias
-USUAL = 10.0, 60.0  # [°C] of modules at rest
-UNIT_TOLERANCE = 0.3  # share by which T in another unit may be off from T_bias
+MOST_REPEATED = 0.2  # share of messages that may equal the one before to the last digit
+QUIET = 3  # so few different values, but more than one, indicate a sensor without noise
+TEMPERATURES = -20.0, 130.0  # [°C] possible range
+BEYOND = 0.1, 1.0  # [m] that l may exceed its range, with and without length calibration
+BEYOND_JOINT = 0.3  # [rad] that θ may exceed the joint limits
+# Tolerance of T − T_bias while nothing is commanded, for errors of the sensor and its zero.
+RESTING_TENSION, RESTING_SHARE = 15.0, 0.5  # [N], share of T_bias; the smaller one applies
+PULLS = 0.3, 3.0  # range of T / T_bias at rest
+USUAL = 10.0, 60.0  # [°C] range of modules at rest
+UNIT_TOLERANCE = 0.3  # relative deviation from T_bias of a T in another unit
 TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # [N]
-HOTTEST_AT_REST = 55.0  # [°C] of modules that nothing was commanded of: 55 °C are 131 °F
-# How far the lengths of healthy arms are from the model's, as these see it, individuals 0–9 of both
-# shipped arms (notes/removed_benches.md): offset at most 42 mm, changes by 0.31 to 1.55 of the
-# model's, where another muscle fits 2.5 times better off by no more than 8.5 mm.
-ZERO_TOLERANCE = 0.045  # [m]
-SLOPES = 0.2, 2.2
-MISPLACED = 0.012  # [m] by which l follows the model worse than another muscle's, and this …
-BETTER = 2.5  # … many times worse
-MOVED = 0.04  # [m] of l from which its slope can be told
-JOINTS_BETTER = 0.8  # share of the misfit that is left where angles are at fault, not lengths
-MOVED_JOINT = 0.2  # [rad] of θ from which its sign can be told
+HOTTEST_AT_REST = 55.0  # [°C] of modules without commands; 55 °C are 131 °F
+# Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of both shipped
+# arms (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by 0.31 to 1.55
+# times the model's changes. Where another muscle fits 2.5 times better, the misfit is below 8.5 mm.
+ZERO_TOLERANCE = 0.045  # [m] of the length offset
+SLOPES = 0.2, 2.2  # range of the change of l divided by that of the model
+MISPLACED = 0.012  # [m] misfit to its own muscle from which a column can be misplaced
+BETTER = 2.5  # times that another muscle must fit better
+MOVED = 0.04  # [m] range of l from which its sign and slope can be checked
+JOINTS_BETTER = 0.8  # share of the misfit that may remain if angles instead of lengths are wrong
+MOVED_JOINT = 0.2  # [rad] range of θ from which its sign can be checked
 MOST_SAMPLES = 400
-#: units in which values may have been published, and what one of them is
+#: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},
     'tension': {'mN': 1e-3, 'cN': 1e-2},
@@ -60,35 +60,45 @@ UNITS = {
 
 
 class Listening:
-    """Collects messages of a driver and judges them. Times are of one steady clock [s]."""
+    """Collects messages of a driver and checks them. Times are of one steady clock [s]."""
 
     def __init__(
         self, robot: Robot, rate: float, posture: Sequence[float] | None = None, zeroed: bool = True
     ) -> None:
-        """Expect messages at a rate [Hz].
+        """Expect messages of a driver.
 
-        The arm is held at a posture [rad] (D,), if stated. If not `zeroed`, every l may be off by a
-        constant.
+        Args:
+            robot: The geometric model.
+            rate: Expected rate of muscle_states [Hz].
+            posture: θ [rad] (D,) in which the arm is held; None: use joint_states.
+            zeroed: Whether the lengths are calibrated; if not, each may have any constant offset.
         """
         self._robot, self._zeroed, self._pace = robot, zeroed, Pace(rate)
         self._stated = posture is not None
         self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
-        self._not_finite: Counter[str] = Counter()  # positions, by joint
-        self._read: list[tuple[Array, Array]] = []  # (3, M), and θ then or NaN (D,)
+        self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
+        self._read: list[tuple[Array, Array]] = []  # states (3, M) and θ (D,) at that time, or NaN
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
         (low, high), most = length_range(robot), robot.tension.max
         ones, beyond, (coldest, hottest) = np.ones_like(most), BEYOND[not zeroed], TEMPERATURES
-        #: what values are possible, (3, M)
+        #: range of possible values, (3, M)
         self._low = np.stack([low - beyond, -0.02 * most, coldest * ones])
         self._high = np.stack([high + beyond, 1.1 * most, hottest * ones])
 
     @property
     def count(self) -> int:
-        """How many messages of muscle_states came, whatever they said."""
+        """Number of messages of muscle_states, valid or not."""
         return self._pace.count
 
     def muscles(self, message: object, now: float, sent: float = math.nan, number: int = 0) -> None:
-        """Take a message of muscle_states that came now; when it was sent, and its number."""
+        """Take a message of muscle_states.
+
+        Args:
+            message: The message.
+            now: Time of reception [s].
+            sent: Source time by the driver's clock [s]; NaN if unknown.
+            number: Sequence number; 0 if unknown.
+        """
         self._pace.message(now, sent, number)
         with self._rejecting('muscle_states'):
             states = read_muscle_states(message, self._robot.muscle_count)
@@ -103,7 +113,7 @@ class Listening:
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
 
     def pause(self, begin: float, end: float) -> None:
-        """Note that this process did not run meanwhile, though it wanted to."""
+        """Record that this process was ready but did not run in this interval."""
         self._pace.pause(begin, end)
 
     @contextmanager
@@ -114,16 +124,16 @@ class Listening:
             self._rejected.setdefault((topic, error.reason), []).append(error)
 
     def verdict(self, now: float) -> Verdict:
-        """Judge what came until now [s]."""
+        """Check the messages received until now [s]."""
         verdict = Verdict(self._robot)
-        heard = not self._stated and not np.isnan(self._theta).all()
+        has_angles = not self._stated and not np.isnan(self._theta).all()
         for (topic, reason), errors in self._rejected.items():
-            told = f'{topic}: {len(errors)} messages refused, {errors[-1]}'
-            if reason == 'missing joint' and heard:  # those of a hand, say
-                verdict.notes.append(told)
+            detail = f'{topic}: {len(errors)} messages rejected, {errors[-1]}'
+            if reason == 'missing joint' and has_angles:  # for example, messages of a hand
+                verdict.notes.append(detail)
             else:
                 what = f'{topic}: {reason}'
-                verdict.failed(what if what in FAULTS else f'{topic}: refused', told=told)
+                verdict.failed(what if what in FAULTS else f'{topic}: refused', detail=detail)
         for name, count in self._not_finite.items():
             verdict.failed('joint not finite', name=name, count=count)
         if not self.count:
@@ -144,32 +154,33 @@ class Listening:
                 which = ', '.join(np.array(self._robot.joints)[lacking]) or 'all joints at once'
                 verdict.notes.append(
                     f'sign, zero and order of l are not judged without θ of {which}: publish '
-                    'joint_states, or hold the arm still and state --posture'
+                    'joint_states, or hold the arm still and pass --posture'
                 )
         return verdict
 
     def _judge_repetition(self, verdict: Verdict, states: Array) -> None:
         if len(states) > 10:
-            # The rate at which messages come is not the rate at which modules are read. (A
-            # temperature may stand.)
+            # A driver may publish more often than it reads the modules. Temperatures are not
+            # compared, because they may stay the same.
             same: Bools = states[1:, :2] == states[:-1, :2]
             repeated, stuck = same.all(axis=(1, 2)).mean(), same.all(axis=(0, 1))
             if repeated > MOST_REPEATED:
                 columns = states[:, :2].reshape(len(states), -1).T
                 if 1 < max(len(np.unique(column)) for column in columns) <= QUIET:
-                    told = 'readings hardly change: move the arm, and it shows whether each is new'
-                    verdict.notes.append(told)
+                    verdict.notes.append(
+                        'readings hardly change: move the arm to check whether each is new'
+                    )
                 else:
                     verdict.failed('repeated', share=100.0 * repeated)
             elif stuck.any():
                 verdict.failed('stuck', *np.flatnonzero(stuck).tolist())
 
     def _judge_values(self, verdict: Verdict, states: Array) -> bool:
-        """Judge rows and units by what values are possible; say whether they are right."""
-        for what, seen, meant in _readings(states):
+        """Check rows and units by the range of possible values; return whether they are right."""
+        for what, texts, meant in _readings(states):
             possible = (meant >= self._low) & (meant <= self._high)
             possible[2] |= np.isnan(meant[2])
-            # Nothing is commanded: T is about T_bias in whatever was meant.
+            # Without a command, T must be close to T_bias in the right interpretation.
             pulls = np.median(meant[1] / self._robot.tension.bias)
             warm = meant[2][~np.isnan(meant[2])]
             is_usual = PULLS[0] < pulls < PULLS[1] and (
@@ -177,20 +188,21 @@ class Listening:
             )
             if possible.all() and (not what or is_usual):
                 if what:
-                    verdict.failed(what, **seen)
+                    verdict.failed(what, **texts)
                     return False
                 verdict.passed('unit')
                 if np.isnan(states[2]).any():
-                    told = 'no temperatures (NaN): nothing protects the motors from heat'
-                    verdict.notes.append(told)
+                    verdict.notes.append(
+                        'no temperatures (NaN): nothing protects the motors from heat'
+                    )
                 return True
         for row, m in np.argwhere(~possible).tolist():
             value, low, high = distinct(states[row, m], self._low[row, m], self._high[row, m])
-            verdict.failed(QUANTITIES[row], m, seen=f'{value}, possible {low} to {high},')
+            verdict.failed(QUANTITIES[row], m, value=f'{value}, possible {low} to {high},')
         return False
 
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
-        """Judge T and temperature (3, M) of modules of which nothing is commanded."""
+        """Check T and temperature in `states` (3, M) of modules without commands."""
         bias = self._robot.tension.bias
         for unit, newtons in TENSION_UNITS.items():
             if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():
@@ -201,33 +213,36 @@ class Listening:
             verdict.failed('resting tension', m, got=states[1, m], bias=bias[m])
         if np.nanmax(states[2], initial=-math.inf) > HOTTEST_AT_REST:
             hottest = np.nanmax(states[2])
-            told = f'a module at rest has {hottest:.0f} °C: is it °C, and not °F?'
-            verdict.notes.append(told)
+            verdict.notes.append(
+                f'a module at rest has {hottest:.0f} °C: check that the unit is °C, not °F'
+            )
 
     def _judge_lengths_and_joints(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Judge l beside the model at θ (N, D), or θ, if that explains all faults of several l."""
+        """Compare l with the model at θ (N, D), or blame θ if that explains faults of several l."""
         judged = Verdict(self._robot)
         misfit = self._judge_lengths(judged, theta, length, tension)
         if sum(len(fault.muscles) for fault in judged.faults) > 1:
-            best, found = JOINTS_BETTER * misfit, None
+            best, explanation = JOINTS_BETTER * misfit, None
             for what, names, meant in self._angles(theta):
                 other = Verdict(self._robot)
                 remaining = self._judge_lengths(other, meant, length, tension)
-                # Lengths of wrong sign look much like angles of wrong sign.
+                # The misfit must fall clearly, because lengths of wrong sign look much like angles
+                # of wrong sign.
                 if not other.faults and remaining < best:
-                    best, found = remaining, (what, names)
-            if found is not None:
-                what, names = found
+                    best, explanation = remaining, (what, names)
+            if explanation is not None:
+                what, names = explanation
                 verdict.failed(what, names=', '.join(names))
                 return
         verdict.add(judged)
 
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
-        """Yield what may have been meant by θ (N, D), with the fault and its joints.
+        """Yield possible corrections of θ (N, D), each with its fault and joints.
 
-        Where the arm was not moved, θ explains too much to be suspected.
+        Signs and order of joints that did not move are not questioned, because an arm at rest would
+        fit too many corrections.
         """
         robot, radian = self._robot, self._robot.kinematics.radian
         joints = range(robot.joint_count)
@@ -251,9 +266,16 @@ class Listening:
     def _judge_lengths(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> float:
-        """Judge l beside the model at θ (N, D), l and T (N, M).
+        """Compare l with the model.
 
-        Returns how far they are from it [m], each muscle as the verdict explains it.
+        Args:
+            verdict: Receives the results.
+            theta: θ [rad], (N, D).
+            length: l [m], (N, M).
+            tension: T [N], (N, M).
+
+        Returns:
+            The sum over muscles of the misfit [m] that remains after the verdict's explanations.
         """
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)
@@ -266,17 +288,19 @@ class Listening:
         moved: Bools = np.ptp(model, axis=0) > MOVED
 
         def misfit(error: Array) -> Array:
-            # A zero that is wrong says nothing of a moved arm's order, all there is of one at rest.
+            # On a moved arm, length offsets do not affect this comparison. On an arm at rest, the
+            # offset is the only information.
             spread: Array = error.std(axis=0) if moved.any() else np.abs(np.median(error, axis=0))
             return spread
 
         fit = np.array([misfit(column[:, None] - model) for column in length.T])
         if not moved.any():
-            verdict.notes.append('sign and order show better while the arm is moved by hand')
-            fit = np.maximum(fit, fit.T)  # of an arm at rest only exchanges are told
+            verdict.notes.append('move the arm by hand for a better check of sign and order')
+            fit = np.maximum(fit, fit.T)  # at rest, only pairwise exchanges can be recognised
         rows, best = linear_sum_assignment(fit)
         inverse = misfit(length + model)
-        # Antagonists mirror each other: all signs wrong is likelier than all of them exchanged.
+        # Antagonists mirror each other. If all signs are wrong, exchanged antagonists fit as well,
+        # but are less likely.
         all_turned = inverse[moved].sum() < fit[rows, best][moved].sum()
         for m, other in enumerate(best.tolist()):
             off = float(np.median((length - model)[:, m]))
@@ -291,10 +315,10 @@ class Listening:
                 continue
             if moved[m]:
                 slope = np.cov(length[:, m], model[:, m])[0, 1] / model[:, m].var(ddof=1)
-                told = f'l changes by {slope:.2f} of what the routes say'
+                detail = f'l changes by {slope:.2f} times the change that the route predicts'
                 if not SLOPES[0] < slope < SLOPES[1]:
                     inverted = SLOPES[0] < -slope < SLOPES[1]
-                    verdict.failed('sign' if inverted else 'slope', m, told=told)
+                    verdict.failed('sign' if inverted else 'slope', m, detail=detail)
                     continue
                 verdict.passed('order', m)
                 verdict.passed('sign', m)
@@ -303,17 +327,18 @@ class Listening:
             if abs(off) <= ZERO_TOLERANCE:
                 verdict.passed('zero', m)
             elif not moved.any() and inverse[m] < 0.3 * abs(off):
-                at = f'l is {np.median(length[:, m]):+.3f} m, the routes say {model[0, m]:+.3f}'
-                verdict.failed('sign', m, told=at)
+                measured = f'l is {np.median(length[:, m]):+.3f} m'
+                predicted = f'the route predicts {model[0, m]:+.3f} m'
+                verdict.failed('sign', m, detail=f'{measured}, {predicted}')
             else:
                 verdict.failed('zero', m, off=1e3 * off)
         return float(np.minimum(fit[rows, best], inverse).sum())
 
 
 def _readings(states: Array) -> Iterator[tuple[str, dict[str, str], Array]]:
-    """Yield what may have been meant by l, T, temperature (3, M): first what they say.
+    """Yield interpretations of l, T, temperature (3, M), from the literal one to the least likely.
 
-    With the fault that it would be, and what that names.
+    Each comes with its fault, '' for none, and the values that the texts of the fault name.
     """
     yield '', {}, states
     yield 'kelvin', {}, states - np.array([[0.0], [0.0], [273.15]])

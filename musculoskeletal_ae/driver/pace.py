@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often a driver publishes, told apart from how often its messages are heard.
+"""Measure the rate at which a driver publishes, which can differ from the rate of reception.
 
-A message says when it was sent and how many were sent before. Without that, what counts is when it
-came. A computer that is busy may let messages wait, lose them, or keep the driver itself from
-running: `Pace` is told when it did not run either.
+Source time and sequence number of a message give the rate of publication. Without them, the time of
+reception is used. A busy computer may delay or lose messages, or block the driver. `Pace` therefore
+also records when this process itself was blocked.
 """
 
 from typing import NamedTuple
@@ -13,43 +13,43 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.verdict import Verdict
 
-RATE_TOLERANCE = 0.2
+RATE_TOLERANCE = 0.2  # relative
 LONGEST_GAP = 0.2  # [s], the controller's `max_age`
-OWN_PAUSE = 0.05  # [s] without running, from which on that explains a gap
-LEAST_LOST = 0.05  # share of the messages
+OWN_PAUSE = 0.05  # [s]; shorter pauses of this process are ignored
+LEAST_LOST = 0.05  # share of lost messages from which they are reported
 
 
 class _Message(NamedTuple):
-    came: float  # [s] of our steady clock
-    sent: float  # [s] of the driver's clock, NaN if that is not known
-    number: int  # that counts up with every message, 0 if that is not known
+    came: float  # time of reception [s]
+    sent: float  # source time by the driver's clock [s]; NaN if unknown
+    number: int  # sequence number; 0 if unknown
 
 
 class Pace:
-    """Collects the times of one driver's messages and judges its rate."""
+    """Collects the times of one driver's messages and checks its rate."""
 
     def __init__(self, rate: float) -> None:
         """Expect messages at a rate [Hz]."""
         self._rate = rate
         self._messages: list[_Message] = []
-        self._pauses: list[tuple[float, float]] = []  # begin and end [s] of our clock
+        self._pauses: list[tuple[float, float]] = []  # begin and end [s]
 
     @property
     def count(self) -> int:
-        """How many messages came."""
+        """Number of messages."""
         return len(self._messages)
 
     def message(self, came: float, sent: float, number: int) -> None:
-        """Take the times of a message [s], and its number."""
+        """Record times [s] and sequence number of a message."""
         self._messages.append(_Message(came, sent, number))
 
     def pause(self, begin: float, end: float) -> None:
-        """Note that this process did not run meanwhile [s], though it wanted to."""
+        """Record that this process was ready but did not run in this interval [s]."""
         if end - begin > OWN_PAUSE:
             self._pauses.append((begin, end))
 
     def judge(self, verdict: Verdict, now: float) -> None:
-        """Judge rate and gaps until now [s]."""
+        """Check the rate and the gaps until now [s]."""
         came, sent, number = map(np.array, zip(*self._messages))
         is_dated = bool(np.isfinite(sent).all() and (np.diff(sent) >= 0.0).all())
         is_numbered = is_dated and bool((number > 0).all() and (np.diff(number) > 0).all())
@@ -59,17 +59,17 @@ class Pace:
         lost = int(steps.sum() - len(gaps))
         if lost > LEAST_LOST * steps.sum():
             verdict.notes.append(
-                f'{lost} of {int(steps.sum()) + 1} messages were lost on the way: '
+                f'{lost} of {int(steps.sum()) + 1} messages were lost in transit: '
                 'this computer or the network is busy'
             )
         rate = steps.sum() / gaps.sum() if len(gaps) and gaps.sum() > 0.0 else 0.0
-        # Where some were lost, the driver has published meanwhile.
+        # Gaps with lost messages are left out, because the driver did publish in them.
         gaps = np.append(gaps[steps == 1], now - came[-1])
         gap = float(gaps.max())
         if self._explain(gap, came, now):
             verdict.notes.append(
-                f'this computer is busy: nothing came for {gap:.2f} s, in which check_driver did '
-                'not run either. The rate is not judged; end what else runs here, and try again'
+                f'this computer is busy: no message was received for {gap:.2f} s, and check_driver '
+                'was blocked as well. The rate is not judged; end other programs and try again'
             )
         elif gap > LONGEST_GAP:
             verdict.failed('gap', gap=gap)
@@ -79,7 +79,7 @@ class Pace:
             verdict.passed('rate')
 
     def _explain(self, gap: float, came: Array, now: float) -> bool:
-        """Whether our own pauses within the longest gap make up most of it."""
+        """Return whether pauses of this process make up most of the longest gap."""
         if gap <= LONGEST_GAP:
             return False
         ends = np.append(came, now)

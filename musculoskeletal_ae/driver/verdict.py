@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is judged of a driver, what may be wrong with it, and what came of it."""
+"""The checks of a driver, the faults that they can find, and the verdict."""
 
 from typing import Literal, NamedTuple, get_args
 
@@ -9,8 +9,8 @@ from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict
 
-#: what is judged of each muscle: messages and their rate, rows and places in the array, units, the
-#: sign and zero of l, the MSC law, its clip at tension.max, latency
+#: checks of each muscle: messages and their rate, order of rows and columns, units, sign and zero
+#: of l, the MSC law, its clip at tension.max, and latency
 Check = Literal['rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency']
 CHECKS: tuple[Check, ...] = get_args(Check)
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
@@ -21,51 +21,57 @@ class FaultTexts(Strict, frozen=True, array_like=True):
     """An entry of faults.yaml."""
 
     check: Check
-    seen: str
+    observation: str
     change: str
 
 
-#: by what is wrong; those of a message that is rejected begin with its topic
+#: texts by name of the fault; names of faults that reject messages begin with the topic
 FAULTS = read_table(__file__, 'faults.yaml', dict[str, FaultTexts])
 
 
 class Fault(NamedTuple):
-    """One thing that is not as it must be."""
+    """A fault of the driver."""
 
     check: str
-    muscles: tuple[int, ...]  # their numbers; all for a fault of the whole driver
-    saw: str
-    change: str
+    muscles: tuple[int, ...]  # indices; all for a fault of the whole driver
+    observation: str
+    change: str  # what to change in the driver
 
 
 class Verdict:
-    """The judgement on one driver."""
+    """The results of all checks of one driver."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self._state = np.full((robot.muscle_count, len(CHECKS)), OPEN, dtype=object)
         self.faults: list[Fault] = []
-        self.notes: list[str] = []  # what is no fault, or could not be judged
+        self.notes: list[str] = []  # remarks, and what could not be judged
 
     def passed(self, check: str, *muscles: int) -> None:
-        """Note that muscles (none: all) are as they must be, unless they were found wrong."""
+        """Record that muscles (none: all) passed a check, unless they have failed it."""
         for m in muscles or range(self.robot.muscle_count):
             if self._state[m, CHECKS.index(check)] == OPEN:
                 self._state[m, CHECKS.index(check)] = OK
 
-    def failed(self, what: str, *muscles: int, **seen: object) -> None:
-        """Note one of the FAULTS, of some muscles (none: of all), with what its texts name."""
+    def failed(self, what: str, *muscles: int, **values: object) -> None:
+        """Record a fault.
+
+        Args:
+            what: Name of the fault in FAULTS.
+            muscles: Its muscles; none: all.
+            values: The values for the placeholders in its texts.
+        """
         texts = FAULTS[what]
         if muscles:
             first, robot = muscles[0], self.robot
-            seen['law'] = LAW.format(robot.tension.bias[first], robot.stiffness[first])
+            values['law'] = LAW.format(robot.tension.bias[first], robot.stiffness[first])
         muscles = muscles or tuple(range(self.robot.muscle_count))
         self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
-        change = texts.change.format(**seen)
-        self.faults.append(Fault(texts.check, muscles, texts.seen.format(**seen), change))
+        observation, change = (text.format(**values) for text in (texts.observation, texts.change))
+        self.faults.append(Fault(texts.check, muscles, observation, change))
 
     def add(self, other: 'Verdict') -> None:
-        """Add what another verdict on the same driver found."""
+        """Add the results of another verdict on the same driver."""
         wrong = other._state == WRONG
         self._state[wrong] = WRONG
         self._state[(self._state == OPEN) & (other._state == OK)] = OK
@@ -74,7 +80,7 @@ class Verdict:
 
     @property
     def wrong(self) -> set[str]:
-        """Which of the CHECKS found a fault."""
+        """The CHECKS that found a fault."""
         return {fault.check for fault in self.faults}
 
     def __str__(self) -> str:
@@ -87,7 +93,7 @@ class Verdict:
             whose = ', '.join(names[m] for m in fault.muscles)
             whose = 'all muscles' if len(fault.muscles) == len(names) else whose
             lines += [
-                f'fault: {fault.check} of {whose}: {fault.saw}',
+                f'fault: {fault.check} of {whose}: {fault.observation}',
                 f'    change: {fault.change}',
             ]
         return '\n'.join([*lines, *(f'note: {note}' for note in self.notes)])

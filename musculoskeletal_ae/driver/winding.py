@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a driver does with commands: each muscle is wound in a little, one at a time.
+"""Check the response of a driver to commands by winding in each muscle a little, one at a time.
 
-At first every l_target is the l of that moment, which must give T_bias. Then, for each muscle, the
-target steps inwards until the MSC law
+At first every l_target is the current l, which must give T_bias. Then, for each muscle, the target
+steps inwards until the MSC law
 
     T = min(T_max, T_bias + max(0, K (l − l_target)))
 
-at the l that is read asks for a low tension; back; and beyond l, where T must stay at T_bias.
+demands a low tension at the measured l. The target then returns, and moves beyond l, where T must
+stay at T_bias.
 
-K makes tension of what l is off by. Where that is more than TENSION_TOLERANCE, from 50 kN/m on, it
-is what is tolerated, and all tensions that are asked for or noticed grow by the same factor.
+The law amplifies an error of l by K. From 50 kN/m on, the resulting error of T exceeds
+TENSION_TOLERANCE. It then replaces the tolerance, and all demanded tensions and detection
+thresholds grow by the same factor.
 """
 
 from collections import deque
@@ -23,29 +25,30 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-ABOVE_BIAS = 40.0  # [N] that the highest tension lies above T_bias, unless said otherwise
-LEAST_ABOVE_BIAS = 20.0  # [N]; an answer to less is not told from noise
-SETTLE, HOLD, RELEASE, MEAN = 1.5, 0.5, 0.6, 0.3  # [s]
-SPEED = 0.01  # [m/s] at which a target goes on inwards while the arm gives way
-RELEASE_SPEED = 0.03  # [m/s] at which it goes back
-FURTHEST = 0.025  # [m] that a muscle is wound in
-SLACK = 0.01  # [m] that l_target then lies beyond l
-RUN_AWAY_TENSION, RUN_AWAY = 60.0, 0.05  # [N] above what is asked for, [m]: it is let go
-MOMENT = 0.1  # [s] for which a falling arm may pull harder
-LATEST = 0.1  # [s] from a command to the first change
-TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1  # [N] that T may be off; of what is asked for
+ABOVE_BIAS = 40.0  # [N] default of the highest demanded tension, above T_bias
+LEAST_ABOVE_BIAS = 20.0  # [N]; responses to lower demands cannot be distinguished from noise
+SETTLE, HOLD, RELEASE, MEAN = 1.5, 0.5, 0.6, 0.3  # [s] durations
+SPEED = 0.01  # [m/s] at which a target continues inwards while the arm gives way
+RELEASE_SPEED = 0.03  # [m/s] at which a target returns
+FURTHEST = 0.025  # [m] by which a muscle is wound in at most
+SLACK = 0.01  # [m] by which l_target is then set beyond l
+RUN_AWAY_TENSION = 60.0  # [N] above the demand at which a muscle is released
+RUN_AWAY = 0.05  # [m] of shortening at which a muscle is released
+MOMENT = 0.1  # [s] for which a falling arm may exceed RUN_AWAY_TENSION
+LATEST = 0.1  # [s] from a command to the first response
+TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1  # [N], share of the demand; the larger one applies
 LENGTH_ERROR = 2.0e-4  # [m] noise and resolution of l, two standard deviations
-SLOPES = 0.7, 1.4  # of what the law asks for
-RESPONSE = 4.0, 0.0006  # [N], [m] above noise
-CLIP = 20.0, 0.05  # asked for beyond tension.max [N], tolerated beyond it (share)
-MIRROR_TOLERANCE = 0.008  # [m] from −l to where a muscle pulls whose l has the wrong sign
-MOST_BEYOND = 0.3  # share of tension.max that is asked for beyond it
+SLOPES = 0.7, 1.4  # range of the change of T divided by that of the demand
+RESPONSE = 4.0, 0.0006  # [N], [m] above noise that count as a response
+CLIP = 20.0, 0.05  # demand beyond tension.max [N], tolerance beyond it (share)
+MIRROR_TOLERANCE = 0.008  # [m] around −l, where a muscle with the wrong sign of l gets tight
+MOST_BEYOND = 0.3  # highest demand beyond tension.max, as a share of it
 
 Wait = Generator[None, None, None]  # each step takes one message
 
 
 class _Reading(NamedTuple):
-    """Means over a moment, each (M,), and what the law asks for there."""
+    """Mean values over MEAN, each (M,), and the demand of the law."""
 
     length: Array
     tension: Array
@@ -54,29 +57,34 @@ class _Reading(NamedTuple):
 
 
 class RunAwayError(Exception):
-    """A muscle does something else than what was asked for."""
+    """A muscle exceeds its demand and must be released."""
 
 
 class Winding:
-    """Winds muscles in, one command a message, and judges what they do."""
+    """Winds muscles in, with one command per message, and checks their responses."""
 
     def __init__(
         self, verdict: Verdict, muscles: Sequence[int] = (), highest: float | None = None
     ) -> None:
-        """Try some muscles (none: all), with at most `highest` [N] asked for.
+        """Prepare to test muscles.
+
+        Args:
+            verdict: Receives the results.
+            muscles: Indices of the muscles; empty: all.
+            highest: Highest demanded tension [N]; None: ABOVE_BIAS above T_bias.
 
         Raises:
-            MusculoskeletalError: If an answer to so little could not be told from noise, or a
-                muscle would be asked for more than it may pull.
+            MusculoskeletalError: If the response to `highest` could not be distinguished from
+                noise, or if a muscle would need more than its tension.max.
         """
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._bias = robot, robot.tension.bias
         self._muscles = muscles or range(robot.muscle_count)
-        #: what T may be off [N] (M,), and by how much K makes it more than it is of a human arm
+        #: tolerance of T [N] (M,), and the factor by which it exceeds TENSION_TOLERANCE
         self._tolerance = np.maximum(TENSION_TOLERANCE, LENGTH_ERROR * robot.stiffness)
         self._scale: Array = self._tolerance / TENSION_TOLERANCE
         self._response: Array = RESPONSE[0] * self._scale
-        #: what it may be off where T_bias, or no tension, is asked for
+        #: tolerance of T where T_bias or no tension is demanded [N] (M,)
         usual = np.minimum(TENSION_TOLERANCE, 0.5 * self._bias)
         self._resting = np.maximum(usual, LENGTH_ERROR * robot.stiffness)
         self._run_away = np.minimum(RUN_AWAY_TENSION * self._scale, robot.tension.max)
@@ -86,26 +94,30 @@ class Winding:
         for m in self._muscles:
             least = self._bias[m] + (LEAST_ABOVE_BIAS * self._scale)[m]
             most = robot.tension.max[m]
-            asked = 'is asked for {} N at least to be judged'
             if most < least:
-                need, has = distinct(least, most)
-                told = f'{asked.format(need)}, its tension.max is {has} N: it is not wound'
-                raise MusculoskeletalError(f'muscle {robot.muscles[m]!r} {told}')
+                needed, limit = distinct(least, most)
+                raise MusculoskeletalError(
+                    f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, but '
+                    f'tension.max is {limit} N; this muscle cannot be checked'
+                )
             if self._highest[m] < least:
-                need, given = distinct(least, self._highest[m])
-                told = f'{asked.format(need)}, not {given} N'
-                raise MusculoskeletalError(f'muscle {robot.muscles[m]!r} {told}')
-        self.trying = ''  # what is going on, for people
+                needed, limit = distinct(least, self._highest[m])
+                raise MusculoskeletalError(
+                    f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, '
+                    f'not {limit} N'
+                )
+        self.trying = ''  # current step, for people
         self.done = False
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
-        self._target: Array = np.full(robot.muscle_count, np.nan)  # none before l is known
-        self._tame_at: Array = np.zeros(robot.muscle_count)  # when each last pulled as asked [s]
+        self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
+        #: last time that each muscle was below its demand plus RUN_AWAY_TENSION [s]
+        self._tame_at: Array = np.zeros(robot.muscle_count)
         self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
         self._run = self._sequence()
 
     def step(self, states: Array, now: float) -> Array | None:
-        """Take l, T, temperature (3, M) at a time [s]; return l_target [m] (M,) if there is one."""
+        """Take l, T, temperature (3, M) at a time [s]; return l_target [m] (M,), or None."""
         self._now = now
         self._recent.append((now, states))
         while now - self._recent[0][0] > MEAN:
@@ -131,17 +143,17 @@ class Winding:
                 self.trying = self._robot.muscles[m]
                 yield from self._try(m)
         except RunAwayError as error:
-            muscle, told, rose = error.args
+            muscle, detail, rose = error.args
             what = 'rising' if rose > RESPONSE[1] else 'ran away'
-            self.verdict.failed(what, muscle, told=told, rose=1e3 * rose)
-            # Out, and then silence, in which modules go safe by themselves.
+            self.verdict.failed(what, muscle, detail=detail, rose=1e3 * rose)
+            # Pay out, then stop sending commands, after which modules go to their safe state.
             self._target += 2.0 * RUN_AWAY
             end = self._now + RELEASE
             while self._now < end:
                 yield
 
     def _wait(self, duration: float) -> Wait:
-        """Wait [s], while no muscle pulls or winds in further than it was asked to."""
+        """Wait [s]; raise RunAwayError if a muscle exceeds its demand or shortens too far."""
         end, start = self._now + duration, self._recent[-1][1] if self._recent else None
         while self._now < end:
             yield
@@ -152,33 +164,33 @@ class Winding:
             self._tame_at[~(tension > asked + self._run_away)] = self._now
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())
-                told = f'T rose to {tension[m]:.0f} N, {asked[m]:.0f} N were asked for'
+                detail = f'T rose to {tension[m]:.0f} N, but the demand was {asked[m]:.0f} N'
                 rose = 0.0 if start is None else float(length[m] - start[0][m])
-                raise RunAwayError(m, told, rose)
+                raise RunAwayError(m, detail, rose)
             if start is not None and (fell := start[0] - length).max() > RUN_AWAY:
-                told = f'l fell by {1e3 * fell.max():.0f} mm'
-                raise RunAwayError(int(fell.argmax()), told, 0.0)
+                detail = f'l fell by {1e3 * fell.max():.0f} mm'
+                raise RunAwayError(int(fell.argmax()), detail, 0.0)
 
     def _mean(self) -> _Reading:
         readings = np.array([states for _, states in self._recent])
-        # Of each l that was read: noise of l pulls wherever it is beyond l_target.
+        # The demand is averaged, because it is a nonlinear function of the noisy l.
         demand = self._robot.demanded(readings[:, 0], self._target)
         clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
         length, tension, third = readings.mean(axis=0)
         return _Reading(length, tension, third, clipped)
 
     def _noise(self) -> Array:
-        """Return the standard deviation of T over a moment [N] (M,)."""
+        """Return the standard deviation of T over MEAN [N] (M,)."""
         return np.std([states[1] for _, states in self._recent], axis=0)
 
     def _off(self, reading: _Reading) -> Bools:
-        """Return which muscles pull with another tension than the law asks for, (M,)."""
+        """Return which muscles have another tension than the law demands, (M,)."""
         tolerated = np.maximum(self._resting, TENSION_SHARE * reading.demand)
         wrong: Bools = np.abs(reading.tension - reading.demand) > tolerated
         return wrong
 
     def _go(self, m: int, goal: float) -> Wait:
-        """Bring a target to where it is to rest, not faster than the arm may follow."""
+        """Move a target to `goal` [m] at RELEASE_SPEED, and wait."""
         last = self._now
         while self._target[m] != goal:
             yield from self._wait(1e-9)
@@ -190,14 +202,18 @@ class Winding:
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]
     ) -> Generator[None, None, _Reading]:
-        """Ask for a level [N], follow the arm as it gives way, and return what is then read.
+        """Demand a tension, follow the arm as it gives way, and return the resulting reading.
 
-        It adds to `latency` [s] when it answered, unless noise may hide all that was asked for.
+        Args:
+            m: The muscle.
+            level: The demanded tension [N].
+            home: l before the test [m]; limits how far the muscle is wound in.
+            latency: Receives the time to the response [s], unless noise could hide it.
         """
         before = self._mean()
         noise = max(self._swing[m], self._noise()[m])
         answer = self._response[m] + 2.0 * noise
-        # A stiff arm gives way before the next message: one reading must tell.
+        # A stiff arm responds before the next message, so a single reading must show the response.
         hidden = answer + 3.0 * noise > level - before.demand[m]
         further = (level - self._bias[m]) / self._robot.stiffness[m]
         self._target[m] = before.length[m] - further
@@ -224,8 +240,8 @@ class Winding:
 
     def _try(self, m: int) -> Wait:
         robot, verdict, home = self._robot, self.verdict, self._mean()
-        half, whole = list[float](), list[float]()  # [s] until it answered
-        # The weight of the arm may ask for more than T_bias already.
+        half, whole = list[float](), list[float]()  # [s] to the response
+        # The demand at home may exceed T_bias, because the muscle carries the arm's weight.
         rise = (self._highest - self._bias)[m]
         yield from self._wind(m, home.demand[m] + 0.5 * rise, home.length[m], half)
         last = yield from self._wind(m, home.demand[m] + rise, home.length[m], whole)
@@ -233,9 +249,10 @@ class Winding:
         if not (abs(pulled[m]) > self._response[m] or wound[m] > RESPONSE[1]):
             yield from self._ask_outwards(m, home, pulled, wound)
             return
-        verdict.passed('unit', m)  # whose l and T they are only θ tells
+        verdict.passed('unit', m)
         if wound[m] < -RESPONSE[1]:
-            verdict.failed('sign', m, told=f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in')
+            detail = f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in'
+            verdict.failed('sign', m, detail=detail)
         verdict.passed('sign', m)
         if (other := self._whose_tension(m, home, last)) != m:
             verdict.failed('tension place', m, other=robot.muscles[other])
@@ -257,12 +274,12 @@ class Winding:
             verdict.passed('latency', m)
 
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
-        """Judge the law by the highest level that was asked for, and by l_target beyond l."""
+        """Check the law at the highest demand, and with l_target beyond l."""
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
         if asked < 0.25 * (self._highest - self._bias)[m]:
-            told = f'{self._robot.muscles[m]}: the arm gave way, the law is not judged'
-            self.verdict.notes.append(told)
+            note = f'{self._robot.muscles[m]}: the arm gave way, the law is not judged'
+            self.verdict.notes.append(note)
             return
         if abs(last.third[m] - home.third[m]) > 0.7 * asked and abs(got) < 0.3 * asked:
             failed('third row', m)
@@ -274,7 +291,7 @@ class Winding:
             self.verdict.passed('law', m)
 
     def _whose_tension(self, m: int, home: _Reading, last: _Reading) -> int:
-        """Return the muscle whose T does what the law asks of m, which was wound in."""
+        """Return the muscle whose T shows the response to winding in m."""
         asked, got = last.demand - home.demand, last.tension - home.tension
         if asked[m] < 0.25 * (self._highest - self._bias)[m] or abs(got[m]) > 0.3 * asked[m]:
             return m
@@ -282,10 +299,10 @@ class Winding:
         return other if SLOPES[0] < (got - asked)[other] / asked[m] < SLOPES[1] else m
 
     def _find_onset(self, m: int, home: _Reading) -> Generator[None, None, float | None]:
-        """Go slowly in, and to where l would be if a sign were wrong; return where m pulls [m].
+        """Search for the l_target [m] at which muscle m gets tight; return None without a response.
 
-        None if it pulls nowhere on the way. It ends with the first newton that tells, and at once
-        where l and T seem not to be read.
+        The target moves slowly inwards and outwards, past −l, where the muscle would get tight if a
+        sign were wrong. The search ends at the first response, or if l or T is not being read.
         """
         home_length, far = (
             home.length[m],
@@ -307,7 +324,14 @@ class Winding:
         return None
 
     def _ask_outwards(self, m: int, home: _Reading, pulled: Array, wound: Array) -> Wait:
-        """Find out why a muscle did not respond, where all pulled [N] and wound in [m] (M,)."""
+        """Find out why a muscle did not respond.
+
+        Args:
+            m: The muscle.
+            home: The reading before the test.
+            pulled: Rise of T of all muscles [N], (M,).
+            wound: Fall of l of all muscles [m], (M,).
+        """
         other = int(np.where(wound > RESPONSE[1], pulled, -np.inf).argmax())
         yield from self._go(m, home.length[m])
         if other != m and pulled[other] > self._response[other]:
@@ -321,7 +345,7 @@ class Winding:
             self.verdict.failed('outwards', m)
             return
         onset = yield from self._find_onset(m, home)
-        self._target[m] = home.length[m]  # at once
+        self._target[m] = home.length[m]  # return without RELEASE_SPEED
         yield from self._wait(RELEASE)
         if onset is None:
             self.verdict.failed('no answer', m)

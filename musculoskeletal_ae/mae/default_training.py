@@ -42,7 +42,7 @@ LAYERS = Layers((200, 100), 'silu')
 STEPS, BATCH, SAMPLES = 3000, 128, 200_000
 STEP_SIZE = 0.004  # of the biases; `optimiser` derives that of the matrices
 REFERENCE = 5 + 10  # D + M of the arm that these numbers are for
-# Muscles of a joint that count; further ones add equations, and nothing to be found.
+# Muscles counted per joint; further muscles add equations, but no unknowns.
 COUNTED_MUSCLES = 2.5
 
 # Share of samples with tensions beyond tension.limit. A payload causes such tensions, and an

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From raw messages of the muscle modules to the samples that everything else uses."""
+"""Convert raw messages of the muscle modules to checked samples for all other parts."""

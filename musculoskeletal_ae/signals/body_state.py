@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which muscles are isolated and what the length offsets are, as one immutable value.
+"""The body state: isolated muscles and length offsets as one immutable value.
 
 The estimator owns the body state and publishes it on the latched topics `isolated_muscles` and
-`muscle_length_zeros`. Every other node receives it and passes it on. A change makes a new value
-with the next version; no object is changed in place.
+`muscle_length_zeros`. All other nodes receive it. Every change creates a new object with the next
+version.
 """
 
 from __future__ import annotations
@@ -16,51 +16,52 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 
-UNKNOWN = 1.0  # [m] standard deviation of a length offset that is being searched for
-SUSPECT = 2.0  # [m] the same of an offset that was known, and that a finding has revoked
-KNOWN = 0.05  # [m] largest standard deviation of an offset that counts as known
+# Standard deviations of length offsets.
+UNKNOWN = 1.0  # [m] of an unknown offset
+SUSPECT = 2.0  # [m] of an offset that was known until a fault revoked it
+KNOWN = 0.05  # [m]; offsets with a lower one count as known
 
 
 @dataclass(frozen=True)
 class LengthOffsets:
-    """By how much every length sensor reads too much, and how well that is known."""
+    """Length offsets, which are subtracted from sensor values, and their uncertainty."""
 
     offset: Array  # o [m], (M,)
     deviation: Array  # standard deviation [m], (M,)
 
     @classmethod
     def none(cls, muscle_count: int) -> LengthOffsets:
-        """Return offsets of zero that are known exactly."""
+        """Return exactly known offsets of zero."""
         return cls(np.zeros(muscle_count), np.zeros(muscle_count))
 
     @classmethod
     def unknown(cls, muscle_count: int) -> LengthOffsets:
-        """Return offsets of which nothing is known."""
+        """Return unknown offsets."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
     @cached_property
     def known(self) -> bool:
-        """Whether the lengths of all muscles can be relied on."""
+        """Whether the offsets of all muscles are known."""
         return bool((self.deviation < KNOWN).all())
 
     @cached_property
     def is_suspect(self) -> bool:
-        """Whether a finding has revoked offsets that were known."""
+        """Whether a fault has revoked known offsets."""
         return bool((self.deviation >= SUSPECT).any())
 
     def revoked(self) -> LengthOffsets:
-        """Return the same offsets, which are not relied on until they are found anew."""
+        """Return the same offsets, marked as suspect until the next length calibration."""
         return LengthOffsets(self.offset, np.full(len(self.offset), SUSPECT))
 
 
 @dataclass(frozen=True)
 class BodyState:
-    """The state of the body that all nodes agree on.
+    """State of the body that all nodes share.
 
     Attributes:
         offsets: Length offsets of all muscles.
-        isolated: Positions (in T and l) of the muscles that are not used, in ascending order.
-        version: Counts the changes; a higher one is newer.
+        isolated: Indices of isolated muscles in T and l, in ascending order.
+        version: Number of changes so far.
     """
 
     offsets: LengthOffsets
@@ -69,17 +70,17 @@ class BodyState:
 
     @classmethod
     def healthy(cls, muscle_count: int) -> BodyState:
-        """Return the state of a body with known offsets of zero and no isolated muscle."""
+        """Return the state with known offsets of zero and no isolated muscle."""
         return cls(LengthOffsets.none(muscle_count))
 
     @property
     def muscle_count(self) -> int:
-        """The number of muscles M."""
+        """Number of muscles M."""
         return len(self.offsets.offset)
 
     @cached_property
     def used(self) -> Bools:
-        """Which muscles are used, (M,)."""
+        """Which muscles are not isolated, (M,)."""
         return ~np.isin(np.arange(self.muscle_count), self.isolated)
 
     def with_isolated(self, muscles: Iterable[int]) -> BodyState:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a raw `muscle_states` message to numbers: the only place where that happens.
+"""Convert raw `muscle_states` messages to checked samples.
 
     message ─► shape, finite ─► plausible level ─► plausible step ─► median ─► length offset
-            ─► tendon friction, believed temperature ─► MuscleSample
+            ─► tendon friction, plausible temperature ─► MuscleSample
 
 A message that fails a check raises a `RejectionError`, which names the reason, the value and the
-legal range. Nodes, bags, `check_driver` and experiments all use this class, and `signals/limits.py`
-has its limits. What isolated muscles read is never judged.
+legal range. Nodes, bags and experiments all use this class; `signals/limits.py` has the limits.
+Values of isolated muscles are not checked.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states
 
 
 class RejectionError(MessageError):
-    """A message that cannot be used.
+    """A message is rejected.
 
     Attributes:
-        reason: What it is counted under.
-        states: l, T and temperature as they were read, (3, M), where the message had that shape.
+        reason: Short text under which it is counted.
+        states: The raw l, T and temperature, (3, M); None if the message had another shape.
     """
 
     def __init__(self, reason: str, detail: str, states: Array | None = None) -> None:
@@ -51,22 +51,20 @@ class RejectionError(MessageError):
 
 @dataclass(frozen=True)
 class MuscleSample:
-    """One message of the muscle modules, ready for use. Arrays have the shape (M,).
+    """A checked message of the muscle modules. Arrays have the shape (M,).
 
     Attributes:
-        time: When it came, by the clock of the caller [s].
+        time: Time of reception by the caller's clock [s].
         length: l, with the length offset removed [m].
-        length_read: l as the sensor read it [m].
-        motor_tension: T at the motor [N].
-        bone_tension: T_end at the bone, with tendon friction removed [N].
-        sliding: Which way each tendon slid last: 1 wound in, −1 paid out.
-        temperature: Of the module's housing, which changes no faster than one can [°C]; NaN where
-            it is unknown.
-        usable: Which muscles count; isolated ones do not.
-        newest: l (offset removed), T and temperature of the last message alone, before the median
+        length_read: l as the sensor measured it [m].
+        motor_tension: Motor-side tension T [N].
+        bone_tension: Bone-side tension T_end, with tendon friction removed [N].
+        sliding: Direction in which each tendon slid last: 1 wound in, −1 paid out.
+        temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
+        usable: Which muscles are not isolated.
+        newest: l (offset removed), T and temperature of the last message alone, without the median
             against glitches, (3, M).
-        jumped: The muscles whose lengths have jumped and settled at another level with this
-            message; usually none.
+        jumped: Muscles whose new level after a jump is accepted with this message; usually none.
     """
 
     time: float
@@ -81,14 +79,14 @@ class MuscleSample:
     jumped: tuple[int, ...] = ()
 
     def shifted(self, offset: Array) -> MuscleSample:
-        """Return the same sample, with lengths that are less by `offset` [m], (M,)."""
+        """Return the same sample with lengths reduced by `offset` [m], (M,)."""
         newest = self.newest.copy()
         newest[0] -= offset
         return replace(self, length=self.length - offset, newest=newest)
 
 
 class LevelCheck:
-    """Checks every value of a message against what a sound sensor can read."""
+    """Checks every value of a message against the limits of plausible sensor values."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -104,15 +102,15 @@ class LevelCheck:
         self._slack = LIMITS.slack_share * robot.description.tension.bias
 
     def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
-        """Return the reason and the detail of the first impossible value, or None.
+        """Return reason and detail of the first implausible value, or None.
 
         Args:
-            states: l [m], T [N] and temperature [°C] (3, M); NaN is not judged.
-            used: Which muscles are judged, (M,).
-            lengths_known: Whether l can be judged; not while the length offsets are unknown.
+            states: l [m], T [N] and temperature [°C] (3, M); NaN is ignored.
+            used: Which muscles to check, (M,).
+            lengths_known: Whether to check l, which requires known length offsets.
         """
         low = self._low.copy()
-        # A slack tendon, as of a ruptured muscle, can be wound in beyond any posture.
+        # A slack tendon, such as that of a ruptured muscle, can be wound in beyond any posture.
         low[0] -= np.where(states[1] < self._slack, LIMITS.slack_length_margin, 0.0)
         beyond = ((states < low) | (states > self._high)) & used
         beyond[0] &= lengths_known
@@ -127,25 +125,25 @@ class LevelCheck:
 
 
 class StepCheck:
-    """Checks that no length changes faster than a muscle can; accepts a level that lasts.
+    """Checks that no length changes faster than a muscle can; accepts a new level that lasts.
 
-    It takes lengths as they were read, so that new length offsets do not interrupt it.
+    It uses lengths as measured, so that new length offsets do not look like jumps.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._accepted: Array | None = None  # the last lengths that were believed [m], (M,)
-        self._last: Array = np.zeros(robot.muscle_count)  # the last lengths, believed or not
+        self._accepted: Array | None = None  # the last accepted lengths [m], (M,)
+        self._last: Array = np.zeros(robot.muscle_count)  # the last lengths, accepted or not
         self._last_at, self._settled_since = -math.inf, math.inf
         self._far: Bools = np.zeros(robot.muscle_count, dtype=bool)  # which lengths jumped
-        self._after_pause = False  # whether they did so in a pause of the messages
-        self.jumped: tuple[int, ...] = ()  # the same muscles, once their level is accepted
+        self._after_pause = False  # whether they jumped during a pause of the messages
+        self.jumped: tuple[int, ...] = ()  # muscles whose new level was just accepted
         self.jumped_in_pause = False
 
     def problem(self, length: Array, used: Bools, now: float) -> tuple[str, str] | None:
-        """Return the reason and the detail if a length jumped, or None.
+        """Return reason and detail if a length jumped, or None.
 
-        `jumped` names the muscles in the one message with which their new level is accepted.
+        With the message that makes a new level accepted, `jumped` contains its muscles.
         """
         self.jumped = ()
         pause = max(now - self._last_at, 0.0)
@@ -167,7 +165,7 @@ class StepCheck:
             self._settled_since = now
         self._settled_since = min(self._settled_since, now)
         if now - self._settled_since > LIMITS.settled:
-            # Others may have moved as far meanwhile, and some may have come back.
+            # Some lengths may have returned meanwhile, and others may have moved as far.
             self.jumped = tuple(np.flatnonzero(self._far & (change > allowed)).tolist())
             self.jumped_in_pause = self._after_pause
             self._accept(length)
@@ -181,21 +179,21 @@ class StepCheck:
 
 
 class TemperatureCheck:
-    """Believes a temperature only where a housing can have got there since the last one believed.
+    """Accepts a temperature only if the housing can have reached it since the last accepted one.
 
-    A sensor that reads 199 °C for three messages changes nothing. One that goes on to read it is
-    believed some seconds later: a hot module must stop the arm.
+    A few messages with 199 °C have no effect. A sensor that continues to read 199 °C is accepted
+    some seconds later, because a hot module must stop the arm.
     """
 
     def __init__(self, muscle_count: int) -> None:
-        self._believed: Array = np.full(muscle_count, math.nan)  # [°C], (M,)
-        self._age: Array = np.zeros(muscle_count)  # of what is believed [s]
-        self._first: Array = self._believed.copy()  # a reading to begin with [°C]
-        self._first_age: Array = np.zeros(muscle_count)  # for how long others agree with it [s]
+        self._believed: Array = np.full(muscle_count, math.nan)  # last accepted [°C], (M,)
+        self._age: Array = np.zeros(muscle_count)  # of the last accepted temperature [s]
+        self._first: Array = self._believed.copy()  # candidate for the first temperature [°C]
+        self._first_age: Array = np.zeros(muscle_count)  # how long readings have agreed with it [s]
         self._last_at = math.nan
 
     def step(self, read: Array, now: float) -> Array:
-        """Return what is believed [°C] (M,) of readings that came at `now` [s]; NaN is unknown."""
+        """Return the accepted temperatures [°C] (M,) after readings at `now` [s]; NaN: unknown."""
         elapsed = max(now - self._last_at, 0.0) if math.isfinite(self._last_at) else 0.0
         self._last_at = now
         possible = (read >= LIMITS.lowest_temperature) & (read <= LIMITS.highest_temperature)
@@ -208,7 +206,7 @@ class TemperatureCheck:
         return np.where(possible, self._believed, math.nan)
 
     def _begins(self, read: Array, elapsed: float) -> Bools:
-        """Return where nothing was believed yet and readings have agreed for long enough, (M,)."""
+        """Return where readings have agreed long enough to accept a first temperature, (M,)."""
         agrees = np.abs(read - self._first) <= LIMITS.temperature_step
         self._first_age = np.where(agrees, self._first_age + elapsed, 0.0)
         self._first = np.where(agrees, self._first, read)
@@ -221,26 +219,26 @@ class MuscleStream:
 
     Attributes:
         body: Length offsets and isolated muscles.
-        displaced: Muscles whose lengths have jumped and settled at another level, although their
-            offset has not been found anew since. Their lengths cannot be relied on.
-        jumps: How often lengths have jumped and settled at another level.
-        has_displaced_unseen: Whether that happened in a pause of the messages, in which the arm
-            may have moved.
+        displaced: Muscles whose lengths have jumped to another level since their last length
+            calibration. Their lengths are not reliable.
+        jumps: How often lengths have jumped to another level.
+        has_displaced_unseen: Whether the last jump was during a pause of the messages, in which
+            the arm may have moved.
     """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
-        """Expect messages of this robot.
+        """Expect messages of a robot.
 
         Args:
             robot: The nominal body.
-            body: Length offsets and isolated muscles; by default none.
-            window: How many messages the median against glitches spans; 1 leaves them as they are.
+            body: Length offsets and isolated muscles; None: offsets of 0, no isolated muscle.
+            window: Number of messages in the median against glitches; 1: no median.
         """
         self._robot = robot
         self.body = body or BodyState.healthy(robot.muscle_count)
         self._friction: Array | float = 0.0
         self._levels = LevelCheck(robot)
-        self._readings: deque[Array] = deque(maxlen=window)  # (3, M) each, l as it was read
+        self._readings: deque[Array] = deque(maxlen=window)  # (3, M) each, l as measured
         self._implausible = Persistence()
         self.displaced: frozenset[int] = frozenset()
         self.has_displaced_unseen = False
@@ -249,19 +247,19 @@ class MuscleStream:
         self.reset()
 
     def reset(self) -> None:
-        """Forget what came before, as after a jump of the clock."""
+        """Forget earlier messages, for example after a jump of the clock."""
         self._steps = StepCheck(self._robot)
         self._direction = FrictionDirection()
         self._readings.clear()
         self._time = math.inf
 
     def use_friction(self, friction: Array | float) -> None:
-        """Remove this tendon friction μ, (M,), from now on."""
+        """Set the tendon friction μ, (M,), to remove from now on."""
         self._friction = friction
 
     def use_body(self, body: BodyState) -> None:
-        """Go by another body state from now on."""
-        if body.offsets is not self.body.offsets:  # the same muscles, measured from other offsets
+        """Use another body state from now on."""
+        if body.offsets is not self.body.offsets:  # the change of lengths is not a motion
             self._direction = FrictionDirection()
             if not body.offsets.is_suspect:
                 self.displaced = frozenset()
@@ -273,10 +271,15 @@ class MuscleStream:
         return self._implausible.lasting(now)
 
     def take(self, message: Any, time: float, now: float | None = None) -> MuscleSample:
-        """Take a Float64MultiArray message that came at `time` [s]; `now` is on a steady clock.
+        """Check and convert a Float64MultiArray message.
+
+        Args:
+            message: The message.
+            time: Time of reception by the caller's clock [s].
+            now: The same by a steady clock [s]; None: `time` is steady.
 
         Raises:
-            RejectionError: If the message cannot be used.
+            RejectionError: If the message is invalid or implausible.
         """
         muscle_count = self._robot.muscle_count
         try:
@@ -289,10 +292,12 @@ class MuscleStream:
         return self.take_states(states, time, now)
 
     def take_states(self, states: Array, time: float, now: float | None = None) -> MuscleSample:
-        """Take l as read [m], T [N] and temperature [°C], (3, M), that came at `time` [s].
+        """Check and convert values as measured: l [m], T [N] and temperature [°C], (3, M).
+
+        Times are those of `take`.
 
         Raises:
-            RejectionError: If they are not plausible.
+            RejectionError: If they are implausible.
         """
         now = time if now is None else now
         offsets = self.body.offsets

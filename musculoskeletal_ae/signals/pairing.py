@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which θ belongs to which (T, l): the nearest in time, within half a period.
+"""Pair each (T, l) with the θ nearest in time, within half a period.
 
-A θ between two messages of the muscle modules belongs to the nearer one, the earlier one if it lies
-in the middle, so none is used twice. That holds joint by joint: several nodes may publish some of
-them each, at times of their own. The rule is the same on a live arm and on a recording.
+A θ between two messages of the muscle modules belongs to the nearer one, or to the earlier one if
+both are equally near. Hence no θ is used twice. The rule applies to each joint separately, because
+several nodes may publish different joints at different times. Live arms and recordings use the same
+rule.
 """
 
 import math
@@ -19,13 +20,13 @@ Message = TypeVar('Message')
 
 @dataclass(frozen=True)
 class Paired(Generic[Message]):
-    """One message of the muscle modules, with the θ of the same time if there is one.
+    """A message of the muscle modules, with the θ of the same time if there is one.
 
     Attributes:
-        time: When the message came [s].
-        message: What the caller passed.
+        time: Time of reception of the message [s].
+        message: The message as the caller passed it.
         dt: Time since the message before [s]; 0 for the first.
-        theta: θ [rad], (D,), NaN of joints of which none belongs to it; None if there is no θ.
+        theta: θ [rad], (D,), NaN for joints without a matching value; None if no joint has one.
     """
 
     time: float
@@ -35,24 +36,24 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Joins two streams; gives out a muscle message when the next one has come."""
+    """Pairs two streams; returns each muscle message when the next one has arrived."""
 
     def __init__(self, period: float) -> None:
-        """Pair within half a `period` [s] of the muscle messages."""
+        """Pair values within half a `period` [s], that of the muscle messages."""
         self._half = 0.5 * period + 1e-9
         self.reset()
 
     def reset(self) -> None:
-        """Forget, as after a backward jump of the clock."""
-        # Of each joint the last θ before the muscle message that waits, the first one after it, and
-        # the latest one: when it came [s], and what it is, (2, D); NaN: none.
+        """Forget all messages, for example after a backward jump of the clock."""
+        # For each joint, time [s] and θ (2, D) of the last value before the pending muscle message,
+        # of the first one after it, and of the latest one; NaN: none.
         self._last = self._next = self._latest = np.full((2, 1), np.nan)
         self._came = -math.inf
         self._pending: tuple[float, Message] | None = None
         self._before: float | None = None
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take a θ [rad] (D,) that came at `time` [s]; NaN of joints that it says nothing of."""
+        """Take a θ [rad] (D,) received at `time` [s]; NaN for joints that are not included."""
         if time < self._came:
             self.reset()
         self._came = time
@@ -61,11 +62,11 @@ class Pairing(Generic[Message]):
         self._next = np.where(np.isnan(self._next), new, self._next)
 
     def muscles(self, time: float, message: Message | None) -> Paired[Message] | None:
-        """Take a message that came at `time` [s]; return the message before, paired.
+        """Take a message received at `time` [s]; return the message before, paired.
 
-        At the end of a recording, None at time ∞ returns the last message.
+        At the end of a recording, pass None at time ∞ to get the last message.
         """
-        # The clock went back, or became another one.
+        # The clock has gone back or been replaced.
         if self._pending is not None and time < self._pending[0]:
             self.reset()
         pending = self._pending
@@ -80,7 +81,7 @@ class Pairing(Generic[Message]):
         return paired
 
     def _nearest(self, came: float, following: float) -> Array | None:
-        """Return the θ nearest to the message that waits, unless it is nearer to a neighbour."""
+        """Return the θ nearest to the pending message, without values nearer to a neighbour."""
         before = -math.inf if self._before is None else self._before
         time, theta = np.stack(np.broadcast_arrays(self._last, self._next), axis=1)
         distance = np.abs(time - came)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Command-line tools; none needs a ROS graph."""
+"""Command-line tools that need no ROS graph."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`check_robot`: says whether a robot description is sound, and where it is not."""
+"""`check_robot`: checks whether a robot description is sound, and names its faults."""
 
 from pathlib import Path
 
@@ -13,15 +13,15 @@ def main(argv: list[str] | None = None) -> int:
     """Check one robot; exit status 0 if it is sound, 1 if it is not or cannot be read."""
     parser = Parser(
         'check_robot',
-        'Says whether a robot description is sound, where it is not, and what helps. '
-        'Exit status 0: sound (with --suggest: what it wrote is), 1: not sound.',
+        'Checks whether a robot description is sound, and names its faults and remedies. '
+        'Exit status 0: sound (with --suggest: the arm that it wrote is sound), 1: not sound.',
     )
     parser.add_robot('robot', default=None)
     parser.add_argument('--postures', type=whole(1, 10_000), default=200, help='random postures')
     parser.add_seed('of the postures')
     parser.add_plot('moment arms and stiffness')
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
-    text = 'search for the smallest change of via points that makes it sound, for minutes'
+    text = 'search for the smallest change of via points that makes it sound (takes minutes)'
     parser.add_argument('--suggest', action='store_true', help=text)
     text = 'new directory for the arm that --suggest finds, and a picture of before and after'
     parser.add_argument('--out', type=Path, metavar='DIR', help=text)
@@ -29,8 +29,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--reach', type=number(1e-3, 1.0), help=text)
     args = parser.parse_args(argv)
     if args.suggest != bool(args.out) or (args.out and args.out.exists()):
-        parser.error('--suggest and --out DIR, a new directory, go together')
+        parser.error('use --suggest and --out DIR, a new directory, together')
     if args.reach and not args.suggest:
-        parser.error('--reach goes with --suggest')
+        parser.error('use --reach with --suggest only')
     args.reach = args.reach or REACH
     return exit_status(lambda: import_heavy('musculoskeletal_ae.tools.robot_report').check(args))

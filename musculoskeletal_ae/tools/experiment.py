@@ -9,27 +9,27 @@ from musculoskeletal_ae.experiments import NAMES
 from musculoskeletal_ae.options import Parser, exit_status, whole
 from musculoskeletal_ae.stop_signals import import_heavy
 
-# In two minutes the learner sees enough to calibrate its detector, so that every key has a value.
+# Two minutes are enough to calibrate the detector; every result then has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
 MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measure; exit status 1 if a robot or folder is not usable, 2 for bad options."""
+    """Run experiments; exit status 1 if a robot or folder is unusable, 2 for invalid options."""
     parser = Parser(
         'experiment',
         'Runs an experiment of the paper on emulated arms, faster than real time and without ROS, '
         "and writes DIR/NAME/result.json, plots, and DIR/report.html with the paper's numbers "
-        'beside ours. Exit status 1: a part failed or a file is not usable, 2: bad options.',
+        'beside ours. Exit status 1: a part failed or a file is unusable, 2: invalid options.',
     )
-    told = f'{", ".join(NAMES)}; several, with a comma between; or all'
-    parser.add_argument('names', metavar='NAME', type=_names, help=told)
+    text = f'{", ".join(NAMES)}; several, separated by commas; or all'
+    parser.add_argument('names', metavar='NAME', type=_names, help=text)
     parser.add_robot()
-    parser.add_preset('networks to measure; preset paper is always shown beside them')
-    parser.add_seeds(None, 'individual arms (default: 0,1,2,3,4; quick: 0)')
+    parser.add_preset('preset to measure; results of preset paper are always shown beside it')
+    parser.add_seeds(None, 'seeds of the emulated individuals (default: 0,1,2,3,4; quick: 0)')
     parser.add_reality()
     parser.add_minutes('duration of the exploration (default: 10; quick: 2)', None)
-    parser.add_quick('a taste of everything, in a minute')
+    parser.add_quick('a short version of each experiment, in a minute')
     parser.add_out('DIR', 'results and report', Path('experiments'))
     cores = len(os.sched_getaffinity(0))
     parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='processes')

@@ -19,11 +19,11 @@ from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 COLUMNS = ['tension', 'absolute_length', 'elongation']
 EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]
 EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # [m]
-EXAMPLE_NOISE = 1e-4  # [m], what a caliper on a testbed resolves
-LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # of the elastic unit, as shares of the highest tension
-SLIGHTLY = 1e-3
-LEAST_ELONGATION = -0.002  # [m], by noise
-LONGEST = 10.0  # [m] of a muscle on a testbed: numbers above that are in another unit
+EXAMPLE_NOISE = 1e-4  # [m], the resolution of a caliper
+LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # range of `force`, relative to the highest tension
+SLIGHTLY = 1e-3  # distance of the starting point from the bounds
+LEAST_ELONGATION = -0.002  # [m]; noise can make an elongation negative
+LONGEST = 10.0  # [m] of a muscle on a testbed; larger numbers are probably in another unit
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -52,8 +52,8 @@ def fit(args: Namespace) -> None:
         raise _refusal(args.table, str(error)) from error
     residual = 1e3 * (table[:, 2] - constants.elongation(table[:, 1], table[:, 0]))
     rms = math.sqrt(float(np.mean(residual**2)))
-    found = {name: float(f'{values[0]:.6g}') for name, values in vars(constants).items()}
-    line = yaml.safe_dump(found, default_flow_style=True, sort_keys=False).strip()
+    fitted = {name: float(f'{values[0]:.6g}') for name, values in vars(constants).items()}
+    line = yaml.safe_dump(fitted, default_flow_style=True, sort_keys=False).strip()
     print(
         f'series_elastic: {line}\n'
         f'residual: rms {rms:.3f} mm, largest {np.abs(residual).max():.3f} mm, {len(table)} rows'
@@ -62,10 +62,10 @@ def fit(args: Namespace) -> None:
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
-    """Return the constants, each of shape (1,), that fit T [N], l_abs [m] and L_e [m] (N,) best.
+    """Fit the constants, each of shape (1,), to T [N], l_abs [m] and L_e [m], (N,) each.
 
     Raises:
-        ValueError: If there are fewer than four rows, or they tell of no spring.
+        ValueError: If there are fewer than four rows, or they do not describe a spring.
     """
     from scipy.optimize import least_squares
 
@@ -75,7 +75,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
         raise ValueError('a testbed table needs several tensions at several muscle lengths')
     if elongation @ (tension - tension.mean()) <= 0.0:
-        raise ValueError('elongation does not grow with tension; from where is it measured?')
+        raise ValueError('elongation does not grow with tension; check its zero and sign')
 
     def model(log_constants: Array) -> SeriesElastic:
         return SeriesElastic(*np.exp(log_constants)[:, None])
@@ -83,7 +83,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     def residual(log_constants: Array) -> Array:
         return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
 
-    # A linear spring is F ≫ T, a wire alone a rate without end: both as far as it can be told.
+    # A linear spring would have F ≫ T, and a tendon alone an infinite rate; both are bounded here.
     most = tension.max()
     low, high = np.log([[LEAST_FORCE * most, 1e-3, 1e-12], [MOST_FORCE * most, 1e6, 1.0]])
     start = np.clip(np.log(list(DEFAULT.values())), low + SLIGHTLY, high - SLIGHTLY)
@@ -118,7 +118,7 @@ def _refusal(file: Path, problem: str) -> RobotDescriptionError:
 
 
 def write_example(args: Namespace) -> None:
-    """Write a synthetic table: the package's default constants and measurement noise."""
+    """Write a synthetic table from the package's default constants and measurement noise."""
     file, seed = args.table, args.seed
     true = SeriesElastic(*np.array(list(DEFAULT.values()))[:, None])
     rng = np.random.default_rng(seed)
@@ -138,7 +138,7 @@ def write_example(args: Namespace) -> None:
 
 
 def plot(table: Array, constants: SeriesElastic, residual: Array) -> Any:
-    """Return a figure of the fit over tension, one curve a muscle length, and the residual."""
+    """Return a figure of the fit over tension, one curve per muscle length, and the residual."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout='constrained')
@@ -153,7 +153,7 @@ def plot(table: Array, constants: SeriesElastic, residual: Array) -> Any:
         fit.plot(table[rows, 0], 1e3 * table[rows, 2], **dots)
         rest.plot(table[rows, 0], residual[rows], **dots)
     fit.set(xlabel='tension [N]', ylabel='elongation [mm]', title='fit (lines) and table (dots)')
-    # A table with a length of its own in every row has no curves worth a legend.
+    # Tables with a different length in every row would have a very long legend.
     if len(lengths) <= 10:
         fit.legend(title='muscle length')
     rest.axhline(0.0, color='black', linewidth=0.8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`import_robot`: makes a robot directory out of another project's model."""
+"""`import_robot`: converts a model of another project to a robot directory."""
 
 from pathlib import Path
 
@@ -8,14 +8,14 @@ from musculoskeletal_ae.stop_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Import one model; exit status 0 if what was written loads."""
+    """Import one model; exit status 0 if the written directory loads."""
     parser = Parser(
         'import_robot',
-        'Makes a robot directory out of a MuJoCo model (MJCF), a cardsflow.xml beside its '
-        'model.urdf or model.sdf, or a URDF (a skeleton to fill in). Says what it chose, dropped, '
-        'renamed or approximated, and how far lengths and moment arms are from those of the '
-        "source's own engine. An OpenSim model becomes MJCF by MyoConverter. Exit status 0: the "
-        'directory loads.',
+        'Converts a MuJoCo model (MJCF), a cardsflow.xml beside its model.urdf or model.sdf, or a '
+        'URDF (which gives a skeleton to fill in) to a robot directory. Reports what it chose, '
+        'dropped, renamed or approximated, and how far lengths and moment arms are from those of '
+        "the source's own engine. Convert OpenSim models to MJCF with MyoConverter first. Exit "
+        'status 0: the directory loads.',
     )
     parser.add_argument('file', type=Path, metavar='FILE', help='the model')
     parser.add_out('DIR', 'new or empty directory')
@@ -25,10 +25,10 @@ def main(argv: list[str] | None = None) -> int:
     text = 'muscles to leave out'
     parser.add_argument('--without', type=names, default=[], metavar='NAME,…', help=text)
     parser.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
-    text = 'end effector, a link, a site, or LINK_tip: the far end of what is drawn of a link; '
-    text += 'joints beside the way to it are held'
+    text = 'end effector: a link, a site, or LINK_tip, the far end of a drawn link; '
+    text += 'joints outside the chain to it are held fixed'
     parser.add_argument('--end', metavar='NAME', help=text)
-    text = 'play an MJCF file for a second and say how fast; exit status 3: not in real time'
+    text = 'play an MJCF file for a second and report its speed; exit status 3: below real time'
     parser.add_argument('--play', action='store_true', help=text)
     args = parser.parse_args(argv)
     return exit_status(lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `train` does: initial training from a robot description, or learning from recordings."""
+"""The work of `train`: initial training from a robot description, or learning from recordings."""
 
 import sys
 import time
@@ -40,8 +40,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions, end_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
-UNSEEN = 5000  # states
-SAID_EVERY = 5.0  # [s] between lines of progress where there is no terminal
+HELD_OUT_STATES = 5000
+REPORT_INTERVAL = 5.0  # [s] between lines of progress if there is no terminal
 ENTERED = {
     Mask.THETA_TENSION: '① (θ, T)',
     Mask.TENSION_LENGTH: '② (T, l)',
@@ -51,19 +51,19 @@ SYMBOLS = {'theta': 'θ', 'tension': 'T', 'length': 'l'}
 
 
 def train(args: Namespace) -> None:
-    """Train as the options say, print the errors and write the checkpoint."""
+    """Train according to the options, print the errors and write the checkpoint."""
     for file in filter(None, (args.out, args.plot)):
         if not file.parent.is_dir() or file.is_dir():
-            raise MusculoskeletalError(f'{file}: is a directory, or in one that is not there')
-        try:  # before the work, which takes minutes
+            raise MusculoskeletalError(f'{file}: is a directory, or its directory does not exist')
+        try:  # check this before the training, which takes minutes
             NamedTemporaryFile(dir=file.parent, prefix=f'.{file.name}.').close()
         except OSError as error:
-            told = f'{file}: cannot be written ({error.strerror}); choose another place'
-            raise MusculoskeletalError(told) from error
+            problem = f'{file}: cannot be written ({error.strerror}); choose another file'
+            raise MusculoskeletalError(problem) from error
     train_on(args.device)
     robot = Robot.load(args.robot)
-    if told := told_of_jumps(robot):
-        print(f'warning: {told}. Nodes may refuse this network', file=sys.stderr)
+    if warning := told_of_jumps(robot):
+        print(f'warning: {warning}. Nodes may reject this network', file=sys.stderr)
     preset = PRESETS[args.preset]
     steps = preset.initial_steps(robot.groups) // (10 if args.quick else 1)
     if args.from_bag:
@@ -71,34 +71,34 @@ def train(args: Namespace) -> None:
         return
     start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
-        said, begun = start, 0.0
+        reported, begun = start, 0.0
         if bar.disable:
             print(f'training: drawing states of the geometric model, {steps} mini-batches follow')
             sys.stdout.flush()
 
         def progress(step: int, loss: float, *_: object) -> None:
-            nonlocal said, begun
+            nonlocal reported, begun
             bar.update()
             if step % 100 == 0:
                 bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
             now = time.perf_counter()
             begun = begun or now
-            if bar.disable and now - said >= SAID_EVERY and step:
-                said, left = now, (steps - step) / step * (now - begun)
+            if bar.disable and now - reported >= REPORT_INTERVAL and step:
+                reported, left = now, (steps - step) / step * (now - begun)
                 share = 100.0 * step / steps
                 print(f'training: {share:.0f} %, loss {loss:.4f}, about {left:.0f} s left')
                 sys.stdout.flush()
 
         trained = initial_mae(robot, args.preset, args.seed, progress, steps)
-    checkpoint.save(trained.mae, args.out)  # before anything else can go wrong
+    checkpoint.save(trained.mae, args.out)  # first, so that no later error loses the training
     print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
-    # Not the stream of the training, so none of these states has been seen.
+    # This random stream differs from that of the training, so all states are held out.
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
-    planned = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, limit))
-    print(table(planned, f'{UNSEEN} unseen states, T in [0, {shown(limit)}] N'))
+    planned = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, limit))
+    print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
     if (most > limit).any():
-        overload = pair_errors(trained.mae, random_states(robot, UNSEEN, rng, most, limit))
+        overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
         print(table(overload, f'the same, T in [{shown(limit)}, {shown(most)}] N (overload)'))
     print(joint_table(robot, planned))
     print(f'checkpoint: {args.out}')
@@ -106,8 +106,8 @@ def train(args: Namespace) -> None:
 
 
 def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
-    """Learn from recordings in their order, those held out judged only; print errors."""
-    # Read before the network is trained, which takes longer than finding a bag unusable.
+    """Learn from recordings in order; print the errors on these and on held-out recordings."""
+    # All bags are read first, because training takes minutes and a bag may be unusable.
     recordings = {
         path: read(path, robot, args.from_namespace) for path in (*args.from_bag, *args.hold_out)
     }
@@ -123,31 +123,33 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
             total = round(pairs.time[-1] - pairs.time[0], 1)
             with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
                 learn(learner, pairs, bar.update)
-    checkpoint.save(learner.mae, args.out)  # before anything else can go wrong
+    checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
     for path, pairs in recordings.items():
         kind = 'held out' if path in args.hold_out else 'learned from'
         after = error(learner.mae, pairs)
         change = f'{before[path]:.4f} → {after:.4f} {robot.kinematics.distance_unit}'
         print(f'{path} ({kind}): {change} against its joint sensors')
-        if path in args.hold_out and (told := anomaly_in(robot, pairs, learner.mae, args.preset)):
-            print(f'warning: {path} (held out): {told}', file=sys.stderr)
+        if path not in args.hold_out:
+            continue
+        if warning := anomaly_in(robot, pairs, learner.mae, args.preset):
+            print(f'warning: {path} (held out): {warning}', file=sys.stderr)
     print(f'checkpoint: {args.out}')
 
 
 def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
-    """Return what an anomaly in a recording makes of its error, or ''.
+    """Return a warning about an anomaly in a recording and its error until then, or ''.
 
-    The health monitor of a learned network decides, as on a running arm.
+    The health monitor detects the anomaly with the learned network, as on a running arm.
     """
     stream, health = MuscleStream(robot), HealthMonitor(robot, preset)
     isolated: tuple[int, ...] | None = None
     steps = np.diff(recording.time, prepend=recording.time[:1])
     for row, (at, dt) in enumerate(zip(recording.time, steps)):
-        said = _isolated(recording.isolated[row], mae.isolated)
-        if said != isolated:
-            isolated, reduced = said, mae.without(said)
-            stream.use_body(stream.body.with_isolated(said))
+        recorded = _isolated(recording.isolated[row], mae.isolated)
+        if recorded != isolated:
+            isolated, reduced = recorded, mae.without(recorded)
+            stream.use_body(stream.body.with_isolated(recorded))
             stream.use_friction(reduced.friction)
             health.reset()
             health.use(reduced)
@@ -157,18 +159,24 @@ def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
         if finding is None:
             continue
         muscle = robot.muscles[finding.muscle]
-        told = f'an anomaly ({muscle}: {finding.kind.value}) begins {at:.1f} s into it'
-        before = recording.first(row)
+        text = f'an anomaly ({muscle}: {finding.kind.value}) begins {at:.1f} s into it'
         if row:
-            told += f'; until then the error is {error(mae, before):.4f}'
-        return f'{told} {robot.kinematics.distance_unit}. Hold out a healthy recording'
+            before = error(mae, recording.first(row))
+            text += f'; until then the error is {before:.4f} {robot.kinematics.distance_unit}'
+        return f'{text}. Hold out a healthy recording'
     return ''
 
 
 def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
-    """Return the paired messages of a bag, at least one, and say what was left out.
+    """Return the paired messages of a bag, and print warnings about unused messages.
 
-    `namespace` is the arm's own where the bag has several.
+    Args:
+        path: The bag.
+        robot: The recorded robot.
+        namespace: The namespace of the arm; required only if the bag has several.
+
+    Raises:
+        BagError: If the bag is unusable or has no pair.
     """
     bag = Bag.open(path)
     for reason in bag.unfinished:
@@ -182,7 +190,7 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
         print(f'warning: {path}: {count} messages used in part, {part}', file=sys.stderr)
     pairs = streams.pairs()
     if not len(pairs.time):
-        problem = 'holds no joint_states and muscle_states that belong together'
+        problem = 'has no simultaneous joint_states and muscle_states'
         raise BagError(path, problem, 'record both topics of this robot')
     return pairs
 
@@ -190,10 +198,10 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
 def learn(
     learner: Learner, recording: Pairs, progress: Callable[[float], None] | None = None
 ) -> None:
-    """Feed a recording to a learner, message by message, as if the arm were moving now.
+    """Pass a recording to a learner, message by message, as on a running arm.
 
-    Like the estimator of a running arm, the health monitor decides when learning has to pause.
-    `progress` is called with the recorded seconds that have passed since its last call.
+    As in the estimator, the health monitor decides when learning has to pause. `progress` is called
+    with the recorded seconds since its last call.
     """
     stream = MuscleStream(learner.robot, learner.body)
     health = HealthMonitor(learner.robot, learner.trainer.preset.name)
@@ -231,7 +239,7 @@ def _finding(
     time: float,
     dt: float,
 ) -> Finding | None:
-    """Return the fault of the arm that a message shows; an implausible message shows none."""
+    """Return the fault that a message reveals, or None; implausible messages reveal none."""
     try:
         sample = stream.take_states(states, time)
     except RejectionError:
@@ -241,7 +249,7 @@ def _finding(
 
 
 def error(mae: Mae, recording: Pairs) -> float:
-    """Return the mean over all messages of ‖θ_est − θ‖₂ against the joint sensors there [rad]."""
+    """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages, for joints with sensors."""
     tension = end_tension(mae.friction, recording.tension, directions(recording.length))
     estimate = np.empty_like(recording.theta)
     for isolated in np.unique(recording.isolated, axis=0):
@@ -251,13 +259,13 @@ def error(mae: Mae, recording: Pairs) -> float:
     return float(np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1).mean())
 
 
-def _isolated(said: Ints, before: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the muscles that a row of `Pairs.isolated` names; those of before if it says none."""
-    return before if (said < 0).any() else tuple(map(int, np.flatnonzero(said)))
+def _isolated(row: Ints, default: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the muscles isolated in a row of `Pairs.isolated`, or `default` if not recorded."""
+    return default if (row < 0).any() else tuple(map(int, np.flatnonzero(row)))
 
 
 def table(errors: list[PairError], title: str) -> str:
-    """Return the nine errors: mean norm of the error vector and mean |error| of an element."""
+    """Return a table of the nine errors: mean norm of the vector, mean |error| of an element."""
     heads = [f'{SYMBOLS[output]} [{unit}] norm (each)' for output, unit, _ in OUTPUTS]
     lines = ['', title, f'{"entered by":<12}' + ''.join(head.rjust(26) for head in heads)]
     for mask, name in ENTERED.items():
@@ -267,7 +275,7 @@ def table(errors: list[PairError], title: str) -> str:
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:
-    """Return the mean absolute error of every joint estimated from (T, l)."""
+    """Return a table of every joint's mean absolute error, estimated from (T, l)."""
     estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
     rows = zip(robot.joints, estimates['theta'], robot.units)
@@ -276,7 +284,7 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
 
 
 def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
-    """Return a figure of the loss, the nine errors and every joint's and muscle's error."""
+    """Return a figure of the loss, the nine errors, and the error of every joint and muscle."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -296,7 +304,8 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
     curve.grid(alpha=0.3)
     text.axis('off')
     limit = robot.tension.limit
-    text.set_title(f'Mean norm of the error, {UNSEEN} unseen states, T in [0, {shown(limit)}] N')
+    states = f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'
+    text.set_title(f'Mean norm of the error, {states}')
     cells = [[f'{e.norm:.4f} {e.unit}' for e in errors if e.mask is mask] for mask in ENTERED]
     grid = text.table(
         cells,

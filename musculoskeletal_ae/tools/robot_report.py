@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `check_robot` prints and draws."""
+"""The report and the figure of `check_robot`."""
 
 from argparse import Namespace
 from typing import Any
@@ -33,19 +33,19 @@ def check(args: Namespace) -> int:
         print(summary(robot, result, args.seed))
         print(moment_arm_table(robot, result))
     save_plot(args.plot, lambda: plot(robot, result))
-    for told in robot.description.warnings:
-        print(f'warning: {told}')
+    for text in robot.description.warnings:
+        print(f'warning: {text}')
     for warning in result.warnings:
         print(f'warning: {warning.message}; {warning.remedy}')
     for fault in result.faults:
         print(f'fault: {fault.message}')
-        for told in [fault.remedy] if fault.remedy else remedies(result, fault):
-            print(f'    remedy: {told}')
+        for remedy in [fault.remedy] if fault.remedy else remedies(result, fault):
+            print(f'    remedy: {remedy}')
     count = len(result.faults)
     print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
     if not (count and args.suggest):
         return 1 if count else 0
-    args.out.mkdir(parents=True)  # before the search, which takes minutes
+    args.out.mkdir(parents=True)  # fails before the search, which takes minutes
     try:
         return _suggested(robot, args)
     finally:
@@ -105,13 +105,13 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
             'highest holding tension [N]': result.tension[held].max(axis=1),
         }.items():
             spread = np.percentile(values, [0, 5, 50, 100])
-            told = [figure(value, 1, np.abs(spread).max()) for value in spread]
-            lines.append(f'{title:<44}' + ''.join(f' {value:>8}' for value in told))
+            texts = [figure(value, 1, np.abs(spread).max()) for value in spread]
+            lines.append(f'{title:<44}' + ''.join(f' {text:>8}' for text in texts))
     return '\n'.join(lines)
 
 
 def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
-    """Return min, median and max of every moment arm [mm], one row a muscle."""
+    """Return a table of min, median and max of every moment arm [mm], one row per muscle."""
     width = max(18, *(len(name) + 2 for name in robot.joints))
     first = max(len(name) for name in robot.muscles) + 2
     scale = np.array([words(robot, j).scale for j in range(robot.joint_count)])
@@ -149,15 +149,15 @@ def plot(robot: Robot, result: RobotCheck) -> Any:
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
     for j, (panel, name) in enumerate(zip(axes, robot.joints)):
-        slides, told = robot.kinematics.slides[j], words(robot, j)
+        slides, terms = robot.kinematics.slides[j], words(robot, j)
         label, shown_as = ('position [mm]', 1e3) if slides else ('joint angle [deg]', 180.0 / np.pi)
         for m, muscle in enumerate(robot.muscles):
             arm = result.moment_arms[:, m, j]
             if np.abs(arm).max() >= result.matters[j]:
                 look = dots | {'color': f'C{m % 10}', 'label': muscle}
-                panel.scatter(shown_as * result.setting.theta[:, j], told.scale * arm, **look)
+                panel.scatter(shown_as * result.setting.theta[:, j], terms.scale * arm, **look)
         panel.axhline(0.0, color='black', linewidth=0.8)
-        panel.set(title=name, xlabel=label, ylabel=f'{told.name} −G [{told.unit}]')
+        panel.set(title=name, xlabel=label, ylabel=f'{terms.name} −G [{terms.unit}]')
         if panel.collections:
             panel.legend(fontsize=6, ncols=2, markerscale=2, loc='best')
     last, held = axes[robot.joint_count], result.held

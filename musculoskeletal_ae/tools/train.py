@@ -9,12 +9,12 @@ from musculoskeletal_ae.stop_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Train one network; exit status 1 if the robot or a file is not usable, 2 for bad options."""
+    """Train one network; exit status 1 if a robot or file is unusable, 2 for invalid options."""
     parser = Parser(
         'train',
         'Trains the Musculoskeletal AutoEncoder on the geometric model of a robot and writes a '
-        'checkpoint. Prints the error of each of the nine (mask, output) pairs on unseen data. '
-        'Exit status 1: the robot or a file is not usable, 2: bad options.',
+        'checkpoint. Prints the error of each of the nine (mask, output) pairs on held-out data. '
+        'Exit status 1: the robot or a file is unusable, 2: invalid options.',
     )
     parser.add_robot(default=None)
     parser.add_out('FILE.safetensors', 'the checkpoint')
@@ -23,31 +23,31 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_plot('loss and errors')
     for flag, text in (
         ('--from-bag', 'learn the real arm from recordings: bag directories or .mcap files'),
-        ('--hold-out', 'with --from-bag: recordings that are only judged, before and after'),
+        ('--hold-out', 'with --from-bag: recordings for measuring the error before and after'),
     ):
         parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)
     text = 'with --from-bag: network to start from (default: train one on the geometric model)'
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
-    text = 'with --from-bag: which arm, of bags that have several'
+    text = 'with --from-bag: namespace of the arm if the bags have several'
     parser.add_argument('--from-namespace', metavar='NS', help=text)
     text = 'device for training; it must be one that torch can use'
     parser.add_argument('--device', choices=DEVICES, default='cpu', help=text)
-    parser.add_quick('a tenth of the training, to try things out')
+    parser.add_quick('a tenth of the training, for a first try')
     args = parser.parse_args(argv)
     if not args.from_bag and (args.hold_out or args.checkpoint or args.from_namespace):
-        parser.error('--hold-out, --checkpoint and --from-namespace go with --from-bag')
+        parser.error('use --hold-out, --checkpoint and --from-namespace with --from-bag only')
     if args.checkpoint and args.quick:
-        parser.error('--quick shortens the initial training: not with --checkpoint')
+        parser.error('--quick shortens the initial training; do not use it with --checkpoint')
     learned = {path.resolve() for path in args.from_bag}
     if both := [str(path) for path in args.hold_out if path.resolve() in learned]:
-        parser.error(f'{both[0]} is to be learned from and held out: name it after one option only')
+        parser.error(f'{both[0]} is both in --from-bag and in --hold-out; name it only once')
     out, read = args.out.resolve(), learned | {path.resolve() for path in args.hold_out}
     if read & {out, *out.parents}:
-        parser.error(f'--out {args.out} is a recording, or in one, and would replace it')
+        parser.error(f'--out {args.out} would overwrite a recording; name another file')
     if args.plot and args.plot.resolve() == out:
-        parser.error(f'--plot {args.plot} would replace the checkpoint: name another file')
+        parser.error(f'--plot {args.plot} would overwrite the checkpoint; name another file')
     if args.from_bag and args.plot:
-        parser.error('--plot shows the initial training: not with --from-bag')
+        parser.error('--plot shows the initial training; do not use it with --from-bag')
     return exit_status(
         lambda: import_heavy('musculoskeletal_ae.tools.initial_training').train(args)
     )

@@ -108,7 +108,7 @@ HEARD = {
         lambda rows: rows.T.reshape(3, M),
         'at rest',
         'order',
-        'each muscle stand together',
+        'each muscle are adjacent',
     ),
     'l in mm': (scaled(1000, 1, 1), 'at rest', 'unit', 'lengths look like mm'),
     'l in mm, moved': (scaled(1000, 1, 1), 'moved', 'unit', 'lengths look like mm'),
@@ -116,14 +116,14 @@ HEARD = {
     'T in kgf': (scaled(1, 1 / 9.81, 1), 'at rest', 'unit', 'tensions look like kgf'),
     'T in kN, moved': (scaled(1, 1e-3, 1), 'moved', 'unit', 'tensions look like kN'),
     'sign of every T': (scaled(1, -1, 1), 'at rest', 'sign', 'has the wrong sign'),
-    'sign of one T': (minus_tension, 'at rest', 'unit', 'does pull count as +'),
-    'zero of one T off by -35 N': (less_tension, 'at rest', 'law', 'with the wire off'),
+    'sign of one T': (minus_tension, 'at rest', 'unit', 'tension is positive'),
+    'zero of one T off by -35 N': (less_tension, 'at rest', 'law', 'with the tendon detached'),
     'tenths of °C': (scaled(1, 1, 10), 'at rest', 'unit', 'temperatures look like tenths'),
     'temperatures in K': (lambda rows: rows + [[0], [0], [273.15]], 'at rest', 'unit', 'like K'),
     'sign of every l': (flipped, 'moved', 'sign', 'must fall when the motor winds in'),
     'sign of one l': (lambda rows: flipped(rows, [BICEPS]), 'moved', 'sign', 'biceps_long'),
     'two muscles exchanged': (exchanged, 'moved', 'order', 'behaves like deltoid_posterior'),
-    'zero of one l off by 80 mm': (shifted, 'at rest', 'zero', 'subtract this'),
+    'zero of one l off by 80 mm': (shifted, 'at rest', 'zero', 'subtract the offset'),
     'the same, moved': (shifted, 'moved', 'zero', 'biceps_long'),
     'NaN tension': (with_nan, 'at rest', 'rate', 'not finite'),
     'two rows': (lambda rows: rows[:2], 'at rest', 'order', '3×M values'),
@@ -132,7 +132,7 @@ HEARD = {
 
 ANGLES = {
     'degrees': (np.degrees, 'unit', 'look like degrees'),
-    'sign of one': (lambda theta: theta * [1.0, -1.0], 'sign', 'the angle of elbow is turned'),
+    'sign of one': (lambda theta: theta * [1.0, -1.0], 'sign', 'the angle of elbow is reversed'),
     'sign of all': (lambda theta: -theta, 'sign', 'shoulder, elbow'),
     'exchanged': (lambda theta: theta[::-1], 'order', 'shoulder, elbow are exchanged'),
 }
@@ -253,7 +253,7 @@ def test_messages_that_are_lost_on_the_way_are_no_fault_of_the_driver():
     messages.bring(300, lambda n: 1000.0 + 0.01 * n, lambda n: 0.01 * n, lost)
     verdict = messages.listening.verdict(3.0)
     assert not verdict.faults, str(verdict)
-    assert '80 of 300 messages were lost on the way' in str(verdict)
+    assert '80 of 300 messages were lost in transit' in str(verdict)
 
 
 @pytest.mark.parametrize('is_busy', [True, False])
@@ -265,7 +265,9 @@ def test_a_gap_in_which_this_computer_did_not_run_is_told_apart(is_busy):
         messages.listening.pause(1.05, 1.55)
     verdict = messages.listening.verdict(3.6)
     assert verdict.wrong == (set() if is_busy else {'rate'}), str(verdict)
-    assert ('this computer is busy' if is_busy else 'nothing came for 0.61 s') in str(verdict)
+    assert ('this computer is busy' if is_busy else 'no message was received for 0.61 s') in str(
+        verdict
+    )
 
 
 def test_a_driver_that_falls_silent_is_found():
@@ -275,7 +277,7 @@ def test_a_driver_that_falls_silent_is_found():
         for _, rows in driver.step():
             listening.muscles(array(rows), driver.now)
     assert not listening.verdict(driver.now).faults
-    assert 'nothing came for 8.00 s' in str(listening.verdict(driver.now + 8.0))
+    assert 'no message was received for 8.00 s' in str(listening.verdict(driver.now + 8.0))
 
 
 @pytest.mark.parametrize('share', [0.1, 0.3])
@@ -351,8 +353,8 @@ WOUND = {
         'sign',
         'a longer l_target winds it in',
     ),
-    'sign of l': ({'publish': flipped}, 'sign', 'turn the sign of l round'),
-    'sign of the command': ({'take': lambda t: -t}, 'sign', 'turn the sign of the command'),
+    'sign of l': ({'publish': flipped}, 'sign', 'reverse the sign of l'),
+    'sign of the command': ({'take': lambda t: -t}, 'sign', 'reverse the sign of the command'),
     'T of two muscles exchanged': (
         {'publish': with_tensions},
         'order',
@@ -360,13 +362,13 @@ WOUND = {
     ),
     'commands counted from another zero': ({'take': lambda t: t + 0.03}, 'zero', 'same zero'),
     'half the stiffness': ({'in_tension': law(stiffness=K / 2)}, 'law', f'K {K:g} N/m'),
-    'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law asks for'),
+    'no bias': ({'in_tension': law(bias=0.0)}, 'law', 'law demands'),
     'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),
-    'command read as mm': ({'take': lambda t: t / 1000.0}, 'law', 'command in m'),
+    'command read as mm': ({'take': lambda t: t / 1000.0}, 'law', 'command is in m'),
     'dead motor': ({'take': only_first}, 'law', 'does not respond'),
     'late': ({'late': 0.15}, 'latency', 'from command to the first change'),
-    'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'is T in N'),
-    'rows 2 and 3 exchanged': ({'publish': rows_in([0, 2, 1])}, 'order', 'row 3 does'),
+    'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'check the unit of T'),
+    'rows 2 and 3 exchanged': ({'publish': rows_in([0, 2, 1])}, 'order', 'row 3 responds'),
 }
 
 
@@ -444,9 +446,9 @@ def test_a_sound_driver_is_found_sound_above_the_tension_limit():
 @pytest.mark.parametrize(
     ('robot', 'highest', 'reported'),
     [
-        (ROBOT, 35.0, 'is asked for 50 N at least to be judged, not 35 N'),
-        (with_tension(35.0, 45.0), None, 'its tension.max is 45 N: it is not wound'),
-        (with_tension(35.0, 45.0), 60.0, 'its tension.max is 45 N: it is not wound'),
+        (ROBOT, 35.0, 'needs at least 50 N, not 35 N'),
+        (with_tension(35.0, 45.0), None, 'tension.max is 45 N; this muscle cannot be checked'),
+        (with_tension(35.0, 45.0), 60.0, 'tension.max is 45 N; this muscle cannot be checked'),
     ],
 )
 def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, reported):

@@ -58,7 +58,7 @@ def test_unwritable_output_exits_with_1_before_training(tmp_path, capsys):
     assert main(['--robot', 'arm26', '--out', '/proc/x']) == 1
     reported = capsys.readouterr().err
     assert reported.count('\n') == 4
-    assert reported.count('choose another place') == 2
+    assert reported.count('choose another file') == 2
 
 
 def test_a_checkpoint_is_written_before_anything_is_printed_of_it(tmp_path, monkeypatch):
