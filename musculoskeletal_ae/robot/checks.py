@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether an arm can be held by its muscles: what `check_robot` measures and judges.
+"""Check whether the muscles of an arm can hold it (`check_robot`).
 
 In postures drawn uniformly in the joint limits, the tension nearest to 0.3 T_limit within [bias,
 limit] that holds the arm's own weight; the joint stiffness under muscle stiffness control at that
@@ -65,18 +65,18 @@ FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
 
 
 class Finding(NamedTuple):
-    """Something about a robot that a person should know, and what to do about it."""
+    """A fault or warning about a robot, with its remedy."""
 
     kind: str  # one word, such as 'wrong_sign'
     message: str  # names muscles and joints
-    remedy: str = ''  # of 'not_held' and 'not_stiff': what `remedies` measures
-    joint: int = -1  # of 'not_held' and 'not_stiff': the joint that most often is the weakest
+    remedy: str = ''  # '' for 'not_held' and 'not_stiff', whose remedies `remedies` finds
+    joint: int = -1  # for 'not_held' and 'not_stiff': the joint that is the weakest most often
 
 
 class Setting(NamedTuple):
-    """A robot in N postures, and what its holding and stiffness follow from.
+    """A robot in N postures, with the quantities that determine holding and stiffness.
 
-    All but θ is as if a pinion turned what slides.
+    All quantities but θ treat a prismatic joint as if a pinion of radius RACK moved it.
     """
 
     robot: Robot
@@ -87,7 +87,7 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
-        """Return a robot in postures (N, D)."""
+        """Return the setting of a robot in postures θ (N, D)."""
         jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
         hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
         torque = radian * robot.kinematics.holding_torque(theta)
@@ -96,7 +96,7 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """What was measured in N postures, and what is wrong."""
+    """Results of the check in N postures."""
 
     setting: Setting
     moment_arms: Array  # r [m], (N, M, D)
@@ -104,10 +104,10 @@ class RobotCheck:
     missing_torque: Array  # torque lacking where a posture is not held [N·m], (N, D)
     stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
     one_sided: Array  # the same with muscles at the bias tension slack, (N,)
-    required: float  # what that has to be [N·m/rad]
-    matters: Array  # from where on moment arms at each joint matter [m], (D,)
+    required: float  # required stiffness [N·m/rad]
+    matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
     faults: tuple[Finding, ...]  # why the arm is not sound; empty if it is
-    warnings: tuple[Finding, ...]  # what deserves a look but is not judged
+    warnings: tuple[Finding, ...]  # questionable points that do not make the arm unsound
 
     @property
     def held(self) -> Bools:
@@ -121,7 +121,12 @@ class RobotCheck:
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
-    """Measure and judge a robot in so many postures, drawn with a random seed.
+    """Check a robot in random postures.
+
+    Args:
+        robot: The robot.
+        postures: Number of postures.
+        seed: Random seed of the postures.
 
     Raises:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
@@ -140,7 +145,7 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 
 
 def judge(setting: Setting) -> RobotCheck:
-    """Measure and judge the muscles of a robot in given postures; errors as for `check_robot`."""
+    """Check the muscles of a robot in the postures of a setting; errors as for `check_robot`."""
     robot, theta, jacobian, hessian, torque = setting
     bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)

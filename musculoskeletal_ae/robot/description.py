@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot description: a directory with `robot.urdf` and `muscles.yaml`, read and checked.
+"""Read and check a robot description: a directory with `robot.urdf` and `muscles.yaml`.
 
-Everything that can be wrong in the two files is refused here, with the file, the entry and the
-legal values in the message, so that no later code needs to check again.
+All faults of the two files are detected here, with the file, the entry and the legal values in the
+message. Later code relies on this.
 """
 
 import math
@@ -35,49 +35,49 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
 from musculoskeletal_ae.schema import Strict, convert
 
-#: makes the error of what is wrong in muscles.yaml
+#: returns the error for a problem in muscles.yaml
 Fail = Callable[[str], RobotDescriptionError]
 
-#: what URDF calls joints that are neither revolute nor prismatic, by their degrees of freedom
+#: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
 
 
 class RoutePoint(NamedTuple):
-    """A point that the wire passes."""
+    """A via point of the tendon."""
 
     link: str
     xyz: Array  # in the link's frame [m], (3,)
-    divisor: float | None = None  # another branch begins here; its length counts 1/divisor
+    divisor: float | None = None  # if set, a branch begins here, whose length counts 1/divisor
 
 
 class Wrap(NamedTuple):
-    """What the wire may wrap round between two points; vectors in the link's frame, (3,)."""
+    """A body around which the tendon wraps between two points; vectors in the link's frame."""
 
     link: str
     xyz: Array  # centre [m]
     radius: float  # [m]
     axis: Array | None  # unit vector of a cylinder; None: a sphere
-    side: Array | None  # a point on the side that the wire takes [m]; inside: a ring
-    side_link: str | None = None  # link that carries this point; None: the one of the wrap
+    side: Array | None  # a point on the side that the tendon takes [m]; inside: a ring
+    side_link: str | None = None  # link of `side`; None: the link of the wrap
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:
-    """Return an item of a route as muscles.yaml has it."""
-    given = {key: value for key, value in item._asdict().items() if value is not None}
-    given = {k: v if isinstance(v, str) else np.round(v, 10).tolist() for k, v in given.items()}
+    """Return an item of a route in the format of muscles.yaml."""
+    entry = {key: value for key, value in item._asdict().items() if value is not None}
+    entry = {k: v if isinstance(v, str) else np.round(v, 10).tolist() for k, v in entry.items()}
     if isinstance(item, Wrap):
-        given = {'wrap': 'sphere' if item.axis is None else 'cylinder', **given}
-    return given
+        entry = {'wrap': 'sphere' if item.axis is None else 'cylinder', **entry}
+    return entry
 
 
-#: points, joined by straight lines or round a wrap that stands between two of them
+#: points, connected by straight lines or around the wrap between them
 Route = tuple[RoutePoint | Wrap, ...]
 
 
 def branches(route: Route) -> list[Route]:
-    """Return the branches of a route: parts that no line joins. Most routes have one."""
+    """Return the branches of a route, which are not connected. Most routes have only one."""
     starts = [i for i, item in enumerate(route) if isinstance(item, RoutePoint) and item.divisor]
     ends = sorted({0, *starts, len(route)})
     return [route[start:end] for start, end in pairwise(ends)]
@@ -87,20 +87,20 @@ def branches(route: Route) -> list[Route]:
 class TensionRange:
     """Muscle tensions [N], each of shape (M,)."""
 
-    bias: Array  # what MSC keeps
-    limit: Array  # the highest planned
-    max: Array  # the highest ever
+    bias: Array  # T_bias, which MSC maintains
+    limit: Array  # T_limit, the highest planned tension
+    max: Array  # T_max, the highest permitted tension
 
 
 def shown(values: Array) -> str:
-    """Return the one value of all muscles, or the span of their values."""
+    """Return the common value of all muscles, or the range of their values."""
     low, high = np.min(values), np.max(values)
     return f'{low:g}' if low == high else f'{low:g}–{high:g}'
 
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """What the two files of a robot directory say, checked."""
+    """The checked content of a robot directory."""
 
     directory: Path
     urdf: str
@@ -111,24 +111,24 @@ class RobotDescription:
     series_elastic: SeriesElastic
     stiffness: Array  # K_stiff of muscle stiffness control [N/m], (M,)
     tension: TensionRange
-    end_effectors: tuple[str, ...]  # the first grasps, is pushed and carries the marker
+    end_effectors: tuple[str, ...]  # links; `end_effector` is the first
     couplings: dict[str, Coupling]  # of joints that follow others
-    warnings: tuple[str, ...]  # what was accepted, but deserves a look
+    warnings: tuple[str, ...]  # accepted, but questionable entries
 
     @property
     def end_effector(self) -> str:
-        """The link that grasps, is pushed and carries the marker."""
+        """The link for poses, external wrenches and the marker."""
         return self.end_effectors[0]
 
     @property
     def held_joints(self) -> tuple[str, ...]:
-        """Movable joints of the URDF that are in neither θ nor a coupling: held fixed."""
+        """Movable joints of the URDF that are held fixed, being neither in θ nor coupled."""
         known = {*self.couplings, *self.joints}
         return tuple(name for name in self.model.names[1:] if name not in known)
 
     @property
     def joint_notes(self) -> list[str]:
-        """Lines that name the joints which are not in θ: coupled ones, and those held fixed."""
+        """Lines that name the coupled joints and those held fixed."""
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
@@ -136,16 +136,16 @@ class RobotDescription:
 
 
 def refusal(file: Path, problem: str) -> RobotDescriptionError:
-    """Return the error that says why a file of a robot directory cannot be read."""
-    remedy = 'a robot directory holds robot.urdf and muscles.yaml'
+    """Return the error for a file of a robot directory that cannot be read."""
+    remedy = 'a robot directory contains robot.urdf and muscles.yaml'
     return RobotDescriptionError(f'{file}: {problem}; {remedy}')
 
 
 def load_description(robot: str | Path) -> RobotDescription:
-    """Read and check a robot description, by a shipped name such as 'arm26' or a directory.
+    """Read and check a robot description: a shipped name such as 'arm26', or a directory.
 
     Raises:
-        RobotDescriptionError: Naming the file, the entry and the legal values.
+        RobotDescriptionError: If it is invalid; names the file, the entry and the legal values.
     """
     directory = find_robot(robot)
     urdf_file, muscle_file = directory / 'robot.urdf', directory / 'muscles.yaml'
@@ -189,7 +189,7 @@ def load_description(robot: str | Path) -> RobotDescription:
 
 
 def _with_muscle_name(problem: str, document: Any) -> str:
-    """Return a problem with the name of the muscle behind the index, where it has both."""
+    """Return a problem with the name of its muscle added, if it concerns a muscle with a name."""
     match = re.match(r'\$\.muscles\[(\d+)\]', problem)
     muscle = document['muscles'][int(match[1])] if match else None
     name = muscle.get('name') if isinstance(muscle, dict) else None
@@ -197,7 +197,7 @@ def _with_muscle_name(problem: str, document: Any) -> str:
 
 
 def _entries(entry: Strict | None) -> dict[str, float]:
-    """Return what an entry of the file sets; keys that were left out are left out."""
+    """Return the values that an entry of the file sets, without omitted keys."""
     entries: dict[str, float] = {} if entry is None else to_builtins(entry)
     return entries
 
@@ -207,7 +207,7 @@ def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
 
 
 def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None:
-    """Refuse joints that cannot be in θ."""
+    """Raise an error for joints that cannot be in θ."""
     for i, name in enumerate(joints):
         if problem := _joint_problem(name, model):
             raise fail(f'$.joints[{i}]: {problem}')
@@ -216,12 +216,12 @@ def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None
         lower, upper = (limit[index] for limit in limits)
         if not -math.inf < lower < upper < math.inf:
             least, most = distinct(lower, upper)
-            found = f'joint {name!r} has limits [{least}, {most}] in robot.urdf'
-            raise fail(f'$.joints[{i}]: {found}; expected finite lower < upper')
+            limits_text = f'joint {name!r} has limits [{least}, {most}] in robot.urdf'
+            raise fail(f'$.joints[{i}]: {limits_text}; expected finite lower < upper')
 
 
 def _joint_problem(name: str, model: pin.Model) -> str:
-    """Return why a joint can neither be in θ nor follow one that is, or '' if it can."""
+    """Return why a joint can neither be in θ nor be coupled to a joint in θ, or ''."""
     movable = list(model.names)[1:]
     if name not in movable:
         return f'unknown joint {name!r}; movable joints of robot.urdf: {", ".join(movable)}'
@@ -236,7 +236,7 @@ def _joint_problem(name: str, model: pin.Model) -> str:
 def _read_couplings(
     content: MuscleFile, mimics: dict[str, Coupling], model: pin.Model, urdf: Path, fail: Fail
 ) -> dict[str, Coupling]:
-    """Return what each coupled joint follows, a joint that follows none itself."""
+    """Return the coupling of each coupled joint to a joint that follows no other."""
     listed = {
         c.joint: Coupling.of_terms(c.master, c.polynomial or (c.offset, c.ratio))
         for c in content.couplings
@@ -268,7 +268,7 @@ def _read_couplings(
         )
         if slave in listed or not is_elsewhere:
             raise refused(slave, problem)
-        del couplings[slave]  # such as wheels; like all joints that are not listed it is held fixed
+        del couplings[slave]  # a wheel, for example; like all unlisted joints, it is held fixed
     return couplings
 
 
@@ -278,15 +278,15 @@ def _read_tension(
     tension = default | _entries(entry)
     bias, limit, most = (tension[key] for key in ('bias', 'limit', 'max'))
     if not bias < limit <= most:
-        told = ', '.join(f'{value:.17g}' for value in (bias, limit, most))
-        raise fail(f'{place}: expected bias < limit <= max, got {told}')
+        values = ', '.join(f'{value:.17g}' for value in (bias, limit, most))
+        raise fail(f'{place}: expected bias < limit <= max, got {values}')
     return tension
 
 
 def _read_route(
     place: str, muscle: MuscleEntry, links: list[str], fail: Fail, warnings: list[str]
 ) -> Route:
-    """Return the route of a muscle, without points that repeat the one before."""
+    """Return the route of a muscle without repeated points."""
     route: list[RoutePoint | Wrap] = []
     for i, entry in enumerate(muscle.route):
         _check_link(f'{place}[{i}].link', entry.link, links, fail)
@@ -334,7 +334,7 @@ def _read_end_effectors(
     order: list[str],
     fail: Fail,
 ) -> tuple[str, ...]:
-    """Return the end effectors that muscles.yaml names; by default the last link of the chain."""
+    """Return the end effectors in muscles.yaml, by default the last link of the chain."""
     links = _joints_above(model, {*content.joints})
     moved = _joints_above(model, {*content.joints, *couplings})
     places = {f'$.end_effectors[{i}]': n for i, n in enumerate(content.end_effectors or ())}
@@ -347,14 +347,14 @@ def _read_end_effectors(
             raise fail(f'{place}: expected a link that the joints move, {legal}; got {name!r}')
     if places:
         return tuple(places.values())
-    # Of several links that so many joints move: the tip of what is fixed to them, then the one
-    # listed last, in the order of the file.
+    # The link that most joints move; among several, the one after most fixed joints, and then the
+    # one listed last in the file.
     tips, last = _fixed_above(model), {link: i for i, link in enumerate(order)}
     return (max(links, key=lambda link: (links[link], tips[link], last[link])),)
 
 
 def _fixed_above(model: pin.Model) -> dict[str, int]:
-    """Return how many fixed joints are between each link and the joint that moves it."""
+    """Return the number of fixed joints between each link and the joint that moves it."""
     counts = dict[str, int]()
     for link in body_frames(model):
         counts[str(link.name)], above = 0, link.parentFrame

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where robot directories are: those that come with the package by name, others by path.
+"""Find robot directories: shipped ones by name, others by path.
 
-Imports nothing heavy: the help of a command lists the robots.
+This module imports nothing heavy, because the help of a command lists the robots.
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 
 
 def shipped_robots() -> dict[str, Path]:
-    """Return the directories of the robots that come with the package, by name."""
+    """Return the directories of the shipped robots by name."""
     here = Path(__file__).resolve()
     roots = [here.parents[2] / 'config']
     # Installed by colcon: <prefix>/lib/pythonX.Y/site-packages/musculoskeletal_ae/robot/…
@@ -23,10 +23,10 @@ def shipped_robots() -> dict[str, Path]:
 
 
 def find_robot(robot: str | Path) -> Path:
-    """Return the directory of a shipped robot's name or of a path.
+    """Return the directory of a robot, named by a shipped name or a path.
 
     Raises:
-        RobotDescriptionError: If there is neither.
+        RobotDescriptionError: If it is neither.
     """
     shipped = shipped_robots()
     if str(robot) in shipped:
@@ -35,10 +35,10 @@ def find_robot(robot: str | Path) -> Path:
         directory = Path(robot).expanduser()
         if str(robot) and directory.is_dir():
             return directory.resolve()
-    except (RuntimeError, ValueError, OSError):  # no such home, a NUL or a name too long in it
+    except (RuntimeError, ValueError, OSError):  # unknown home directory, NUL or too long a name
         pass
     raise RobotDescriptionError(
         f'robot {str(robot)!r} is neither a directory nor a shipped robot '
-        f'({", ".join(sorted(shipped))}); give one of these names, or a directory with '
+        f'({", ".join(sorted(shipped))}); use one of these names, or a directory with '
         'robot.urdf and muscles.yaml'
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm looks like: bones and muscles as lines, and a picture of them without a display.
+"""Draw an arm: bones and muscles as lines, and pictures of them without a display.
 
 A muscle is green at T_bias and turns red towards T_limit (paper, §IV-D).
 """
@@ -14,11 +14,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.options import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
-# Shorter bones are two joints in one place.
-SHORTEST_BONE = 1e-3  # [m]
+SHORTEST_BONE = 1e-3  # [m]; shorter ones connect two joints in the same place
 BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
 BONE_COLOUR = (0.8, 0.8, 0.75)
-BALL = 1.7  # of a line's width
+BALL = 1.7  # diameter of a ball divided by the width of its line
 
 
 class Line(NamedTuple):
@@ -28,22 +27,27 @@ class Line(NamedTuple):
     points: Array  # [m], (N, 3)
     width: float  # [m]
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
-    name: str = ''  # of the muscle; further branches of its tendon have none
+    name: str = ''  # of the muscle; only the first branch of its tendon has it
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:
-    """Return how far T [N] (M,) is on the way from T_bias to T_limit, within [0, 1]; NaN: 0."""
+    """Return (T − T_bias) / (T_limit − T_bias) of T [N] (M,), within [0, 1]; 0 for NaN."""
     limits = robot.tension
     known = np.nan_to_num(tension)
     return np.clip((known - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
 
 
 def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = None) -> list[Line]:
-    """Return the bones of an arm, then its muscles in their order, at θ [rad] (D,) and T [N] (M,).
+    """Return the lines of an arm: its bones, then its muscles in order.
 
-    A muscle is one line, or one for each branch of its tendon.
+    Args:
+        robot: The geometric model.
+        theta: θ [rad], (D,).
+        tension: T [N], (M,), which determines the colours.
+        points: Route points [m], (P, 3); None: those of the geometric model.
 
-    Route points [m] (P, 3) are those of the geometric model by default.
+    Returns:
+        One line for each bone and for each branch of a tendon.
     """
     kin = robot.kinematics
     origins = kin.tree.joint_poses(theta[None]).translation[0]
@@ -66,7 +70,7 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
 
 def _within(line: Line, middle: Array, reach: float) -> Line:
-    """Return a line from where it enters a cube to where it leaves it."""
+    """Return the part of a bone inside a cube; other lines are returned unchanged."""
     if line.kind != 'bones':
         return line
     start, end = line.points[[0, -1]]
@@ -76,12 +80,16 @@ def _within(line: Line, middle: Array, reach: float) -> Line:
 
 
 def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool = True) -> None:
-    """Draw lines from the front and from the side, in true proportions, and save a picture.
+    """Draw lines in true proportions, from the front and from the side, and save the picture.
 
-    Or what of them is where the muscles are.
+    Args:
+        lines: The lines.
+        path: The file of the picture.
+        title: Title of the picture; '' for the default.
+        whole: Whether to show all lines; if false, show the region of the muscles only.
 
     Raises:
-        MusculoskeletalError: If it cannot be written.
+        MusculoskeletalError: If the file cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -95,7 +103,7 @@ def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool
         axes: Any = figure.add_subplot(1, 2, i + 1, projection='3d', proj_type='ortho')
         for line in lines:
             width = 400.0 * line.width
-            # Balls where bones meet, and where a muscle's route is held.
+            # Balls mark joints and via points.
             axes.plot(*line.points.T, color=line.colour, lw=width, ms=BALL * width, **balls)
         axes.set(title=name, xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')
         axes.set(**{f'{x}lim': (m - reach, m + reach) for x, m in zip('xyz', middle)})

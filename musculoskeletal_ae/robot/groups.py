@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of joints and muscles: the limbs of a body, found from its routes."""
+"""Groups of joints and muscles, such as the limbs of a body, derived from its routes."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from musculoskeletal_ae.arrays import Bools, Ints
 
 
 class Group(NamedTuple):
-    """Joints and muscles that share nothing with the others, as those of one limb."""
+    """Joints and muscles, such as those of a limb, that are independent of all others."""
 
-    joints: tuple[int, ...]  # places in θ
-    muscles: tuple[int, ...]  # places in T and l
+    joints: tuple[int, ...]  # indices in θ
+    muscles: tuple[int, ...]  # indices in T and l
 
     @classmethod
     def whole(cls, joints: int, muscles: int) -> Group:
-        """Return a group of D joints and M muscles."""
+        """Return the group of all D joints and M muscles of a body."""
         return cls(tuple(range(joints)), tuple(range(muscles)))
 
     def columns(self, joints: int, muscles: int) -> Ints:
-        """Return the places in (θ, T, l) of a body of D joints and M muscles."""
+        """Return the indices of the group in (θ, T, l) of a body with D joints and M muscles."""
         own = joints + np.array(self.muscles)
         return np.concatenate([self.joints, own, muscles + own])
 
 
 def groups(crossed: Bools) -> tuple[Group, ...]:
-    """Return the connected components of muscles and the joints that they cross (M, D).
+    """Return the connected components of muscles and the joints that they cross, (M, D).
 
-    What is connected to nothing goes with the first joint, or with the first muscle.
+    A muscle that crosses no joint joins the first joint; a joint without muscles joins the first
+    group.
     """
     of_joint = np.arange(crossed.shape[1])
     for own in crossed[crossed.any(axis=1)]:

@@ -18,17 +18,17 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-# How far the pose of a usual camera's marker can be trusted: σ_p [m], σ_R [rad].
+# Standard deviations of a marker's pose from a typical camera: σ_p [m], σ_R [rad].
 SPREADS = np.repeat([0.002, 0.01], 3)
-POSITION_ONLY = np.repeat([0.002, 100.0], 3)  # however the hand is turned
+POSITION_ONLY = np.repeat([0.002, 100.0], 3)  # for any orientation
 ITERATIONS = 30
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6  # shares of JᵀJ
-STEP_SPREAD = 0.1  # [rad] of a joint of which the pose says nothing: damping of any step
-LEAST_GAIN = 1.0  # of the sum above
+STEP_SPREAD = 0.1  # [rad] σ that damps every step, for joints that the pose does not determine
+LEAST_GAIN = 1.0  # lowest decrease of the sum above; a smaller one ends the search
 
 
 class Posture(NamedTuple):
-    """A solution, and what it leaves of the position and of the orientation."""
+    """A solution, with its errors of position and orientation."""
 
     theta: Array  # θ [rad], (D,)
     distance: float  # [m]
@@ -41,15 +41,18 @@ def inverse_kinematics(
 ) -> Posture:
     """Return the joint angles that bring the end effector nearest to a pose.
 
-    The pose is in the root link's frame and known to `spreads`, (6,) σ_p [m] and σ_R [rad]; the
-    search starts at the estimate θ_est [rad] (D,).
+    Args:
+        robot: The geometric model.
+        pose: The pose in the root link's frame.
+        start: θ_est [rad] (D,), at which the search starts.
+        spreads: Standard deviations of the pose, σ_p [m] and σ_R [rad], (6,).
     """
     kin, lower, upper = robot.kinematics, robot.lower, robot.upper
     theta, damping = np.clip(start, lower, upper), 1e-2
     error = _error(robot, pose, theta, spreads)
     for _ in range(ITERATIONS):
         jacobian = kin.end_effector_jacobian(theta) / spreads[:, None]
-        # At a limit, a joint that wants to go beyond is held.
+        # Hold a joint at its limit if the step would exceed it.
         gradient = jacobian.T @ error
         held = (theta <= lower) & (gradient < 0.0) | (theta >= upper) & (gradient > 0.0)
         jacobian[:, held] = 0.0
@@ -73,7 +76,7 @@ def inverse_kinematics(
 
 
 def _error(robot: Robot, pose: pin.SE3, theta: Array, spreads: Array) -> Array:
-    """Return what is missing in position and orientation, weighted, (6,)."""
+    """Return the weighted error of position and orientation, (6,)."""
     here = robot.kinematics.end_effector_pose(theta)
     turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
     missing: Array = np.concatenate([pose.translation - here.translation, turn]) / spreads

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wires whose length jumps where the arm moves smoothly.
+"""Find tendons whose length jumps while the arm moves smoothly.
 
-A wire with a `side` that comes to lie beyond the end of what it wraps round slips to the other
-side of it, as MuJoCo's do: at once, and by centimetres. No network restores such a length.
+A tendon with a `side` can pass the end of the body that it wraps around. It then slips to the other
+side at once, as in MuJoCo, and its length jumps by centimetres. No network restores such a length.
 """
 
 from collections.abc import Callable
@@ -12,8 +12,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.robot import Robot
 
-LINES, STEPS = 60, 400  # between postures, that lengths are followed along
-JUMP = 0.001  # [m] within such a step: lengths that change smoothly bend by a hundredth of that
+LINES, STEPS = 60, 400  # lines between random postures, and steps along each
+JUMP = 0.001  # [m] second difference per step; that of smooth lengths is a hundred times smaller
 LEAST_RANGE = 0.3  # share of a joint's range that a limit against jumps has to keep
 RANGE_MARGIN = 0.03  # share of the range between such a limit and the jumps
 REDRAWN = 50  # times that a jumping wire's points are drawn again for an individual, at most

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid bodies of the arm, by pinocchio, in the order of θ that muscles.yaml gives.
+"""Rigid-body kinematics and dynamics of the arm by pinocchio, in the order of θ of muscles.yaml.
 
 Pinocchio reads the URDF and answers for single postures: poses of links, gravity, inertia,
 Jacobians. Training, learning and the view ask for the poses of thousands of postures at once; those
@@ -21,7 +21,7 @@ RACK = 0.06
 
 
 class Units(NamedTuple):
-    """In what one joint's θ, torque and stiffness are."""
+    """Units of a joint's θ, torque and stiffness."""
 
     theta: str
     torque: str

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What helps an arm that is not held or not stiff: a change is measured before it is named.
+"""Find remedies for an arm that is not holdable or not stiff, by testing each of them.
 
-The check's postures are held anew with other numbers in muscles.yaml, less mass, longer moment arms
-or narrower limits. Named is what suffices alone, in the least step that does; else what helps, and
-a combination: from all of it together, each change in turn, the costliest first, is set to what
-serves best, and then to the least that does as well.
+The postures of the check are evaluated again with other values in muscles.yaml, less mass, longer
+moment arms or narrower limits. If a change suffices alone, its smallest sufficient step is
+suggested. Otherwise all changes that help are suggested, and a combination. The search for the
+combination starts from all changes together. It sets each change in turn, the costliest first, to
+its best step, and then to the smallest step that is as good.
 """
 
 from copy import copy
@@ -19,8 +20,8 @@ from musculoskeletal_ae.robot import checks
 from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
 from musculoskeletal_ae.robot.description import shown
 
-HELPS = 0.01  # of the postures; a change that wins less is not named
-#: what is multiplied by which factors, the least change first; the costliest first
+HELPS = 0.01  # share of postures that a change must gain to be suggested
+#: changes, the costliest first, with their factors, the smallest change first
 TRIED = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),
@@ -34,7 +35,7 @@ TRIED = {
 
 
 def remedies(check: RobotCheck, fault: Finding) -> list[str]:
-    """Return what raises the share of postures that a 'not_held' or 'not_stiff' fault is about."""
+    """Return remedies for a 'not_held' or 'not_stiff' fault, which raise its share of postures."""
     kind = fault.kind.removeprefix('not_')
 
     @cache
@@ -77,7 +78,7 @@ def rounded(values: Array) -> Array:
 
 
 def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:
-    """Multiply something about an arm, or about one of its joints; say what it then is."""
+    """Apply a change by a factor to an arm or to one joint; return the result and its text."""
     robot = copy(setting.robot)
     if what == 'mass':
         text = f'links at {100 * factor:g} % of their mass'
@@ -101,7 +102,7 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'
     owner, _, part = what.rpartition('.')
     of: Any = getattr(robot, owner) if owner else robot
-    # What is measured is the number that a person would write into the file.
+    # Round to the number that a user would write into the file.
     values = rounded(factor * getattr(of, part))
     vars(robot).update({owner: replace(of, **{part: values})} if owner else {part: values})
     more = ' (and max)' if part == 'limit' and (values > robot.tension.max).any() else ''

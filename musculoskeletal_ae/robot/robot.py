@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tendon-driven robot as its description gives it: the nominal body."""
+"""The geometric model of a tendon-driven robot, built from its description."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Robot:
         self.joint_count, self.muscle_count = len(self.joints), len(self.muscles)
         self.series_elastic = description.series_elastic
         self.tension = description.tension
-        self.isolated: tuple[int, ...] = ()  # muscles that are not used, places in T and l
-        self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # all others, (M,)
+        self.isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
+        self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # which are not isolated, (M,)
         self.stiffness = description.stiffness
-        #: the URDF's, in whose frame poses and markers are given
+        #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
             description.model, self.joints, description.end_effector, description.couplings
@@ -45,11 +45,11 @@ class Robot:
 
     @classmethod
     def load(cls, robot: str | Path) -> Robot:
-        """Read a shipped robot's name or a directory; see `load_description` for errors."""
+        """Load a shipped robot by name, or a robot directory; see `load_description` for errors."""
         return cls(load_description(robot))
 
     def limb(self, joints: Ints, muscles: Ints) -> Robot:
-        """Return the robot of one group's joints and muscles; the other joints stand at zero."""
+        """Return the robot with one group's joints and muscles; other joints are fixed at zero."""
         whole = self.description
         elastic, tension = (
             [values[muscles] for values in vars(part).values()]
@@ -67,12 +67,17 @@ class Robot:
         return Robot(description)
 
     def demanded(self, length: Array, command: Array) -> Array:
-        """Return the T [N] (M,) that MSC demands at l under l_target [m] (M,), without T_max."""
+        """Return the tensions [N] (M,) that MSC demands, not limited to T_max.
+
+        Args:
+            length: l [m], (M,).
+            command: l_target [m], (M,).
+        """
         demand: Array = self.tension.bias + np.maximum(0.0, self.stiffness * (length - command))
         return demand
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
-        """Return where in T and l the named muscles stand.
+        """Return the indices of the named muscles in T and l.
 
         Raises:
             MusculoskeletalError: If a name is not one of this robot's muscles.
@@ -84,13 +89,13 @@ class Robot:
         return [self.muscles.index(name) for name in names]
 
     def names(self, muscles: Iterable[int]) -> str:
-        """Return the names of muscles, places in T and l, for people to read."""
+        """Return the names of muscles, indices in T and l, as text."""
         return ', '.join(self.muscles[m] for m in muscles)
 
     def without(self, muscles: Iterable[int]) -> Robot:
-        """Return this robot with exactly these muscles isolated: the tensions they may have are 0.
+        """Return a copy with exactly these muscles isolated, whose tension limits become 0.
 
-        The copy shares the geometry with the original, which stays as it is.
+        The copy shares the geometry with the original.
         """
         reduced, whole = copy.copy(self), self.description.tension
         reduced.isolated = tuple(sorted(muscles))
@@ -105,16 +110,18 @@ class Robot:
         return relative - self.series_elastic.elongation(absolute, tension)
 
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
-        """Return the most that weight and muscles at T_bias put on each joint [N·m], (D,).
+        """Return the highest load of weight and muscles at T_bias on each joint [N·m], (D,).
 
-        In N postures, of the torque that holds the weight [N·m] (N, D) and G (N, M, D).
+        Args:
+            torque: Torque that holds the weight in N postures [N·m], (N, D).
+            jacobian: G [m/rad], (N, M, D).
         """
         pulls = np.abs(jacobian) * self.tension.bias[:, None]
         load: Array = np.abs(torque).max(axis=0) + pulls.sum(axis=1).max(axis=0)
         return load
 
     def muscle_stiffness(self, theta: Array, tension: Array) -> Array:
-        """Return k(θ, T) [N/m] of MSC and the elastic unit in series, θ (..., D), T (..., M)."""
+        """Return k(θ, T) [N/m] of MSC and elastic element in series, θ (..., D), T (..., M)."""
         absolute = self.routes.absolute_lengths(theta)
         return muscle_stiffness(self.stiffness, self.series_elastic.compliance(absolute, tension))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Elongation of a muscle under tension: a nonlinear elastic unit plus the stretch of its wire.
+"""Elongation of a muscle under tension: series elastic element plus stretch of the tendon.
 
     L_e(l_abs, T) = ln(1 + T / force) / rate + wire_stretch · l_abs · T
 
@@ -19,17 +19,17 @@ DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}
 
 @dataclass(frozen=True)
 class SeriesElastic:
-    """Elastic constants of M muscles, each of shape (M,). A wire cannot push: T < 0 counts as 0."""
+    """Elastic constants of M muscles, each of shape (M,). A negative tension counts as 0."""
 
-    force: Array  # tension at which the elastic unit has stretched by ln 2 / rate [N]
-    rate: Array  # stiffening rate of the elastic unit [1/m]
-    wire_stretch: Array  # stretch of the wire per metre and newton [1/N]
+    force: Array  # tension at which the elastic element has stretched by ln 2 / rate [N]
+    rate: Array  # stiffening rate of the elastic element [1/m]
+    wire_stretch: Array  # stretch of the tendon per metre and newton [1/N]
 
     def elongation(self, absolute_length: Array, tension: Array) -> Array:
         """Return L_e(l_abs, T) [m]; l_abs [m] and T [N] of shape (..., M)."""
-        pull = np.maximum(tension, 0.0)
-        stretch = self.wire_stretch * absolute_length * pull
-        return np.log1p(pull / self.force) / self.rate + stretch
+        tension = np.maximum(tension, 0.0)
+        stretch = self.wire_stretch * absolute_length * tension
+        return np.log1p(tension / self.force) / self.rate + stretch
 
     def compliance(self, absolute_length: Array, tension: Array) -> Array:
         """Return ∂L_e/∂T [m/N], shape (..., M)."""

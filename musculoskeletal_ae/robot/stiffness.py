@@ -3,9 +3,9 @@
 
     K_θ = Gᵀ diag(k) G + Σ_i T_i ∂²l_i/∂θ²,    k = (1/K_stiff + ∂L_e/∂T)⁻¹
 
-`check_robot` takes G and L_e from the geometric model, control from the network. A muscle that MSC
-holds at T_bias gives way without resistance when it is shortened: counted as slack, its k is zero
-(the one-sided value). What a push meets is K_θ + ∂g/∂θ, since the arm's weight moves as well.
+`check_robot` takes G and L_e from the geometric model, the controller from the network. A muscle
+that MSC holds at T_bias does not resist shortening. The one-sided stiffness therefore counts it as
+slack, with k = 0. An external wrench meets K_θ + ∂g/∂θ, because the arm's weight moves as well.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from musculoskeletal_ae.arrays import Array
 
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:
-    """Return k [N/m] of MSC with K_stiff [N/m] and an elastic unit of ∂L_e/∂T [m/N] in series."""
+    """Return k [N/m] of MSC (K_stiff [N/m]) and elastic element (∂L_e/∂T [m/N]) in series."""
     return 1.0 / (1.0 / module + compliance)
 
 

@@ -18,24 +18,24 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot.robot import Robot
 
-# [N] left between the limits of a muscle that is held at one value (hot, ruptured): without any,
-# quadprog takes its own rounding for infeasibility.
+# [N] gap between the limits of a muscle that is fixed at one value (hot, ruptured). Without a gap,
+# rounding makes the problem infeasible for quadprog.
 ROOM = 1e-8
 SOFT_WEIGHT = 1e-7  # [N·m/N]², against torques of some N·m and tensions of some hundred N
 
 
 class Exertion(NamedTuple):
-    """Tensions and what they leave undone."""
+    """Tensions, and the torque that they do not produce."""
 
     tension: Array  # T [N], (M,)
     missing_torque: Array  # τ + Gᵀ T, the part of τ that T does not produce [N·m], (D,)
 
 
 class TensionProgramme:
-    """Quadratic programmes over the tensions that produce a torque within their limits.
+    """Quadratic programmes over the tensions within limits that produce a torque.
 
-    Every one raises an `InfeasibleError` if no tension within the limits produces the torque, or an
-    entry is not finite: quadprog would answer with zeros, as if all were well.
+    All of them raise an `InfeasibleError` if no such tension exists, or if an entry is not finite.
+    In the second case quadprog itself would return zeros without an error.
     """
 
     def __init__(
@@ -60,15 +60,15 @@ class TensionProgramme:
             return quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)[0]
         except ValueError as error:
             torque = ', '.join(f'{value:.2f}' for value in self._torque.tolist())
-            told = f'no tension within its limits produces the torque ({torque}) N·m'
-            raise InfeasibleError(told) from error
+            problem = f'no tension within its limits produces the torque ({torque}) N·m'
+            raise InfeasibleError(problem) from error
 
     def nearest(self, desired: Array | float) -> Array:
-        """Return the hard form: of all tensions the nearest to desired ones [N]."""
+        """Solve the hard form: return the tensions [N] (M,) nearest to the desired ones."""
         return self.minimum(self._eye, np.full(self._count, desired, dtype=float))
 
     def compromise(self) -> Exertion:
-        """Return the soft form: what comes nearest to the torque, and of that the least."""
+        """Solve the soft form: the lowest of the tensions that come nearest to the torque."""
         jacobian = self._jacobian
         quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * self._eye
         tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
@@ -94,11 +94,12 @@ def least_tension(
     high: Array | float,
     desired: Array | float = 0.0,
 ) -> Exertion:
-    """Return the least tensions that produce a torque, or else what comes nearest to it.
+    """Return the tensions of the hard form, or those of the soft form if it is infeasible.
 
-    Hard where it can be, and then the nearest to a desired T [N], (M,); soft where the limits do
-    not allow it. Arguments as for `TensionProgramme`; the error is raised only if an entry is not
-    finite.
+    The arguments are those of `TensionProgramme` and its `nearest`.
+
+    Raises:
+        InfeasibleError: If an entry is not finite.
     """
     programme = TensionProgramme(muscle_jacobian, torque, low, high)
     try:
@@ -109,7 +110,7 @@ def least_tension(
 
 @cache
 def _unit(count: int) -> tuple[Array, Array]:
-    """Return the unit matrix, and with its negative the normals of limits: never written to."""
+    """Return the unit matrix and the normals of the limits; callers must not change them."""
     eye = np.eye(count)
     return eye, np.hstack([eye, -eye])
 
