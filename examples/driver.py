@@ -3,7 +3,7 @@
 
     python my_driver.py --ros-args -p robot:=path/to/my_arm
 
-doc/howto/your_robot.md says what a driver must do and why; `check_driver` whether this one does.
+doc/howto/your_driver.md states the contract of a driver; `check_driver` checks it.
 """
 
 import sys

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An anomaly that was reported is over only when the estimator confirms that.
+"""Latches an anomaly until the estimator confirms that it has ended.
 
-The topic `anomaly_detected` latches an anomaly at once. That it is false there is a reason to ask:
-anybody could say so. The service `estimator/check_health` answers for the node that detected it.
+A true message on `anomaly_detected` latches an anomaly at once. A false one does not clear it,
+because any node could publish it. The latch then asks the estimator by `estimator/check_health`.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 SERVICE = 'estimator/check_health'
-ASK_PERIOD = 1.0  # [s] after which an estimator that has not answered is asked again
+ASK_PERIOD = 1.0  # [s] after which the request is repeated if the estimator has not answered
 
 
 class AnomalyLatch:
     """Follows `anomaly_detected` for one node."""
 
     def __init__(self, node: Node, follow: Callable[[bool], object]) -> None:
-        """Begin without an anomaly; `follow` is called with every confirmed change."""
+        """Begin without an anomaly; call `follow` with every confirmed change."""
         self._node, self._follow = node, follow
         self._is_latched = False
         self._client: Any = node.create_client(Trigger, SERVICE)
-        self._future: Any = None  # the answer that is awaited
+        self._future: Any = None  # of the pending request
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer: Any = node.create_timer(ASK_PERIOD, self._ask, clock=steady)
         self._timer.cancel()
 
     def take(self, detected: bool) -> None:
-        """Take a message of anomaly_detected."""
+        """Process a message of anomaly_detected."""
         if detected:
             self._give_up()
             if not self._is_latched:
@@ -43,7 +43,7 @@ class AnomalyLatch:
             self._ask()
 
     def _ask(self) -> None:
-        """Ask the estimator; it may have been started anew since the last time."""
+        """Ask the estimator; drop an earlier request, which a restarted one never answers."""
         if self._future is not None:
             self._client.remove_pending_request(self._future)
         self._future = self._client.call_async(Trigger.Request())
@@ -59,7 +59,7 @@ class AnomalyLatch:
             self._follow(False)
         else:
             self._node.get_logger().warning(
-                f'anomaly_detected is false, but the estimator says: {answer and answer.message}'
+                f'anomaly_detected is false, but the estimator reports: {answer and answer.message}'
             )
 
     def _give_up(self) -> None:

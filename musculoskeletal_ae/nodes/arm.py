@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm on the graph: its states and description, if it is simulated or emulated, and its looks.
+"""Publishers that an emulated, simulated or estimated arm shares: states, markers and frames.
 
-For RViz and Foxglove: bones, muscles and names as markers, or poses of all links on /tf. The
-hardware's bones are ivory and solid; green those of the estimate, violet the simulator's.
+Markers show bones, muscles and names in RViz and Foxglove. Bones of the hardware are ivory and
+opaque, those of the estimate green, those of the simulator violet. Link poses go to /tf.
 """
 
 from collections.abc import Callable
@@ -33,15 +33,16 @@ MARKER_RATE = 10.0  # [Hz]
 NAME_HEIGHT = 0.018  # [m]
 BONES = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
 SOLID = (*BONE_COLOUR, 1.0)
-# After a pause (a debugger, a jump of /clock) an arm goes on instead of catching up.
-LONGEST_STEP, MOST_PERIODS = 0.1, 2.0  # [s], or if they are longer
+# After a pause (a debugger, a jump of /clock) the arm continues without simulating the missed time.
+# One step covers at most LONGEST_STEP [s] or MOST_PERIODS periods, whichever is longer.
+LONGEST_STEP, MOST_PERIODS = 0.1, 2.0
 
 
 class Markers:
-    """Publishes ARM/markers while somebody listens."""
+    """Publishes ARM/markers while the topic has a subscriber."""
 
     def __init__(self, node: Shell, arm: str, lines: Callable[[], list[Line]]) -> None:
-        """Draw the lines of an arm, none where there is nothing to draw yet."""
+        """Draw the lines that `lines` returns; an empty list publishes nothing."""
         self._node, self._lines = node, lines
         self._bones = BONES.get(arm, SOLID)
         self._publisher = node.create_publisher(MarkerArray, f'{arm}/markers', RELIABLE)
@@ -73,14 +74,14 @@ class Markers:
 
 
 class Frames:
-    """Publishes where links are, where ROS has tf2_msgs: Jazzy does, the wheels do not."""
+    """Publishes link poses on /tf; needs tf2_msgs, which the ROS wheels do not contain."""
 
     def __init__(self, node: Shell) -> None:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise MusculoskeletalError(
-                'parameter publish_tf: tf2_msgs is not installed; source ROS 2 Jazzy, or leave it '
+                'parameter publish_tf: tf2_msgs is not installed; source ROS 2 Jazzy, or set it to '
                 '"none"'
             ) from error
         self._node, self._message = node, TFMessage
@@ -103,22 +104,22 @@ class Frames:
 
 
 class Arm(Shell):
-    """A node that stands for an arm. Like real muscle modules it obeys whoever commands it."""
+    """A node that takes the place of an arm; like real muscle modules, it obeys every publisher."""
 
     accepted_from_all = COMMANDS
 
     @property
     def longest_step(self) -> float:
-        """What may pass at once [s]."""
+        """Longest time that one step may cover [s]."""
         return max(LONGEST_STEP, MOST_PERIODS / self.rate)
 
     def follow_wrench(self, arm: str, follow: Callable[[Array], object]) -> None:
-        """Give `follow` what comes on ARM/external_wrench, (6,) [N, N·m] in root link axes."""
+        """Pass wrenches from ARM/external_wrench to `follow`: (6,) [N, N·m] in root link axes."""
         topic, frame = f'{arm}/external_wrench', self.root_frame
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
-        """Advertise the states below a prefix; the description is the robot's own to publish."""
+        """Advertise the states under a topic prefix, and `robot_description` if `description`."""
         self._joints = None
         self.sources.watch(f'{prefix}joint_states', f'{prefix}muscle_states')
         if joint_sensors:
@@ -131,7 +132,7 @@ class Arm(Shell):
     def publish_state(
         self, theta: Array, length: Array, tension: Array, temperature: Array
     ) -> None:
-        """Publish θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,), as of now."""
+        """Publish θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,)."""
         if self._joints is not None and is_heard(self._joints):
             stamp = self.get_clock().now().to_msg()
             self._joints.publish(joint_message(self.robot.joints, theta, stamp))

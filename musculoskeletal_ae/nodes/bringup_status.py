@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `bringup_status`: one line a second about a running arm, for `bringup.sh`.
+"""The node `bringup_status`: prints one line a second about a running arm, for `bringup.sh`.
 
 joint_states, estimated_joint_states, anomaly, /diagnostics → stdout. Its own report on /diagnostics
-is the situation of the whole arm: as bad as the worst of all nodes.
+is the situation of the whole arm, with the level of the worst node.
 """
 
 import math
@@ -24,7 +24,7 @@ from musculoskeletal_ae.report import Report
 
 
 class BringupStatus(Shell):
-    """Prints estimation error, A, samples learned and number of checkpoints."""
+    """Prints the estimation error, A, and the numbers of samples and checkpoints."""
 
     # A terminal that is paused by Ctrl-S, or a pager that is not read on, blocks the prints.
     is_watched = False
@@ -50,7 +50,7 @@ class BringupStatus(Shell):
 
     @property
     def theta(self) -> Array | None:
-        """What joint sensors say [rad] (D,); None while they are silent."""
+        """Measured θ [rad] (D,); None without a recent message."""
         at, theta = self.measured
         return theta if time.monotonic() - at <= OLD else None
 
@@ -68,16 +68,17 @@ class BringupStatus(Shell):
         self.situation.tick()
         if self.started is None and not self.anomalies:
             if 0.0 < self.patience < now - self.begun:
-                sys.exit(f'the system did not come up: no estimate in {self.patience:g} s')
+                sys.exit(f'the system did not come up: no estimate within {self.patience:g} s')
             return
         self.started = self.started or now
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
         unit = self.robot.kinematics.distance_unit
-        told, known = self.situation, figures(self.theta is not None, means[0], means[1], unit)
+        situation = self.situation
+        known = figures(self.theta is not None, means[0], means[1], unit)
         self.errors, self.anomalies = [], []
         line = f'{now - self.started:6.0f} s  {known}'
-        line += f'  samples {told.samples or 0}  checkpoints {told.checkpoints or 0}'
-        more = told.trouble() or told.hint()
+        line += f'  samples {situation.samples or 0}  checkpoints {situation.checkpoints or 0}'
+        more = situation.trouble() or situation.hint()
         print(printable(f'{line}  {more}'.rstrip()), flush=True)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator decides for all nodes which network is used.
+"""The part of the estimator that selects the network for all nodes.
 
     mae_checkpoint (learner) ─► validation ─► accepted_checkpoint (estimator) ─► controller, sim
 
-Candidates come on the topic `mae_checkpoint`, or from a file by the parameter `checkpoint`. What is
-accepted is used by the estimator and published, latched. After an anomaly soon after a change, the
-network before is published again. No other node validates networks.
+Candidates arrive on the topic `mae_checkpoint`, or from the file of the parameter `checkpoint`. The
+estimator uses an accepted network and publishes it latched. If an anomaly follows soon after a new
+network, the estimator publishes the previous one again. No other node validates networks.
 """
 
 import time
@@ -24,11 +24,11 @@ from musculoskeletal_ae.nodes.shell import Shell
 
 
 class Candidates:
-    """Validates candidates, and publishes what is accepted.
+    """Validates candidates, and publishes the accepted networks.
 
     Attributes:
-        validator: The rules, and the messages that they are checked on.
-        queue: Candidates from the topic, which are validated in small steps.
+        validator: Validation rules, and the recent messages that networks are validated on.
+        queue: Candidates from the topic; it validates them in small steps.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Candidates:
         Args:
             node: The estimator.
             use: Puts an accepted network to use.
-            on_candidate: Is called when a candidate from the topic was accepted.
+            on_candidate: Called when a candidate from the topic was accepted.
         """
         self._node, self._use, self._on_candidate = node, use, on_candidate
         self.validator = CheckpointValidator(node.robot)
@@ -47,14 +47,14 @@ class Candidates:
         self.queue = node.checkpoint_queue(CANDIDATES, self._validate)
 
     def follow(self) -> None:
-        """Take candidates from the topic, and from the file of `checkpoint`, now and later."""
+        """Subscribe to candidates, and follow the parameter `checkpoint`."""
         node = self._node
         node.needed.append(CANDIDATES)
         node.follow_parameter('checkpoint', self._use_file, node.load_checkpoint)
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def on_anomaly(self, detected: bool) -> None:
-        """Take whether an anomaly is latched; a new network that may be its cause is replaced."""
+        """Process whether an anomaly is latched; replace a recent network that may be its cause."""
         if detected and self.validator.mae is not None:
             self.queue.give_up()
         before = self.validator.anomaly(detected, time.monotonic())

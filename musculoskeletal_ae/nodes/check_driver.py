@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `check_driver`: does the driver of a real arm keep its contract?
+"""The tool `check_driver`: checks the driver of a real arm against its contract.
 
-muscle_states, joint_states → stdout; with --move also muscle_length_command.
+It reads muscle_states and joint_states; with --move it publishes muscle_length_command.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, run_tool, start
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.stop_signals import import_heavy
 
-if TYPE_CHECKING:  # what --help does not load
+if TYPE_CHECKING:  # slow imports, which --help does not need
     from musculoskeletal_ae.driver.verdict import Verdict
     from musculoskeletal_ae.robot.robot import Robot
 
 STATES, JOINTS, COMMAND = 'muscle_states', 'joint_states', 'muscle_length_command'
 TYPE = 'std_msgs/msg/Float64MultiArray'
-DISCOVERY = 1.0  # [s] in which the others on the graph are found
-SILENCE = 1.0  # [s] without messages that end the winding
-TICK = 0.02  # [s]; a tick that comes late says that this process did not run
+DISCOVERY = 1.0  # [s] within which other nodes are discovered
+SILENCE = 1.0  # [s] without messages after which the motion test ends
+TICK = 0.02  # [s]; a late tick shows that this process was paused
 
 
 def _say(text: object) -> None:
@@ -40,7 +40,7 @@ def _say(text: object) -> None:
 
 
 class CheckDriver:
-    """Listens to one driver, and winds its muscles in."""
+    """Checks the messages of one driver, and how its muscles respond to commands."""
 
     def __init__(self, robot: Robot, options: Namespace) -> None:
         self.node = Node('check_driver')
@@ -67,7 +67,7 @@ class CheckDriver:
         return ', '.join(sorted(kinds - {TYPE}))
 
     def listen(self) -> Verdict:
-        """Wait for a driver and listen to it."""
+        """Wait for a driver, listen to it, and return the verdict."""
         chosen, node = self.options, self.node
         kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
         listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed)
@@ -91,20 +91,24 @@ class CheckDriver:
         elif (publishers := node.count_publishers(STATES)) > 1:
             verdict.failed('several', n=publishers, topic=self.topic)
         if not node.count_publishers(JOINTS):
-            verdict.notes.append('nobody publishes joint_states, from which the learner learns')
+            verdict.notes.append('nobody publishes joint_states, which the learner needs')
         return verdict
 
     def alone(self, own: int = 0) -> bool:
-        """Refuse to go on where something else than its `own` publishers moves the arm."""
+        """Return True if no node besides our `own` publishers commands the arm.
+
+        Raises:
+            MusculoskeletalError: If another node publishes commands.
+        """
         if self.node.count_publishers(COMMAND) > own:
             raise MusculoskeletalError(
-                f'{self.command} is published by another node: stop the controller before anything '
-                'else moves the arm'
+                f'{self.command} is published by another node: stop the controller before the '
+                'motion test'
             )
         return True
 
     def wind(self, verdict: Verdict) -> None:
-        """Wind each muscle in a little."""
+        """Wind each muscle in slightly, and add what is wrong to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
         read = import_heavy('musculoskeletal_ae.validity').read_muscle_states
         publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
@@ -131,7 +135,7 @@ class CheckDriver:
         self.muscles = follow
 
         def ended() -> bool:
-            # On a busy machine another node may be discovered late.
+            # Checked again here, because a busy machine may discover another node late.
             return self.alone(1) and (winding.done or time.monotonic() - last > SILENCE)
 
         self.spin_until(ended, math.inf)
@@ -140,7 +144,7 @@ class CheckDriver:
 
 
 def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
-    """Return what winds muscles in.
+    """Return the motion test of the chosen muscles.
 
     Raises:
         MusculoskeletalError: If the options name an unknown muscle, or too small a tension.
@@ -153,56 +157,63 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
 def _check(options: Namespace, arguments: list[str]) -> int:
     robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(options.robot)
     if options.posture and len(options.posture) != robot.joint_count:
-        raise MusculoskeletalError(f'--posture: {robot.joint_count} values are wanted, one a joint')
-    if options.move:  # what cannot be moved is refused before anything is waited for
+        raise MusculoskeletalError(f'--posture: expected {robot.joint_count} values, one per joint')
+    if options.move:  # refuse wrong options before waiting for a driver
         kind = import_heavy('musculoskeletal_ae.driver.verdict').Verdict
         _winding(robot, kind(robot), options)
     start_ros(arguments)
-    driver, told = CheckDriver(robot, options), None
+    driver, reported = CheckDriver(robot, options), None
     while True:
         verdict = driver.listen()
         faults = {fault[:2] for fault in verdict.faults}
-        if faults != told:  # else it is as it was
+        if faults != reported:
             _say(verdict)
-        told = faults
+        reported = faults
         if not (options.wait and faults):
             break
-        _say('nothing may move before the driver is changed; listening on')
+        _say('fix the driver before moving the arm; still listening')
     if options.move:
         driver.alone()
         if verdict.wrong - {'zero'}:
-            _say('not moved: what is wrong already comes first')
+            _say('motion test skipped: fix the faults above first')
         else:
             driver.wind(verdict)
             _say(verdict)
-    _say('the driver keeps its contract' if not verdict.faults else 'the driver is to be changed')
+    passed, failed = 'the driver keeps its contract', 'driver check FAILED: fix the faults above'
+    _say(failed if verdict.faults else passed)
     return 1 if verdict.faults else 0
 
 
 def _parse(arguments: list[str]) -> Namespace:
     parser = Parser(
         'check_driver',
-        'Listens to the driver of a real arm and says of each muscle whether it keeps the contract '
-        'of doc/howto/your_robot.md: what was seen, and what to change. Move the arm gently by '
-        'hand meanwhile, if you can. Exit status 0: it does, 1: it does not.',
+        'Listens to the driver of a real arm and checks each muscle against the contract of '
+        'doc/howto/your_driver.md. Reports what was measured and what to change. Meanwhile, move '
+        'the arm gently by hand if you can. Exit status 0: check passed, 1: check failed.',
         ROS_HELP,
     )
     parser.add_robot()
     add = parser.add_argument
     add('--seconds', type=positive, default=30.0, metavar='S', help='how long to listen [s]')
-    add('--rate', type=number(1.0, 1000.0), default=100.0, metavar='HZ', help='of muscle_states')
-    text = 'where the arm is held, without joint sensors [rad or m]'
+    add(
+        '--rate',
+        type=number(1.0, 1000.0),
+        default=100.0,
+        metavar='HZ',
+        help='expected rate of muscle_states [Hz]',
+    )
+    text = 'posture in which the arm is held, if it has no joint sensors [rad or m]'
     add('--posture', type=numbers, metavar='θ,…', help=text)
-    text = 'winches without absolute encoders: the zeros of l are not judged'
+    text = 'for winches without absolute encoders: do not check the length offsets'
     add('--unzeroed', action='store_true', help=text)
-    add('--move', action='store_true', help='then wind each muscle in a little, one at a time')
+    add('--move', action='store_true', help='then wind each muscle in slightly, one at a time')
     add('--muscles', type=names, metavar='NAME,…', help='with --move: only these')
     text = (
-        'with --move: the highest tension asked for [N] (default: 40 above T_bias, where K is '
-        'beyond 50 kN/m 0.8 mm times K; at most tension.max)'
+        'with --move: highest commanded tension [N] (default: T_bias + 40 N; for K above '
+        '50 kN/m: T_bias + 0.8 mm times K; at most tension.max)'
     )
     add('--tension', type=positive, metavar='N', help=text)
-    add('--wait', action='store_true', help='wait for a driver, and until it has no fault')
+    add('--wait', action='store_true', help='wait for a driver, and listen until it has no faults')
     options = parser.parse_args(arguments)
     if (options.muscles or options.tension) and not options.move:
         parser.error('--muscles and --tension go with --move')

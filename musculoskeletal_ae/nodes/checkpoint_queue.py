@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints from a topic are handled in small steps, so that commands stay on time."""
+"""Handles checkpoints from a topic in small steps, to keep commands on time."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,15 +11,15 @@ from std_msgs.msg import UInt8MultiArray
 from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
 from musculoskeletal_ae.reception import Reception
 
-#: What the learner proposes, and what the estimator has accepted for all nodes.
+#: Topics of the networks that the learner proposes, and that the estimator has accepted.
 CANDIDATES, ACCEPTED = 'mae_checkpoint', 'accepted_checkpoint'
-#: Time between steps [s]. A step takes a few milliseconds: at most a quarter of a core is used.
+#: Time between steps [s]. A step takes a few milliseconds, which is at most a quarter of a core.
 STEP_PERIOD = 0.02
-LARGEST = 64 << 20  # [bytes] of a checkpoint; one of ours has half a MB
+LARGEST = 64 << 20  # [bytes] of a checkpoint; a typical one has half a MB
 
 
 class CheckpointQueue:
-    """Handles one checkpoint at a time; of those that arrive meanwhile, only the last one next."""
+    """Handles one checkpoint at a time, then the newest of those that arrived meanwhile."""
 
     def __init__(
         self,
@@ -29,16 +29,16 @@ class CheckpointQueue:
         handle: Callable[[UInt8MultiArray], Iterator[None]],
         unfit: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Begin with nothing to do.
+        """Create an empty queue.
 
         Args:
-            node: Its timer makes the steps.
+            node: Node whose timer runs the steps.
             reception: Counts the checkpoints that were used and rejected.
-            topic: Where they come from.
-            handle: Returns the steps of one checkpoint. They raise a MusculoskeletalError to reject
-                it; the last one puts it to use.
-            unfit: Is called with the reason if a checkpoint cannot be computed with. One that does
-                not explain the arm (GateError) is only rejected.
+            topic: Topic of the checkpoints.
+            handle: Returns the steps of one checkpoint. A step raises a MusculoskeletalError to
+                reject the checkpoint; the last step puts it to use.
+            unfit: Called with the reason if a checkpoint is unusable (CheckpointError). A network
+                that does not explain the arm (GateError) is only rejected.
         """
         self._reception, self._topic = reception, topic
         self._handle, self._unfit = handle, unfit
@@ -50,14 +50,14 @@ class CheckpointQueue:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a checkpoint is being handled, or is the next one."""
+        """Whether a checkpoint is being handled or waits."""
         return self._steps is not None or self._next is not None
 
     def propose(self, message: UInt8MultiArray) -> None:
-        """Handle a checkpoint as soon as the one before is done.
+        """Handle a checkpoint as soon as the previous one is done.
 
         Raises:
-            CheckpointError: If it is too large to be a network, and is not kept.
+            CheckpointError: If the message is too large to be a network.
         """
         if len(message.data) > LARGEST:
             raise CheckpointError(f'{len(message.data)} bytes, at most {LARGEST}')
@@ -66,7 +66,7 @@ class CheckpointQueue:
             self._timer.reset()
 
     def give_up(self) -> None:
-        """Forget the checkpoint that is being handled, and the next one."""
+        """Drop the checkpoint that is being handled, and the one that waits."""
         self._steps = self._next = None
         self._timer.cancel()
 
@@ -88,5 +88,5 @@ class CheckpointQueue:
             self._reception.reject(self._topic, error.reason, str(error))
         except Exception as error:  # noqa: BLE001 - a received file may do anything
             self._reception.reject_error(self._topic, error)
-        if self._steps is steps:  # the last step may have given up, and started anew
+        if self._steps is steps:  # else the last step called `give_up`, and another one began
             self._steps = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `controller`: target posture → muscle commands, with a latched safe stop.
+"""The node `controller`: computes muscle commands for a target posture, with a latched safe stop.
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
 muscle_states, anomaly_detected, isolated_muscles → muscle_length_command, or muscle_tension_command
@@ -48,14 +48,14 @@ from musculoskeletal_ae.validity import (
 class Controller(Shell):
     """Node shell of control."""
 
-    # Several publishers stop the arm. What pays it out then has to go by the readings that come.
+    # Several publishers of muscle_states stop the arm, but paying out still needs the readings.
     accepted_from_all = frozenset({'muscle_states'})
 
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
         self.recording: StopRecording = StopRecording(self.resolve_topic_name)
-        self.recorded: StopCause | None = None  # the stop that the last recording is of
+        self.recorded: StopCause | None = None  # cause of the last recorded stop
         self.logged: list[str] = []
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
         self.published_mode = ''
@@ -93,13 +93,13 @@ class Controller(Shell):
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
-        # Watches ages and keeps publishing when no sensor message does it.
+        # Checks message ages and keeps publishing commands when no sensor message arrives.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
 
     def destroy_node(self) -> None:
-        """Let a recording be finished."""
+        """Wait until a stop recording has been written, then destroy the node."""
         self.recording.close()
         super().destroy_node()
 
@@ -107,7 +107,8 @@ class Controller(Shell):
         self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _check_stiffness(self, value: Any) -> Any:
-        # Before any other that is set with it: what those end would not come back.
+        # Runs before the other parameters of the same request are set, because their setters may
+        # end a motion that a rollback would not restore.
         checked = replace(self.core.settings, joint_stiffness=value)
         checked.desired_stiffness(self.robot.kinematics.radian)
         return value
@@ -118,10 +119,12 @@ class Controller(Shell):
             for kind, publisher in self.publishers_of.items()
         }
         if value in BY_TENSION and followed[LENGTH] and not followed[TENSION]:
-            # It would let the arm go, as if no commands came.
+            # The driver would pay the muscles out, as it does without commands.
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
-            told = f'{value!r}: the driver follows muscle_length_command only; legal: {legal}'
-            raise MusculoskeletalError(f'{told}; or let it follow muscle_tension_command, too')
+            problem = f'{value!r}: the driver follows muscle_length_command only'
+            raise MusculoskeletalError(
+                f'{problem}; legal: {legal}; or let it follow muscle_tension_command, too'
+            )
         return value
 
     def _use_body(self) -> None:
@@ -134,14 +137,14 @@ class Controller(Shell):
         self.core.anomaly(detected)
 
     def on_intruders(self, intruders: str) -> None:
-        """Stop while anybody else publishes what one of the arm's nodes should."""
+        """Stop while another node publishes a topic that belongs to one of the arm's nodes."""
         self.core.watchdog.second_publisher = intruders
 
     def _estimated(self, message: JointState) -> None:
         theta = read_posture(message, self.robot.joints)
         is_new = self.estimate_stamps.is_new(message.header.stamp)
         self.core.estimated(theta, time.monotonic(), is_new)
-        # The estimate is made from the newest muscle states: now everything is fresh.
+        # Estimates are computed from the newest muscle states, so all inputs are fresh now.
         self._step()
 
     def _target(self, message: JointState) -> None:
@@ -149,7 +152,7 @@ class Controller(Shell):
         warn = self.get_logger().warning
         if not self.core.supervisor.is_running:
             condition = self.core.supervisor.condition
-            warn(f'stopped ({condition}): the target waits for controller/reset')
+            warn(f'stopped ({condition}): the arm moves to the target after controller/reset')
         target = self.core.target_state
         if target.unreachable_reason:
             warn(f'out of reach: {target.unreachable_reason}')
@@ -160,7 +163,7 @@ class Controller(Shell):
         points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
         begin = stamp.sec + 1e-9 * stamp.nanosec  # 0: now
         self.core.trajectory(points, begin - self.now() if begin > 0.0 else 0.0)
-        self._tell_slowed()
+        self._warn_if_slowed()
 
     def _pose(self, message: PoseStamped) -> None:
         only = without_orientation(message)
@@ -170,17 +173,17 @@ class Controller(Shell):
         reason = self.core.target_state.unreachable_reason
         if reason not in ('', before):
             self.get_logger().warning(f'out of reach: {reason}')
-        self._tell_slowed()
+        self._warn_if_slowed()
 
     def _twist(self, message: TwistStamped) -> None:
         self.core.twist(read_twist(message, self.root_frame))
 
-    def _tell_slowed(self) -> None:
+    def _warn_if_slowed(self) -> None:
         if slowed := status.slowed(self.core.activities.follower):
             self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
 
     def _state(self) -> JointTrajectory:
-        """Say what is desired, what is estimated, and the error, as three points."""
+        """Return the desired state, the estimated posture and the error, as three points."""
         follower = self.core.activities.follower
         desired, names = follower.desired, ('positions', 'velocities', 'accelerations')
         parts = {name: part.tolist() for name, part in zip(names, desired, strict=True)}
@@ -204,14 +207,14 @@ class Controller(Shell):
 
     def _stop(self, _: Trigger.Request) -> str:
         self.core.stop(StopCause.OPERATOR)
-        return 'stopped; controller/reset ends it'
+        return 'stopped; call controller/reset to go on'
 
     def _reset(self, _: Trigger.Request) -> str:
         present = self.core.reset(time.monotonic())
         if present is not None:
-            again = f'call again once that is over, {LIMITS.settled:g} s after it is mended'
+            again = f'call controller/reset again {LIMITS.settled:g} s after the cause is removed'
             raise MusculoskeletalError(f'refused: {present}: {present.cause.remedy}; {again}')
-        return 'going on to the last target, if any; controller/explore explores again'
+        return 'moving to the last target, if there is one; call controller/explore to explore'
 
     def _watch(self) -> None:
         if time.monotonic() - self.core.watchdog.age.stepped_at > 1.5 / self.rate:
@@ -234,7 +237,7 @@ class Controller(Shell):
         self._record_stop()
 
     def _publish_mode(self) -> None:
-        """Publish mode and stop cause as identifiers, whenever they change."""
+        """Publish mode and stop cause as identifiers when they change."""
         supervisor = self.core.supervisor
         mode = supervisor.mode
         if supervisor.condition is not None:
@@ -244,7 +247,7 @@ class Controller(Shell):
             self.mode.publish(String(data=mode))
 
     def _record_stop(self) -> None:
-        """Keep the last seconds before a stop that has latched."""
+        """Save the last seconds before a latched stop."""
         supervisor = self.core.supervisor
         if not supervisor.is_latched or supervisor.condition is None:
             self.recorded = None
@@ -253,7 +256,7 @@ class Controller(Shell):
             self.recording.save(str(supervisor.condition), self.parameter('stop_recordings'))
 
     def report(self) -> Report:
-        """Return what /diagnostics shows, and log what has changed."""
+        """Return the diagnostic report, and log stops and joint stiffness when they change."""
         report = status.report(self.core, time.monotonic())
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
@@ -264,7 +267,7 @@ class Controller(Shell):
         held = {} if changing else report.values
         stiffness = [f'{k}: {v}' for k, v in held.items() if k.startswith('joint stiff')]
         before, self.logged = self.logged, stopped + stiffness
-        # In two places: rclpy lets no line of code log with two severities.
+        # Two loops, because rclpy refuses to log with two severities from one line of code.
         for line in stopped:
             if line not in before:
                 self.get_logger().warning(line)

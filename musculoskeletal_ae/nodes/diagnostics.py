@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node says of itself on /diagnostics: how it is, what came, and what was rejected."""
+"""Publishes a node's state on /diagnostics, with message rates and rejected messages."""
 
 import secrets
 import time
@@ -12,26 +12,26 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 
-PERIOD = 1.0  # [s] of reports
+PERIOD = 1.0  # [s] between reports
 
 
 class Diagnostics:
     """Publishes the reports of one node, each as a single status."""
 
     def __init__(self, node: Node, reception: Reception, hardware: str) -> None:
-        """Tell of a node, of what it receives, and by which `hardware` that is."""
+        """Report for a node and its reception; `hardware` becomes the hardware id of the status."""
         self._node, self._reception, self._hardware = node, reception, hardware
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._told_at = time.monotonic()
+        self._published_at = time.monotonic()
         self._ignored_before = Counter[str]()
         self.status_name = f'{node.get_fully_qualified_name()}: state'
-        #: tells this node from another one of the same name
+        #: distinguishes this node from another one of the same name
         self.identity = secrets.token_hex(8)
 
     def tell(self, report: Report) -> dict[str, int]:
-        """Publish a report; return how many messages were used since the last, by topic."""
+        """Publish a report; return the number of messages used since the previous one, by topic."""
         now = time.monotonic()
-        elapsed, self._told_at = now - self._told_at, now
+        elapsed, self._published_at = now - self._published_at, now
         received, rejected = self._reception.take_received(), self._reception.rejected
         values = {**report.values, 'identity': self.identity}
         values |= {f'{topic} rate': f'{n / elapsed:.1f} Hz' for topic, n in received.items()}
@@ -60,7 +60,7 @@ class Diagnostics:
 
 
 def _with_warning(report: Report, warning: str) -> Report:
-    """Return a report with one more warning; an error stays the error that it is."""
+    """Return a report with one more warning; errors are returned unchanged."""
     if report.level == 'error':
         return report
     return Report('warn', f'{report.message}; {warning}', report.values)

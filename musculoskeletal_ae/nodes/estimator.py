@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `estimator`: joint angles from muscle length and tension; is the body healthy.
+"""The node `estimator`: estimates joint angles from muscle length and tension, detects anomalies.
 
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
 anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros
-(joint_states help to find those), estimated/markers; on request muscle_joint_states and /tf;
-marker_pose → vision_joint_states, the joint angles that a camera sees.
+(joint_states support this calibration), estimated/markers; on request muscle_joint_states and /tf.
+marker_pose → vision_joint_states, the joint angles measured by a camera.
 """
 
 import time
@@ -48,16 +48,16 @@ OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estim
 
 
 class Estimator(Shell):
-    """Node shell of the estimator: translates messages, and publishes what has changed."""
+    """Node shell of the estimator: converts messages, and publishes results and changes."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
-        # After a restart, the learner's first network brings back which muscles were isolated.
+        # After a restart, the learner's first network restores the isolation of muscles.
         self.candidates = Candidates(self, self._use, self.core.keep_isolated)
         self._advertise()
         self.sources.watch(*OWN_TOPICS)
-        # What was published last on the latched topics; None: nothing yet.
+        # Last values published on the latched topics; None: none yet.
         self.published_anomaly = False
         self.published_isolated: tuple[int, ...] | None = None
         self.published_offsets: LengthOffsets | None = None
@@ -67,7 +67,7 @@ class Estimator(Shell):
         self.muscles_to_isolate: tuple[int, ...] = ()  # parameter isolate_muscles
         self.follow_parameter('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
-            # Until there is a network, nobody moves by what the sensors read.
+            # Without known offsets, no node uses the measured lengths before calibration.
             self.core.forget_offsets()
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
         self.candidates.follow()
@@ -111,7 +111,7 @@ class Estimator(Shell):
         before = self.core.body.isolated
         self.core.use(mae)
         if mae.isolated != before:
-            self.published_isolated = None  # a learner that has started again has to receive it
+            self.published_isolated = None  # publish again, because the learner has restarted
         self._publish_isolated()
         waits_for_network = not self.core.body.offsets.known and self.core.calibration is None
         if waits_for_network:
@@ -132,7 +132,7 @@ class Estimator(Shell):
         self._publish_offsets()
         self._reset(request)
         how = 'while the arm stands in zero_posture' if self.posture else 'while it moves gently'
-        return f'finding the zeros of the lengths {how}; /diagnostics says how far it is'
+        return f'calibrating length offsets {how}; /diagnostics shows the progress'
 
     def _isolate(self, muscles: set[int]) -> str:
         self.core.isolate(muscles)
@@ -141,9 +141,9 @@ class Estimator(Shell):
 
     def _isolate_more(self, request: Trigger.Request) -> str:
         if not self.muscles_to_isolate:
-            raise MusculoskeletalError('name muscles in the parameter isolate_muscles first')
+            raise MusculoskeletalError('no muscle named: set the parameter isolate_muscles first')
         wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
-        self.core.reset()  # which would restore a suspect
+        self.core.reset()  # before isolating, because it restores a suspect
         answer = self._isolate(wanted)
         self._reset(request)
         return answer
@@ -165,7 +165,7 @@ class Estimator(Shell):
         return f'cleared: {cause}' if cause else 'nothing was detected'
 
     def _check_health(self, _: Trigger.Request) -> str:
-        """Confirm that nothing is detected: a latched anomaly opens only by that."""
+        """Confirm that no anomaly is detected; other nodes clear their latch only then."""
         if cause := self.core.cause:
             raise MusculoskeletalError(f'anomaly detected: {cause}')
         return 'no anomaly is detected'
@@ -190,7 +190,7 @@ class Estimator(Shell):
         try:
             output = self.core.take(message, clock.nanoseconds * 1e-9, now)
         except RejectionError:
-            if self.core.body.isolated != isolated:  # a sensor of a muscle reports no number
+            if self.core.body.isolated != isolated:  # a failed sensor has isolated a muscle
                 self.get_logger().warning(self.core.suspects.last_verification)
                 self._publish_isolated()
             raise
@@ -238,18 +238,18 @@ class Estimator(Shell):
         self.mirror.publish(message)
 
     def _publish_anomaly(self) -> None:
-        """Publish whether an anomaly is latched, and which muscles are isolated, if it changed."""
+        """Publish anomaly_detected and isolated_muscles if they changed."""
         detected = bool(self.core.cause)
         if detected != self.published_anomaly:
             self.published_anomaly = detected
-            self.detected.publish(Bool(data=detected))  # it stops the arm: first of all
+            self.detected.publish(Bool(data=detected))  # first, because it stops the arm
             if detected:
                 text = f'anomaly detected: {self.core.cause}'
             else:
                 text = self.core.suspects.last_verification
             self.get_logger().warning(text)
             self.candidates.on_anomaly(detected)
-            self._report()  # the suspect is known with the anomaly, not a second later
+            self._report()  # at once, because the report names the suspect
         self._publish_isolated()
 
     def _publish_isolated(self) -> None:

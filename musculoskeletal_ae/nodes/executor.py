@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executor that runs the callbacks of nodes and tools.
 
-rclpy's `SingleThreadedExecutor` builds its wait set anew, in Python, for every message, and runs
-each callback as a task: at 200 Hz that is half of what a node costs. `LeanExecutor` keeps the wait
+rclpy's `SingleThreadedExecutor` rebuilds its wait set, in Python, for every message, and runs each
+callback as a task. At 200 Hz this takes half of a node's CPU time. `LeanExecutor` keeps the wait
 set until entities are created or destroyed, and calls callbacks directly. It uses private names of
 rclpy. It is therefore used only with versions of rclpy that it was tested with, and only if all of
-those names exist. Otherwise rclpy's own executors take its place, with one line in the log.
+those names exist. Otherwise a stock executor of rclpy runs instead, and the log says so.
 
-The environment variable MUSCULOSKELETAL_AE_EXECUTOR chooses by hand: lean, events or single.
+The environment variable MUSCULOSKELETAL_AE_EXECUTOR overrides the choice: lean, events or single.
 """
 
 import os
@@ -39,9 +39,9 @@ VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
 CHOICES = ('lean', 'events', 'single')
 #: first and last version of rclpy that LeanExecutor was tested with
 TESTED = (7, 1, 1), (7, 1, 11)
-#: first version whose EventsExecutor runs asynchronous callbacks; up to 7.1.7 it runs nothing
+#: first version whose EventsExecutor runs asynchronous callbacks; up to 7.1.7 it runs none at all
 EVENTS_SINCE = (7, 1, 11)
-#: what LeanExecutor uses of SingleThreadedExecutor, beyond what rclpy documents
+#: undocumented attributes of SingleThreadedExecutor that LeanExecutor uses
 PRIVATE_NAMES = (
     '_guard', '_is_shutdown', '_tasks',
     '_take_client', '_take_service', '_take_subscription', '_take_timer',
@@ -50,7 +50,7 @@ FULL_ROUND_PERIOD = 1.0  # [s]
 
 
 class _Group(NamedTuple):
-    """Entities of one kind, and how they enter a wait set and are taken from."""
+    """Entities of one kind, with the functions that add them to a wait set and take from them."""
 
     kind: str
     entities: list[Any]
@@ -61,20 +61,20 @@ class _Group(NamedTuple):
 class LeanExecutor(SingleThreadedExecutor):
     """Runs the callbacks of timers, subscriptions, services and clients without overhead.
 
-    Everything else is left to rclpy, in a *full round*: asynchronous callbacks and other tasks, and
-    actions, as soon as there are any; events of quality of service once a second.
+    rclpy handles everything else in a *full round*. Asynchronous callbacks, other tasks and actions
+    trigger a full round at once. QoS events wait for the next one, at most a second.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
-        self._wait_set: Any = None  # of rcl; None: to be built
+        self._wait_set: Any = None  # of rcl; None: not built yet
         self._groups: tuple[_Group, ...] = ()
         self._actions: list[Any] = []
-        self._handles = ExitStack()  # keeps what is waited for from being destroyed
+        self._handles = ExitStack()  # keeps entities of the wait set alive
         self._next_full_round = 0.0  # [s] of the monotonic clock
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run every callback that is ready; wait at most `timeout_sec`, or for a full round."""
+        """Run all ready callbacks; wait at most `timeout_sec` and the period of full rounds."""
         if self._wait_set is None:
             self._build_wait_set()
         wait_set, groups = self._wait_set, self._groups
@@ -89,7 +89,7 @@ class LeanExecutor(SingleThreadedExecutor):
         wait_set.wait(int(longest * S_TO_NS))
         if not self.context.ok():
             raise ExternalShutdownException
-        # The guard condition says that entities have changed, or that there is a task.
+        # The guard condition triggers when entities change or a task is created.
         is_changed = bool(wait_set.get_ready_entities('guard_condition'))
         has_action = any(action.is_ready(wait_set) for action in self._actions)
         for group in groups:
@@ -102,12 +102,12 @@ class LeanExecutor(SingleThreadedExecutor):
             self._run_full_round()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Release the entities, then this executor's own."""
+        """Release the entities of the wait set, then shut the base class down."""
         self._release()
         return super().shutdown(timeout_sec)
 
     def _run(self, entity: Any, take: Callable[[Any], Any]) -> None:
-        # A timer may have been cancelled since.
+        # Another callback may have cancelled the timer since the wait.
         if isinstance(entity, Timer) and not entity.handle.is_timer_ready():
             return
         execute = take(entity)
@@ -117,7 +117,7 @@ class LeanExecutor(SingleThreadedExecutor):
             self.create_task(execute)
             return
         try:
-            execute().send(None)  # ends at once: nothing in it waits
+            execute().send(None)  # runs to the end, because the callback awaits nothing
         except StopIteration:
             pass
 
@@ -164,34 +164,34 @@ class LeanExecutor(SingleThreadedExecutor):
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """Return the executor that the environment asks for, or the best for this rclpy.
+    """Return the executor that the environment selects, or else the best one for this rclpy.
 
     Raises:
-        MusculoskeletalError: If the environment asks for one that there is not, or that does not
+        MusculoskeletalError: If the environment selects an unknown executor, or one that does not
             work with this rclpy.
     """
     choice = os.environ.get(VARIABLE, '')
     if choice not in ('', *CHOICES):
         raise MusculoskeletalError(f'{VARIABLE}={choice!r}; legal: {", ".join(CHOICES)}')
     version = _rclpy_version()
-    found = f'rclpy {_dotted(version) or "of unknown version"}'
+    installed = f'rclpy {_dotted(version) or "of unknown version"}'
     if choice == 'events' and version < EVENTS_SINCE:
         needed = _dotted(EVENTS_SINCE)
-        raise MusculoskeletalError(f'{VARIABLE}=events needs rclpy {needed}; this is {found}')
+        raise MusculoskeletalError(f'{VARIABLE}=events needs rclpy {needed}; this is {installed}')
     if choice == 'lean' or (not choice and TESTED[0] <= version <= TESTED[1]):
         executor = LeanExecutor(context=context)
         missing = [name for name in PRIVATE_NAMES if not hasattr(executor, name)]
         if not missing:
             return executor
         executor.shutdown()
-        found += f', which has no {missing[0]}'
+        installed += f', which has no {missing[0]}'
     kind: Any = SingleThreadedExecutor
     if choice != 'single' and version >= EVENTS_SINCE:
         kind = import_module('rclpy.experimental').EventsExecutor
     if choice not in ('events', 'single'):
         get_logger('musculoskeletal_ae').info(
             f'using {kind.__name__}: LeanExecutor was tested with rclpy {_dotted(TESTED[0])} to '
-            f'{_dotted(TESTED[1])}, and this is {found}'
+            f'{_dotted(TESTED[1])}, and this is {installed}'
         )
     stock: Executor = kind(context=context)
     return stock

@@ -15,16 +15,16 @@ NAME = 'follow_joint_trajectory'
 
 
 class LateServer(ActionServer):
-    """Whose goals end when they are told to, without a task that waits meanwhile."""
+    """An action server whose goals need no waiting task; a callback ends them later."""
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
-        """Let a goal begin without doing anything; with a callback, end it as that says."""
+        """Start a goal without a task; with a callback, run it to end the goal."""
         if execute_callback is not None:
             super().notify_execute(goal_handle, execute_callback)
 
 
 class FollowJointTrajectory:
-    """Serves one goal at a time: a new one replaces it."""
+    """Serves one goal at a time; a new goal replaces it."""
 
     def __init__(
         self,
@@ -34,10 +34,18 @@ class FollowJointTrajectory:
         start: Callable[[Any], None],
         refuse: Callable[[str, str, str], object],
     ) -> None:
-        """Offer the action `kind`; `start` takes a JointTrajectory or raises a MessageError."""
+        """Offer the action.
+
+        Args:
+            node: The controller's node.
+            kind: Action type.
+            core: The controller.
+            start: Starts a JointTrajectory, or raises a MessageError.
+            refuse: Counts a refused goal, from its topic, reason and error text.
+        """
         self._kind, self._core, self._start, self._refuse = kind, core, start, refuse
         self._joints = node.robot.joints
-        self._asked: FollowedGoal | None = None  # of the goal that is just being accepted
+        self._requested: FollowedGoal | None = None  # the goal that is being accepted
         self._goal: FollowedGoal | None = None
         self._handle: Any = None
         self._server = LateServer(
@@ -48,23 +56,23 @@ class FollowJointTrajectory:
     def _ask(self, goal: Any) -> GoalResponse:
         try:
             bounds = [
-                read_tolerances(given, self._joints)
-                for given in (goal.path_tolerance, goal.goal_tolerance)
+                read_tolerances(tolerances, self._joints)
+                for tolerances in (goal.path_tolerance, goal.goal_tolerance)
             ]
             if not goal.trajectory.points:
-                raise MessageError('empty', 'a goal has points')
+                raise MessageError('empty', 'a goal needs at least one point')
             self._start(goal.trajectory)
         except MessageError as error:
             self._refuse(NAME, error.reason, str(error))
             return GoalResponse.REJECT
         patience = goal.goal_time_tolerance
         late = patience.sec + 1e-9 * patience.nanosec
-        self._asked = FollowedGoal(self._core, self._joints, bounds[0], bounds[1], late)
+        self._requested = FollowedGoal(self._core, self._joints, bounds[0], bounds[1], late)
         return GoalResponse.ACCEPT
 
     def _accepted(self, handle: Any) -> None:
         self._end(INVALID, 'replaced by a new goal')
-        self._handle, self._goal = handle, self._asked
+        self._handle, self._goal = handle, self._requested
         handle.execute()
 
     def _cancel(self, _: Any) -> CancelResponse:
@@ -72,17 +80,21 @@ class FollowJointTrajectory:
         return CancelResponse.ACCEPT
 
     def _rest(self) -> None:
-        with suppress(MessageError):  # stopped already
+        with suppress(MessageError):  # the controller has already stopped
             self._core.trajectory(None)
 
-    def step(self, say: Callable[[], Any]) -> None:
-        """Tell of the goal, if there is one, what `say` returns for `controller_state`; end it."""
+    def step(self, get_state: Callable[[], Any]) -> None:
+        """Publish feedback on the active goal, and end the goal when it has an outcome.
+
+        Args:
+            get_state: Returns the message of `controller_state`.
+        """
         if self._handle is None or self._goal is None:
             return
         if self._handle.is_cancel_requested:
-            self._end(SUCCESSFUL, 'cancelled: comes to rest')
+            self._end(SUCCESSFUL, 'cancelled: the arm comes to rest')
             return
-        state = say()
+        state = get_state()
         desired, actual, error = state.points
         names = {'header': state.header, 'joint_names': state.joint_names}
         feedback = self._kind.Feedback(**names, desired=desired, actual=actual, error=error)
@@ -92,7 +104,7 @@ class FollowJointTrajectory:
                 self._rest()
             self._end(*outcome)
 
-    def _end(self, code: int, told: str) -> None:
+    def _end(self, code: int, text: str) -> None:
         handle, self._handle = self._handle, None
         if handle is None:
             return
@@ -104,6 +116,6 @@ class FollowJointTrajectory:
                 handle.succeed()
             else:
                 handle.abort()
-            return self._kind.Result(error_code=code, error_string=told)
+            return self._kind.Result(error_code=code, error_string=text)
 
         self._server.notify_execute(handle, finish)

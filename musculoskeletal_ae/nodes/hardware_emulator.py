@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `hardware_emulator`: an arm with muscle modules, and faults on request.
+"""The node `hardware_emulator`: emulates an arm with muscle modules, and faults on request.
 
 muscle_length_command, muscle_tension_command → joint_states, muscle_states, marker_pose,
 markers; on request imu.
@@ -44,7 +44,7 @@ class HardwareEmulator(Arm):
         )
         for warning in self.arm.warnings:
             self.get_logger().warning(warning)
-        # Compiled code is loaded before the first message promises a living arm.
+        # One step loads compiled code, which would delay the first messages otherwise.
         self.arm.step(0.01)
         self.marker_pose_rate = self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()
@@ -60,27 +60,27 @@ class HardwareEmulator(Arm):
         if link := self.parameter('imu_link'):
             links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
             if link not in links:
-                told = f'{link!r}; legal: {", ".join(links)}'
-                raise MusculoskeletalError(f'parameter imu_link: {told}')
+                legal = ', '.join(links)
+                raise MusculoskeletalError(f'parameter imu_link: {link!r}; legal: {legal}')
             self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_muscles('muscle_length_command', self.arm.command_length)
         self.follow_muscles('muscle_tension_command', self.arm.command_tension)
         self.follow_wrench('hardware_emulator', self.arm.set_wrench)
         serve(self, Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()
-        self.pace = 1.0  # simulated seconds in a second
+        self.pace = 1.0  # simulated seconds per second of wall time
         self.time = self.clock_publisher = None
         if self.parameter('clock'):
             self.clock_publisher = self.create_publisher(ClockMessage, '/clock', RELIABLE)
             self.time = time.time_ns()
-        # On a steady clock: with use_sim_time nothing passes before this node says so.
+        # On a steady clock, because with use_sim_time this node itself advances the ROS clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0 / self.rate, self._tick, clock=steady)
 
     def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
-        return 'arm at rest, free and cool, modules safe; parameters stay as set'
+        return 'arm at rest, no wrench, modules cool and safe; parameters unchanged'
 
     def _set_marker_pose_rate(self, rate: float) -> None:
         self.marker_pose_rate, self.pose_due = rate, 0.0
@@ -88,7 +88,7 @@ class HardwareEmulator(Arm):
     def _tick(self) -> None:
         now = time.monotonic()
         since = now - self.ticked
-        # By its own clock each tick is one period, however late it comes.
+        # With parameter `clock` each tick advances one period, however late it is.
         elapsed = min(since, self.longest_step if self.time is None else 1.0 / self.rate)
         self.pace += min(1.0, since / PACE_TIME) * (elapsed / max(since, 1e-6) - self.pace)
         elapsed += self.remainder
@@ -117,8 +117,8 @@ class HardwareEmulator(Arm):
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.parameter('frame_prefix') + link
         message.orientation_covariance[0] = -1.0  # no orientation is measured
-        held = self.arm.accelerometer(link).tolist()
-        message.linear_acceleration = Vector3(**dict(zip('xyz', held)))
+        acceleration = self.arm.accelerometer(link).tolist()
+        message.linear_acceleration = Vector3(**dict(zip('xyz', acceleration)))
         publisher.publish(message)
 
     def _publish_pose(self) -> None:
@@ -136,11 +136,12 @@ class HardwareEmulator(Arm):
         return draw_arm(self.robot, arm.theta, arm.tension, arm.route_points())
 
     def report(self) -> Report:
-        """Return what /diagnostics shows."""
-        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only where all are
+        """Return the diagnostic report."""
+        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all are
         values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
         if self.arm.has_diverged:
-            return Report('error', 'broken by forces beyond all bounds: reset it', values)
+            problem = 'simulation diverged under excessive forces'
+            return Report('error', f'{problem}: call hardware_emulator/reset', values)
         if self.arm.safe:
             return Report('warn', 'modules safe: no commands', values)
         return Report('ok', 'following commands', values)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `learner`: learns the body online and hands the network to the other nodes.
+"""The node `learner`: learns the body online, and publishes the network for the estimator.
 
 joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_detected,
-isolated_muscles →
-mae_checkpoint.
+isolated_muscles, muscle_length_zeros → mae_checkpoint.
 """
 
 import os
@@ -29,7 +28,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 
-POLL = 0.05  # [s] between looks at the training process
+POLL = 0.05  # [s] between checks of the training process
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 
@@ -58,7 +57,7 @@ class Learner(Shell):
         core = self.core
         if value('fresh'):
             core.replace(None)
-        # What was learned comes back by no setter that is called again.
+        # These setters replace what was learned, which cannot be undone: hence `prepare`.
         self.follow_parameter('fresh', self._start, self._afresh)
         self.follow_parameter('checkpoint', self._start, self._network)
         self.follow_parameter('relearn_muscles', self._name, self.robot.muscle_indices)
@@ -89,7 +88,7 @@ class Learner(Shell):
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 
     def _afresh(self, value: bool) -> Mae | None:
-        """Return the network to start anew from while the node runs."""
+        """Return the network to restart from; None at the start of the node."""
         if not (value and self.running):
             return None
         path = self.parameter('checkpoint')
@@ -105,7 +104,7 @@ class Learner(Shell):
         (self.core.replace if self.running else self.core.begin)(mae)
 
     def _name(self, muscles: Sequence[int]) -> None:
-        if self.running:  # given at every start, it would forget at every start
+        if self.running:  # a parameter file must not relearn at every start
             self.core.relearn(muscles)
 
     # -- messages -------------------------------------------------------------------------------
@@ -121,7 +120,7 @@ class Learner(Shell):
         self.core.use_body(self.core.body.with_offsets(self.body.offsets))
 
     def _isolate(self) -> None:
-        # An estimator that has just started knows of none before it has our network.
+        # An estimator that has just started knows no isolated muscles before it has our network.
         number = self._reception.numbers['isolated_muscles']
         knows = number > 1 or (number == 0 and self.has_heard_isolated)
         muscles = self.body.isolated
@@ -131,7 +130,7 @@ class Learner(Shell):
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)
-        return 'learning' if request.data else 'stopped; samples and network stay'
+        return 'learning' if request.data else 'stopped; samples and network are kept'
 
     def _relearn(self, _: Trigger.Request) -> str:
         names = self.parameter('relearn_muscles')
@@ -140,22 +139,22 @@ class Learner(Shell):
                 '`relearn_muscles` names no muscle; set that parameter first'
             )
         self.core.relearn(self.robot.muscle_indices(names))
-        return f'learning anew: {", ".join(names)}; the others stay'
+        return f'relearning: {", ".join(names)}; other muscles are unchanged'
 
     def _poll(self) -> None:
         data = self.core.poll(self.now())
         if data is not None:
             self.publisher.publish(bytes_message(data))
-        if bool(self.core.trouble) != self.troubled:  # is told at once, not with the next report
+        if bool(self.core.trouble) != self.troubled:  # report at once
             self.troubled = not self.troubled
             self._report()
 
     def clock_jumped_back(self) -> None:
-        """Forget what is not a sample yet."""
+        """Drop messages that have not become a sample."""
         self.core.reset()
 
     def report(self) -> Report:
-        """Return what /diagnostics shows."""
+        """Return the diagnostic report."""
         return self.core.report()
 
     def destroy_node(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages from arrays, which `validity` reads; their quality of service; services."""
+"""Builds ROS messages from arrays (`validity` reads them), QoS profiles and service answers."""
 
 import math
 from array import array
@@ -49,7 +49,7 @@ def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointStat
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Whether anybody listens: a message that nobody hears need not be made."""
+    """Whether a publisher has a subscriber; without one, callers skip building the message."""
     return publisher.get_subscription_count() > 0
 
 
@@ -59,7 +59,10 @@ def bytes_message(data: bytes) -> UInt8MultiArray:
 
 
 def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
-    """Offer a Trigger or SetBool service: `work` says what it did, or raises why it did not."""
+    """Offer a Trigger or SetBool service.
+
+    `work` returns the response message, or raises a MusculoskeletalError to report failure.
+    """
 
     def answer(request: Any, response: Any) -> Any:
         try:
@@ -72,9 +75,9 @@ def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
 
 
 def refuse(request: Any, response: Any, reason: str) -> None:
-    """Let the response to a request that could not be worked on say so, where it can."""
+    """Mark a response as failed, with the reason, if its type has a field for that."""
     refused = SetParametersResult(successful=False, reason=reason)
-    if hasattr(response, 'results'):  # of parameters, those done before
+    if hasattr(response, 'results'):  # one per parameter; earlier ones may have succeeded
         response.results += [refused] * (len(request.parameters) - len(response.results))
     elif isinstance(getattr(response, 'result', None), SetParametersResult):
         response.result = refused

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of every node: one table, from which all else that tells of them is made.
+"""The parameters of every node, in one table.
 
-Declarations and `ros2 param describe` come from it (`shell`), `--help` of each node (`running`),
-and `config/nodes.yaml`:
+Declarations and descriptions (`shell`), the `--help` of each node (`running`) and
+`config/nodes.yaml` are generated from it:
 
     python -m musculoskeletal_ae.nodes.parameters > config/nodes.yaml
 
-Imports nothing heavy, so that `--help` answers at once.
+This module imports nothing slow, so that `--help` answers quickly.
 """
 
 import json
@@ -31,7 +31,7 @@ from musculoskeletal_ae.parameters import (
     parameters_of,
 )
 
-FRAME_PREFIX = Parameter('', 'put before every frame that is published, such as "left/"')
+FRAME_PREFIX = Parameter('', 'prefix of every published frame name, such as "left/"')
 SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX}
 NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
@@ -43,7 +43,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'seed': SEED,
         'explore': Parameter(False, 'explore from the start'),
         'stop_recordings': Parameter(
-            10, 'last seconds before a stop that are kept as bags', '', (0, 1000), settable=True
+            10, 'number of stop recordings to keep (0: none)', '', (0, 1000), settable=True
         ),
         **parameters_of(ControlSettings),
     },
@@ -51,28 +51,28 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         **NETWORK,
         'zero_posture': Parameter(
             (),
-            'where the arm stands when estimator/zero is called, one angle for each joint ([]: '
-            'unknown, zeros are found while it moves gently)',
+            'posture of the arm when estimator/zero is called, one angle for each joint ([]: '
+            'unknown; length offsets are then estimated while the arm moves gently)',
             'rad or m',
             (-100.0, 100.0),
             settable=True,
         ),
         'zero_at_start': Parameter(
-            False, 'winches that forget their zeros: find them at the start'
+            False, 'calibrate lengths at the start, for winches without absolute encoders'
         ),
         **parameters_of(Detection),
         'isolate_muscles': Parameter(
             ('',),
-            'muscles to do without: from the start, or when estimator/isolate is called, until '
+            'muscles to isolate at the start, or when estimator/isolate is called, until '
             'estimator/restore',
             settable=True,
         ),
         'mirror_muscles': Parameter(
-            False, 'publish muscle_joint_states, so that plots know the names of the muscles'
+            False, 'publish muscle_joint_states, with the names of the muscles for plots'
         ),
         'publish_tf': Parameter(
             'none',
-            'whose joint angles go to /tf as poses of all links; needs tf2_msgs, which a sourced '
+            'source of the joint angles for link poses on /tf; needs tf2_msgs, which a sourced '
             'Jazzy has',
             legal=('none', 'estimate', 'sensor'),
         ),
@@ -82,41 +82,47 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'seed': SEED,
         'reality': Parameter(
             'kin',
-            'the body: kin (the first), foreign (a second one, of MuJoCo), or an MJCF file whose '
+            'emulator model: kin, foreign (an independent one in MuJoCo), or an MJCF file whose '
             'joints and tendons have the names of the joints and muscles',
         ),
         'deviates': Parameter(
             False,
-            'with an MJCF file as reality: an individual that deviates from it as the seed draws '
-            '(doc/howto/mujoco.md), instead of the file as it is',
+            'with an MJCF file as reality: emulate an individual that deviates from the file, '
+            'depending on the seed (doc/howto/mujoco.md)',
         ),
         'clock': Parameter(
             False,
-            'publish /clock, and let time pass no faster than it can be computed; all nodes need '
-            'use_sim_time',
+            'publish /clock; simulated time slows down on a computer that is too slow; all nodes '
+            'need use_sim_time',
         ),
-        'ruptured_muscles': Parameter(('',), 'names of cut muscles ([""] heals)', settable=True),
+        'ruptured_muscles': Parameter(
+            ('',), 'names of ruptured muscles ([""]: none)', settable=True
+        ),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(
             (0.0,),
-            'error of the length sensors, one for all or one each',
+            'offset of the length sensors, one for all or one each',
             'm',
             (-1.0, 1.0),
             settable=True,
         ),
         'faults': Parameter(
             ('',),
-            'what is wrong, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
-            '([""] mends; doc/reference/topics_and_services.md lists the kinds)',
+            'faults, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
+            '([""]: none; doc/reference/topics_and_services.md lists the kinds)',
             settable=True,
         ),
         'joint_sensors': Parameter(True, 'publish joint_states'),
         'marker_pose_rate': Parameter(
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
         ),
-        'imu_link': Parameter('', 'link that carries an accelerometer (empty: none does)'),
+        'imu_link': Parameter('', 'link that carries an accelerometer (empty: none)'),
         'command_timeout': Parameter(
-            0.5, 'time without a command until the modules go safe', 's', (0.01, 60), settable=True
+            0.5,
+            'time without a command after which the modules go safe',
+            's',
+            (0.01, 60),
+            settable=True,
         ),
     },
     'sim': {
@@ -132,25 +138,24 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'seed': SEED,
         'joint_source': Parameter(
             'sensor',
-            'joint_states (of any joints), vision_joint_states (now and then), or neither',
+            'source of joint angles: sensor (joint_states), marker (vision_joint_states) or none',
             legal=('sensor', 'marker', 'none'),
         ),
         'relearn_muscles': Parameter(
             ('',),
-            'replaced or re-wired muscles, whose constants are learned anew once it is set, or at '
-            'learner/relearn',
+            'replaced or re-tied muscles to relearn when this is set, or when learner/relearn is '
+            'called',
             settable=True,
         ),
         'fresh': Parameter(
             False, 'drop the saved state and start from `checkpoint`', settable=True
         ),
         'state_directory': Parameter(
-            'auto', 'of samples and network (auto: below XDG_STATE_HOME; empty: keep nothing)'
+            'auto',
+            'where samples and network are saved (auto: below XDG_STATE_HOME; empty: nowhere)',
         ),
         **parameters_of(LearningSettings),
-        'update_steps': Parameter(
-            STEPS, 'mini-batches of one update, preset default', '', (1, 100_000)
-        ),
+        'update_steps': Parameter(STEPS, 'mini-batches of one update', '', (1, 100_000)),
         'device': Parameter(
             'cpu',
             'device that trains the network (the CPU if torch cannot use the device)',
@@ -160,10 +165,13 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
     'bringup_status': {
         **SHARED,
         'duration': Parameter(
-            0.0, 'time from the first estimate to the end (0: no end)', 's', (0.0, 1e9)
+            0.0,
+            'time from the first estimate after which the node ends (0: never)',
+            's',
+            (0.0, 1e9),
         ),
         'patience': Parameter(
-            0.0, 'longest wait for the first estimate (0: no end)', 's', (0.0, 1e9)
+            0.0, 'longest wait for the first estimate (0: unlimited)', 's', (0.0, 1e9)
         ),
     },
 }
@@ -171,15 +179,19 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
 #: executables that are several nodes in one process
 COMBINED = {'combined': ('estimator', 'controller')}
 
-#: what every node of rclpy has
+#: parameters that rclpy declares for every node
 OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
 
 def check_names(names: Iterable[str], node: str = '') -> None:
-    """Refuse a parameter that nothing would read.
+    """Refuse the name of a parameter that nothing would read.
 
-    That is one that no node has or, where it is given to one `node` or executable, that only
-    another one has: a file is for all nodes.
+    Args:
+        names: Names of parameters.
+        node: Node or executable that the parameters are for; '': all nodes, as in a file.
+
+    Raises:
+        MusculoskeletalError: If no node has the parameter, or only another node than `node`.
     """
     own = COMBINED.get(node, (node,) if node else ())
     every = [*OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]
@@ -197,12 +209,12 @@ def check_names(names: Iterable[str], node: str = '') -> None:
 
 
 HELP_TAIL = """\
-Give them as  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; those marked * may be
-set while the node runs. Names of topics:  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER"""
+Set them by  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; those marked * may be
+set while the node runs. Remap names by  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER"""
 
 
 def help_text(executable: str) -> str:
-    """Return the part of `--help` that tells of the parameters of an executable's nodes."""
+    """Return the part of `--help` that describes the parameters of an executable's nodes."""
     lines, table = ['Parameters:', ''], dict[str, Parameter]()
     for node in COMBINED.get(executable, (executable,)):
         table |= PARAMETERS[node]
@@ -216,7 +228,7 @@ def help_text(executable: str) -> str:
 def yaml_text() -> str:
     """Return `config/nodes.yaml`: every parameter once, with its default."""
     lines = [
-        '# Parameters of all nodes and their defaults. Made by',
+        '# Parameters of all nodes and their defaults, generated by',
         '#     python -m musculoskeletal_ae.nodes.parameters > config/nodes.yaml',
         '/**:',
         '  ros__parameters:',

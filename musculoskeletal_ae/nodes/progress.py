@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ends a node that makes no progress, and writes down where it hangs.
+"""Ends a node that hangs, and writes the stacks of its threads to stderr.
 
-The executor notes progress ten times a second (`ProgressWatch.note`). A thread looks twice a
-second. Without progress for 10 s it dumps the stacks of all threads to stderr and ends the process
-with status 70: whoever started the node sees that, and what it published has grown old long ago.
+A timer callback notes progress ten times a second (`ProgressWatch.note`). A thread checks it twice
+a second. After 10 s without progress it dumps the stacks of all threads to stderr and ends the
+process with status 70. Other nodes have treated its topics as stale long before that.
 
-A native call that computes for ever without giving up Python's lock would stop that thread, too.
-For this case a timer of processor time ends the process by SIGVTALRM, after a dump of the stacks.
+A native call that never returns and holds Python's global interpreter lock blocks that thread, too.
+A CPU-time timer covers this case: it ends the process by SIGVTALRM, after a dump of the stacks.
 
-Neither counts time in which the whole process was suspended, nor what a debugger or numba's
-compiler takes.
+Time in which the process was suspended does not count, nor does time in a debugger or in numba's
+compiler.
 """
 
 import faulthandler
@@ -23,19 +23,19 @@ from collections.abc import Callable
 LONGEST = 10.0  # [s] without progress
 LOOK_PERIOD = 0.5  # [s]
 STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
-#: modules that may take long in the main thread
+#: modules in which the main thread may stay long
 PATIENT = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
 
 def end_process() -> None:
-    """Dump the stacks of all threads, and end the process at once."""
-    print(f'no progress for {LONGEST:g} s: ending; the stacks of all threads:', file=sys.stderr)
+    """Dump the stacks of all threads, and end the process immediately."""
+    print(f'no progress for {LONGEST:g} s: ending; stacks of all threads:', file=sys.stderr)
     faulthandler.dump_traceback(all_threads=True)
     os._exit(STALLED)
 
 
 class ProgressWatch:
-    """Watches the main thread, between `start` and `stop`."""
+    """Watches the main thread between `start` and `stop`."""
 
     def __init__(
         self,
@@ -43,12 +43,12 @@ class ProgressWatch:
         look_period: float = LOOK_PERIOD,
         on_stall: Callable[[], object] = end_process,
     ) -> None:
-        """Watch nothing yet.
+        """Prepare the watch; `start` begins it.
 
         Args:
-            longest: Time without progress [s].
-            look_period: Between looks [s].
-            on_stall: Is called, in another thread, when there was none for so long.
+            longest: Longest legal time without progress [s].
+            look_period: Time between two checks [s].
+            on_stall: Called in another thread after `longest` without progress.
         """
         self._longest, self._look_period, self._on_stall = longest, look_period, on_stall
         self._quiet = 0.0  # [s]
@@ -56,7 +56,7 @@ class ProgressWatch:
         self._thread = threading.Thread(target=self._watch, name='progress', daemon=True)
 
     def start(self) -> None:
-        """Watch from now on."""
+        """Begin to watch."""
         faulthandler.register(signal.SIGVTALRM, all_threads=True, chain=True)
         self._thread.start()
 
@@ -65,7 +65,7 @@ class ProgressWatch:
         self._quiet = 0.0
 
     def stop(self) -> None:
-        """Watch no longer."""
+        """Stop watching."""
         if not self._thread.is_alive():  # never started
             return
         self._is_stopped.set()
@@ -80,7 +80,7 @@ class ProgressWatch:
             if self._is_stopped.wait(self._look_period):
                 return
             now = time.monotonic()
-            # A process that was suspended has had no time for progress.
+            # A longer interval means that the process was suspended; it counts in part only.
             self._quiet += min(now - before, 2.0 * self._look_period)
             before = now
             if self._quiet > self._longest:

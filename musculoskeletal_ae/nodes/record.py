@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `record`: the topics to an mcap bag that `ros2 bag` can read."""
+"""The tool `record`: writes the topics to an mcap bag that `ros2 bag` can read."""
 
 import math
 import sys
@@ -25,30 +25,30 @@ from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, 
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-# What the recorder may lose when it is killed is what is younger than this.
+# If the recorder is killed, the messages of at most this time are lost.
 FLUSH_PERIOD = 0.5  # [s]
-# A second or two of the fastest topic, while the disk is busy.
+# Holds one or two seconds of the fastest topic while the disk is busy.
 LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# After Ctrl-C: what has arrived and waits to be taken still belongs to the recording.
+# Time after Ctrl-C for recording messages that have already arrived.
 DRAIN_TIME = 0.5  # [s]
-# Before it says that it records: to find the publishers that are there, and to be connected.
+# Time to discover existing publishers, and to connect to them, before announcing the recording.
 DISCOVERY_TIME, CONNECTION_TIME = 0.5, 2.0  # [s]
 
 
 class Record(Node):
-    """Writes what arrives, serialized as it is."""
+    """Writes messages to a bag, in their serialized form."""
 
     def __init__(self, writer: BagWriter, topics: list[str]) -> None:
         super().__init__('record')
         self.writer = writer
         self.received = 0
-        #: what was latched before the first /clock, by topic; how much else came before
+        #: latched messages that arrived before the first /clock, by topic
         self._early: dict[str, tuple[Topic, bytes, dict[str, int]]] = {}
-        self.timeless = 0
+        self.timeless = 0  # number of other messages that arrived before the first /clock
         self._sim_time = self.get_parameter('use_sim_time').value
         self._subscriptions_of: dict[str, Subscription] = {}  # by the name in the interface
-        self._incompatible: dict[str, QoSPolicyKind] = {}  # what a publisher does not offer
+        self._incompatible: dict[str, QoSPolicyKind] = {}  # policy that a publisher does not offer
         for name in topics:
             self._subscribe(name, LATCHED if TOPICS[name].latched else LIVE)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -67,7 +67,7 @@ class Record(Node):
         self._incompatible[name] = event.last_policy_kind
 
     def _look_after(self) -> None:
-        """Write to disk, and subscribe anew where a publisher offers less than was requested."""
+        """Write to disk; resubscribe with the QoS of publishers that offer less than requested."""
         self.writer.flush()
         incompatible, self._incompatible = self._incompatible, {}
         for name, policy in incompatible.items():
@@ -77,21 +77,21 @@ class Record(Node):
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
             elif policy == QoSPolicyKind.DURABILITY:
                 qos.durability = DurabilityPolicy.VOLATILE
-            else:  # nothing else is requested
+            else:  # the subscription requests no other policy
                 continue
             self.destroy_subscription(before)
             self._subscribe(name, qos)
 
     @property
     def is_connected(self) -> bool:
-        """Whether the publishers that are known by now are connected."""
+        """Whether all publishers that have been discovered are connected."""
         return all(
             each.get_publisher_count() >= self.count_publishers(each.topic_name)
             for each in self._subscriptions_of.values()
         )
 
     def missing(self) -> list[str]:
-        """Say of each topic on which nothing came, and whether somebody publishes it."""
+        """Return the topics without messages, each with whether it has a publisher."""
         silent = [
             each.topic_name
             for each in self._subscriptions_of.values()
@@ -105,7 +105,7 @@ class Record(Node):
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
         self.received += 1
-        if now == 0:  # of a simulated clock that has not begun
+        if now == 0:  # no /clock message has arrived yet
             self.timeless += not topic.latched
             if topic.latched:
                 self._early[name] = topic, data, info
@@ -121,7 +121,7 @@ class Record(Node):
         self.writer.write(name, now, info['source_timestamp'], data)
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
-        """Return what the publishers of a topic offer; their depth cannot be seen from here."""
+        """Return the QoS that the publishers of a topic offer, except for the unknown depth."""
         offered = [
             offered_qos(
                 info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
@@ -139,7 +139,7 @@ def _record(options: Namespace, arguments: list[str]) -> int:
         node = Record(writer, options.topics)
         with Spinner(node) as spinner:
             with suppress(KeyboardInterrupt):
-                # Who starts this and publishes then may rely on being heard.
+                # The announcement promises that messages published from now on are recorded.
                 spinner.spin_until(lambda: False, DISCOVERY_TIME)
                 spinner.spin_until(lambda: node.is_connected, CONNECTION_TIME)
                 print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)
@@ -151,14 +151,14 @@ def _record(options: Namespace, arguments: list[str]) -> int:
         missing = node.missing()
         node.destroy_node()
     if node.timeless:
-        problem = 'messages came before the first /clock, and are left out'
+        problem = 'messages came before the first /clock and were not recorded'
         print(f'warning: {node.timeless} {problem}', file=sys.stderr)
     print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
     if options.are_chosen and missing:
         print(f'warning: nothing was recorded of {"; ".join(missing)}', file=sys.stderr)
         return 1
     if not writer.message_count:
-        print('warning: nothing was recorded: no topic brought a message', file=sys.stderr)
+        print('warning: nothing was recorded: no message arrived on any topic', file=sys.stderr)
         return 1
     return 0
 
@@ -168,21 +168,22 @@ def parse(arguments: list[str]) -> Namespace:
     what = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
     parser = Parser('record', what + ROS_HELP)
     add = parser.add_argument
-    add('directory', nargs='?', type=Path, metavar='DIR', help='new directory')
-    add('-o', '--out', type=Path, metavar='DIR', help='the same')
+    directory_help = 'new directory (default: DATE-TIME_bag)'
+    add('directory', nargs='?', type=Path, metavar='DIR', help=directory_help)
+    add('-o', '--out', type=Path, metavar='DIR', help='same as DIR')
     add('--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)')
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
-    add('--compression', choices=COMPRESSIONS, default='zstd', help='of the messages')
+    add('--compression', choices=COMPRESSIONS, default='zstd', help='compression of the messages')
     recover_help = (
-        'copy what can be read of a bag, such as one whose recorder was killed, to a finished one '
-        'in DIR (default: BAG_recovered)'
+        'copy all readable messages of a damaged bag, for example of a killed recorder, to a '
+        'complete bag in DIR (default: BAG_recovered)'
     )
     add('--recover', type=Path, metavar='BAG', help=recover_help)
     options = parser.parse_args(arguments)
     if options.directory and options.out:
         parser.error('DIR is given twice')
     if options.recover and (options.topics or options.duration):
-        parser.error('--recover copies the whole recording: without --topics and --duration')
+        parser.error('--recover copies the whole recording: remove --topics and --duration')
     options.out = options.out or options.directory
     options.are_chosen = bool(options.topics)
     options.topics = options.topics or list(TOPICS)
@@ -192,7 +193,7 @@ def parse(arguments: list[str]) -> Namespace:
 def _topics(text: str) -> list[str]:
     listed = names(text)
     if unknown := [name for name in listed if name not in TOPICS]:
-        raise ArgumentTypeError(f'{unknown[0]!r} is none of {", ".join(TOPICS)}')
+        raise ArgumentTypeError(f'unknown topic {unknown[0]!r}; legal: {", ".join(TOPICS)}')
     return listed
 
 
@@ -206,7 +207,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
             problem = f'left out, since they are not in CDR: {", ".join(left_out)}'
             print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
-        with STOP.reacting(Reaction.REMEMBER):  # what waits in the queues is still written
+        with STOP.reacting(Reaction.REMEMBER):  # queued messages are still written
             return _record(options, arguments)
     return 0
 

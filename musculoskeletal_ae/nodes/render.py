@@ -16,7 +16,7 @@ from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
-DISCOVERY = 2.0  # [s] in which nodes that run know of each other
+DISCOVERY = 2.0  # [s] within which running nodes discover each other
 
 
 def _line(strip: Marker) -> Line:
@@ -35,14 +35,14 @@ def _render(options: Namespace, arguments: list[str]) -> int:
         node.create_subscription(MarkerArray, topic, take, SENSOR)
     first, spinner = node.resolve_topic_name(topics[0]), Spinner(node)
     spinner.spin_until(lambda: drawn, options.timeout)
-    # Who publishes the first may be discovered later, or send its next markers later.
+    # The publisher of the preferred topic may be discovered later, or send its next markers later.
     spinner.spin_until(lambda: topics[0] in drawn, DISCOVERY if drawn else 0.0)
     if drawn and node.count_publishers(first):
         spinner.spin_until(lambda: topics[0] in drawn, options.timeout)
     if not drawn:
-        told = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
-        told += '; is the node running, and in this namespace (--ros-args -r __ns:=/NAME)?'
-        raise MusculoskeletalError(told)
+        problem = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
+        remedy = 'is the node running, and in this namespace (--ros-args -r __ns:=/NAME)?'
+        raise MusculoskeletalError(f'{problem}; {remedy}')
     topic = topics[0] if topics[0] in drawn else topics[-1]
     save_picture(drawn[topic], options.out)
     print(f'{options.out}: {topic}')
@@ -52,7 +52,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
 def _take(drawn: dict[str, list[Line]], topic: str, message: MarkerArray) -> None:
     kind = Marker.LINE_STRIP, Marker.ADD
     lines = [_line(m) for m in message.markers if (m.type, m.action) == kind and m.points]
-    if lines:  # an estimator that waits has none
+    if lines:  # an estimator without a network draws none
         drawn[topic] = lines
 
 
@@ -60,8 +60,8 @@ def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
     add = parser.add_argument
-    told = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} where nobody publishes them)'
-    add('--topic', help=told)
+    topic_help = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} if nobody publishes it)'
+    add('--topic', help=topic_help)
     add('--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]')
     return parser.parse_args(arguments)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `replay`: plays a recorded bag onto the topics, or reports what is in it."""
+"""The node `replay`: plays a recorded bag onto its topics, or checks its contents."""
 
 import sys
 import time
@@ -41,36 +41,36 @@ from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-# Deep enough that a reader that is late by a second still gets everything.
+# Deep enough that a reader that is one second late still receives every message.
 DEPTH = 1000
-# Services are answered at least so often; between, a short wait is slept.
+# Services are answered at least once per SERVICE_PERIOD; waits up to SLEPT use time.sleep.
 SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
-# A publisher sees its subscriber a little before the subscriber sees it and takes messages.
+# A publisher discovers a subscriber slightly before that subscriber can receive messages.
 SETTLE_TIME = 0.3  # [s]
 LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
 TRAJECTORY = 'joint_trajectory'
-# How a report on /diagnostics says that no message was used since the one before.
+# Value of a rate on /diagnostics if no message was used since the previous report.
 NO_RATE = '0.0 Hz'
-# [s] for a first report of those that listen, and for two reports after a message was sent.
+# [s] to wait for a first report of the subscribers, and for two reports after sending.
 FIRST_REPORT_TIME, REPORT_TIME = 2.0 * PERIOD, 5.0 * PERIOD
-SENDINGS = 3  # of a trajectory that does not arrive
-# [s] for subscribers: a recording may begin without them, one message is worth a longer wait.
+SENDINGS = 3  # attempts to send a trajectory
+# [s] to wait for subscribers: playback may start without them, a single trajectory cannot.
 WAIT, SEND_WAIT = 2.0, 10.0
-ACKNOWLEDGE_TIME = 2.0  # [s] for reliable readers at the end
-# Recorded time between two messages on /clock, but not more often than nodes can bear.
+ACKNOWLEDGE_TIME = 2.0  # [s] to wait until reliable readers have acknowledged the messages
+# Recorded time between two messages on /clock, and the shortest wall time that nodes can handle.
 CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
 
 
 class Replay(Node):
-    """Publishes recorded bytes at their time."""
+    """Publishes recorded messages, as serialized bytes, at their recorded times."""
 
     def __init__(self, bag: Bag, names: dict[str, str], options: Namespace) -> None:
-        """Advertise the topics: `names` says what to publish each recorded one on."""
+        """Advertise the topics; `names` maps each recorded topic to the one to publish."""
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
         self.length = (self._stop - self._start) / 1e9  # [s]
-        self._before = (self._start - bag.start) / 1e9  # [s] of the bag
+        self._before = (self._start - bag.start) / 1e9  # [s] of the bag that are skipped
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher: dict[str, Publisher] = {}
         for recorded, name in names.items():
@@ -81,8 +81,8 @@ class Replay(Node):
             self._recorded_time = self.create_publisher(Clock, '/clock', QoSProfile(depth=1))
         self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
         self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
-        self._sought: int | None = None  # where to go on [ns]
-        description = 'go on from here, counted from the beginning [s]'
+        self._sought: int | None = None  # recorded time to seek to [ns]
+        description = 'position in the bag; set it to seek [s]'
         descriptor = ParameterDescriptor(description=description)
         end = self._before + self.length
         legal = FloatingPointRange(from_value=self._before, to_value=end)
@@ -92,7 +92,7 @@ class Replay(Node):
         self._position_publisher = self.create_publisher(
             Float64MultiArray, 'replay/position', RELIABLE
         )
-        reception = Reception(self.get_logger().warning)  # of nothing: it only sends
+        reception = Reception(self.get_logger().warning)  # stays empty: this node only publishes
         self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
@@ -101,14 +101,14 @@ class Replay(Node):
         self._spinner = Spinner(self)
 
     def get_ready(self, longest: float) -> None:
-        """Wait until every topic has a subscriber, at most so long [s]; then offer services."""
+        """Wait at most `longest` [s] until every topic has a subscriber; then offer services."""
         topics = [*self._publisher.values(), *filter(None, [self._recorded_time])]
         _await_subscribers(self._spinner, topics, longest)
         for work in (self.pause, self.resume, self.step):
             serve(self, Trigger, f'replay/{work.__name__}', work)
 
     def play(self, progress: tqdm, again: bool) -> None:
-        """Publish everything, from start to stop; again and again until the process is ended."""
+        """Publish all messages from start to stop; if `again`, repeat until the process ends."""
         self._lap(progress)
         while again:
             self._wait(self._stop + LAP_GAP, progress)
@@ -119,7 +119,7 @@ class Replay(Node):
         self._sought = self._start if self._sought is None else self._sought
         while self._sought is not None:
             start, self._sought = self._sought, None
-            # Just before the first message, so that it is not due when the lap begins paused.
+            # Jump to just before the first message, which is then not due yet if paused.
             self._timeline.jump(start - 1, time.monotonic())
             for message in lap(self._bag, self._names, start, self._stop):
                 if not self._wait(message.log_time, progress):
@@ -130,14 +130,18 @@ class Replay(Node):
                 self._publisher[message.topic].publish(message.data)
 
     def acknowledge(self) -> None:
-        """Give reliable readers time to get the last messages."""
+        """Wait until reliable readers have acknowledged the last messages."""
         end = time.monotonic() + ACKNOWLEDGE_TIME
         for publisher in self._publisher.values():
             left = max(0.0, end - time.monotonic())
             publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
 
     def _wait(self, recorded: int, progress: tqdm) -> bool:
-        """Answer services and publish the clock until a recorded time [ns] is due; False: seek."""
+        """Answer services and publish the clock until a recorded time [ns] is due.
+
+        Returns:
+            False if a seek was requested meanwhile.
+        """
         self._next_time = recorded
         while (due := self._timeline.wait(recorded, now := time.monotonic())) > 0:
             if self._sought is not None:
@@ -163,7 +167,7 @@ class Replay(Node):
         return self._sought is None
 
     def _tick(self) -> None:
-        """Publish the recorded time, if it is wanted and due."""
+        """Publish the recorded time on /clock, if enabled and due."""
         if self._recorded_time and (now := time.monotonic()) >= self._next_tick:
             self._next_tick = now + self._clock_period
             seconds, nanoseconds = divmod(self._timeline.recorded(now), 1_000_000_000)
@@ -175,12 +179,12 @@ class Replay(Node):
                 self._sought = self._bag.start + int(1e9 * parameter.value)
 
     def pause(self, _: Trigger.Request) -> str:
-        """Stop where it is."""
+        """Pause at the present position."""
         self._timeline.hold(True, time.monotonic())
         return f'paused at {self._position()}'
 
     def resume(self, _: Trigger.Request) -> str:
-        """Go on."""
+        """Resume playback."""
         self._timeline.hold(False, time.monotonic())
         return f'playing at {self._position()}'
 
@@ -192,7 +196,7 @@ class Replay(Node):
         return f'stepped at {self._position()}'
 
     def _done(self) -> float:
-        """Return how much has been played [s]."""
+        """Return the played time [s]."""
         return max(0.0, (self._timeline.recorded(time.monotonic()) - self._start) / 1e9)
 
     def _position(self) -> str:
@@ -200,13 +204,13 @@ class Replay(Node):
 
 
 def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: float) -> None:
-    """Wait until every topic has a subscriber that takes messages, at most so long [s]."""
+    """Wait at most `longest` [s] until every topic has a subscriber that can receive messages."""
     spinner.spin_until(lambda: all(p.get_subscription_count() for p in publishers), longest)
     time.sleep(SETTLE_TIME if longest else 0.0)
 
 
 class _Answers:
-    """What the nodes that listen to a topic say of it on /diagnostics."""
+    """Reports on /diagnostics of the nodes that subscribe to a topic."""
 
     def __init__(self, node: Node, topic: str) -> None:
         self._node, self._topic = node, topic
@@ -216,7 +220,7 @@ class _Answers:
 
     @property
     def listeners(self) -> set[str]:
-        """The names under which the nodes that listen report."""
+        """Status names of the nodes that subscribe to the topic."""
         infos = self._node.get_subscriptions_info_by_topic(self._topic)
         return {f'{info.node_namespace.rstrip("/")}/{info.node_name}: state' for info in infos}
 
@@ -226,7 +230,7 @@ class _Answers:
                 self.reports.append({value.key: value.value for value in status.values})
 
     def begin(self) -> None:
-        """Forget the reports so far; what they count as refused is an earlier message."""
+        """Forget the reports so far; refusals that they count concern earlier messages."""
         self._refused_before = self._refused
         self.reports.clear()
 
@@ -238,13 +242,13 @@ class _Answers:
 
     @property
     def is_taken(self) -> bool:
-        """Whether a node reports that it has used a message since."""
+        """Whether a node has reported using a message since `begin`."""
         key = f'{TRAJECTORY} rate'
         return any(values.get(key, NO_RATE) != NO_RATE for values in self.reports)
 
     @property
     def refusal(self) -> str:
-        """Why a node has refused a message since; '' if none reports that."""
+        """Why a node has refused a message since `begin`; '' if none has reported a refusal."""
         if not self.reports or self._refused <= self._refused_before:
             return ''
         last = self.reports[-1].get('last rejected', '')
@@ -252,20 +256,20 @@ class _Answers:
 
 
 def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wait: float) -> None:
-    """Publish a trajectory to nodes that have been matched, and wait until it has been used.
+    """Publish a trajectory to the connected nodes, and wait until one has used it.
 
     Raises:
         MusculoskeletalError: If nobody listens, or the trajectory did not arrive or was refused.
     """
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
     answers = _Answers(node, publisher.topic_name)
-    # The list of subscribers may come before the connection to them, or after it.
+    # Discovery may list a subscriber before or after the connection to it is made.
     spinner.spin_until(lambda: publisher.get_subscription_count() and answers.listeners, wait)
     if not publisher.get_subscription_count():
-        found = ', '.join(sorted(answers.listeners))
+        listeners = ', '.join(sorted(answers.listeners))
         raise MusculoskeletalError(
-            f'no connection to {found} within {wait:g} s: try again, or with a longer --wait'
-            if found
+            f'no connection to {listeners} within {wait:g} s: try again, or with a longer --wait'
+            if listeners
             else f'nobody listens to {topic}: start the controller first'
         )
     spinner.spin_until(lambda: answers.reports, FIRST_REPORT_TIME)
@@ -284,7 +288,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
         if answers.is_taken:
             return
         if is_acknowledged and not answers.reports:
-            print(f'{topic}: received; whether it was taken has not been reported', file=sys.stderr)
+            print(f'{topic}: received; no node has reported whether it uses it', file=sys.stderr)
             return
     raise MusculoskeletalError(
         f'{topic} was sent {SENDINGS} times and did not arrive; is this machine overloaded?'
@@ -292,9 +296,9 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
 
 
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish what a hand taught as one trajectory, and say whether the controller took it."""
+    """Publish a hand-guided motion as one trajectory; fail if the controller refuses it."""
     names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
-    if len(names) > 1:  # all arms' names are kept
+    if len(names) > 1:  # with --keep-names, the bag's arms stay separate
         problem = f'has the motion of several arms: {", ".join(names)}'
         raise BagError(bag.path, problem, 'choose one with --from-namespace')
     ((recorded, name),) = names.items()
@@ -309,7 +313,7 @@ def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
     topic, spinner = name.removesuffix(TAUGHT_TOPIC) + TRAJECTORY, Spinner(node)
     _send(node, spinner, message, topic, options.wait)
     length = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
-    print(f'{topic}: {length}, the first {LEAD_TIME:g} s of it to where it begins')
+    print(f'{topic}: {length}; the first {LEAD_TIME:g} s lead to the beginning of the motion')
     return 0
 
 
@@ -340,20 +344,21 @@ def parse(arguments: list[str]) -> Namespace:
         'replay',
         'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,
         'While it plays, the services replay/pause, replay/resume and replay/step '
-        '(std_srvs/Trigger) stop it, go on, and play the messages of the next recorded time. Its '
-        'parameter `position` [s] goes there.',
+        '(std_srvs/Trigger) pause it, resume it, and play the messages of the next recorded time. '
+        'Set its parameter `position` [s] to seek.',
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='a bag directory, or one mcap or sqlite3 file')
-    add('--check', action='store_true', help='play nothing; say what is in it (exit status 1: bad)')
+    check = 'play nothing; check and report the contents (exit status 1: faults)'
+    add('--check', action='store_true', help=check)
     add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
     topics = (
-        f'{DEFAULT}: what hardware, vision, user and controller sent; {ALL}: also what nodes '
-        'compute; or names separated by commas'
+        f'{DEFAULT}: topics of hardware, vision, user and controller; {ALL}: also those that '
+        'nodes compute; or names separated by commas'
     )
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
     add('--keep-names', action='store_true', help='keep the recorded namespace')
-    add('--from-namespace', metavar='NS', help='which arm, of a bag that has several')
+    add('--from-namespace', metavar='NS', help='arm to play, if the bag has several arms')
     rate = 'multiple of the recorded speed; needs --clock'
     add('--rate', type=number(1e-3, 1e3), default=1.0, help=rate)
     add('--clock', action='store_true', help='publish the recorded time on /clock')
@@ -361,16 +366,17 @@ def parse(arguments: list[str]) -> Namespace:
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
-    teach = f'send the motion of {TAUGHT_TOPIC} as one smooth joint_trajectory, and end'
+    teach = f'send the motion of {TAUGHT_TOPIC} as one smooth joint_trajectory, then exit'
     add('--as-trajectory', action='store_true', help=teach)
-    add('--paused', action='store_true', help='wait for replay/resume or replay/step')
+    paused = 'start paused: wait for replay/resume or replay/step'
+    add('--paused', action='store_true', help=paused)
     wait = f'longest wait for subscribers [s] (default: {WAIT:g}, --as-trajectory: {SEND_WAIT:g})'
     add('--wait', type=not_negative, metavar='S', help=wait)
     options = parser.parse_args(arguments)
     if options.rate != 1 and not options.clock:
         parser.error(
             '--rate other than 1 needs --clock, and nodes with use_sim_time: '
-            'by their own clocks they would take the arm to be faster or slower than it was'
+            'by their own clocks the arm would seem faster or slower than it was'
         )
     if options.robot and not options.check:
         parser.error('--robot is for --check')
@@ -379,22 +385,22 @@ def parse(arguments: list[str]) -> Namespace:
             name for name, value in vars(options).items() if value != parser.get_default(name)
         }
         if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
-            parser.error(f'--check plays nothing: without --{ignored[0].replace("_", "-")}')
+            parser.error(f'--check plays nothing: remove --{ignored[0].replace("_", "-")}')
     if options.wait is None:
         options.wait = SEND_WAIT if options.as_trajectory else WAIT
     if options.as_trajectory and (options.loop or options.clock or options.paused):
-        parser.error('--as-trajectory sends one message: without --loop, --clock and --paused')
+        parser.error('--as-trajectory sends one message: remove --loop, --clock and --paused')
     if options.as_trajectory and options.topics != [DEFAULT]:
         listed = ','.join(options.topics)
         parser.error(
-            f'--as-trajectory sends the motion of {TAUGHT_TOPIC}: without --topics {listed}'
+            f'--as-trajectory sends the motion of {TAUGHT_TOPIC}: remove --topics {listed}'
         )
     return options
 
 
 def _work(options: Namespace, arguments: list[str]) -> int:
     if options.check:
-        # The robot's model takes a second to load, which playing does not need.
+        # Imported here, because loading the robot model takes a second that playback does not need.
         from musculoskeletal_ae.bags.check import check_bag
 
         check = check_bag(options.bag, options.robot, options.from_namespace)
@@ -403,7 +409,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
     try:
         return _replay(options, arguments)
     except KeyboardInterrupt:
-        return 0  # as `ros2 bag play`
+        return 0  # like `ros2 bag play`
 
 
 main = partial(run_tool, 'replay', parse, _work)

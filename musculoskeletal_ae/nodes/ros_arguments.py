@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS arguments on the command line: which parameters they set, and what rclpy raises for them."""
+"""ROS arguments on the command line: the parameters that they set, and the errors of rclpy."""
 
 import os
 from itertools import pairwise
@@ -7,8 +7,8 @@ from itertools import pairwise
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-NO_REASON = 'error not set'  # what rcl says where it has stated none
-#: what rclpy raises for a value of the wrong type or beyond its range, given at the start
+NO_REASON = 'error not set'  # the message of rcl for an error without a reason
+#: exceptions of rclpy for a start-up value of the wrong type or out of range
 PARAMETER_ERRORS = (
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -18,7 +18,7 @@ PARAMETER_ERRORS = (
 
 
 def reason(error: Exception) -> str:
-    """Return what rcl says is wrong, without the place in its sources."""
+    """Return the message of an rcl error, without the location in its source code."""
     text = ' '.join(str(error).split(', at /')[0].split())
     is_secured = os.environ.get('ROS_SECURITY_ENABLE') == 'true'
     if is_secured and not os.environ.get('ROS_SECURITY_KEYSTORE') and NO_REASON in text:
@@ -30,6 +30,6 @@ def reason(error: Exception) -> str:
 
 
 def parameters_given(arguments: list[str]) -> list[str]:
-    """Return the names that `-p NAME:=VALUE` or `-p NODE:NAME:=VALUE` give values."""
+    """Return the names of the parameters set by `-p NAME:=VALUE` or `-p NODE:NAME:=VALUE`."""
     values = [value for flag, value in pairwise(arguments) if flag in ('-p', '--param')]
     return [value.partition(':=')[0].rpartition(':')[2] for value in values]

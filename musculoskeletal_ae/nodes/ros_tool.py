@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tools on the ROS graph share: `check_driver`, `record`, `render`, `replay`, `view`."""
+"""Shared code of the ROS tools `check_driver`, `record`, `render`, `replay` and `view`."""
 
 import sys
 import time
@@ -25,7 +25,7 @@ from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
-LONGEST_WAIT = 0.1  # [s] between looks at a condition, and at the stop signals
+LONGEST_WAIT = 0.1  # [s] between checks of a condition and of the stop signals
 
 
 def message_class(type_name: str) -> Any:
@@ -40,9 +40,10 @@ def message_class(type_name: str) -> Any:
 
 
 class Spinner:
-    """Runs the callbacks of a tool's node while the tool waits; an exception in one ends the tool.
+    """Runs the callbacks of a tool's node while the tool waits.
 
-    Inside rclpy a stop signal is only remembered (`stop_signals.Reaction`).
+    An exception in a callback ends the tool. A stop signal that arrives inside rclpy is handled
+    after rclpy returns (`stop_signals.Reaction.REMEMBER`).
     """
 
     def __init__(self, node: Node) -> None:
@@ -56,12 +57,12 @@ class Spinner:
         self._executor.shutdown()
 
     def spin_once(self, longest: float) -> None:
-        """Run what is ready, or wait at most so long [s] for something."""
+        """Run the callbacks that are ready; wait at most `longest` [s] for the first."""
         with STOP.reacting(Reaction.REMEMBER):
             self._executor.spin_once(longest)
 
     def spin_until(self, condition: Callable[[], object], longest: float) -> None:
-        """Run callbacks until a condition holds, at most so long [s].
+        """Run callbacks until a condition holds, for at most `longest` [s].
 
         Raises:
             KeyboardInterrupt: After a stop signal.
@@ -73,7 +74,7 @@ class Spinner:
 
 
 def start_ros(arguments: list[str]) -> None:
-    """Start ROS without its signal handlers, which would end publishers before the tool's work."""
+    """Start ROS without its signal handlers, which would shut publishers down too early."""
     with _clear_ros_arguments(arguments):
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
 
@@ -84,17 +85,23 @@ def run_tool(
     work: Callable[[Namespace, list[str]], int],
     argv: list[str] | None = None,
 ) -> int:
-    """Parse options, work with them and with all arguments, and return the exit status.
+    """Run a command-line tool and return its exit status.
 
-    `argv` are the arguments, those for ROS included; None for those of the process. Status 1 says
-    that something cannot be used, 2 that an option is wrong.
+    Args:
+        name: Name of the executable.
+        parse: Parses the arguments that are not for ROS.
+        work: Does the work, from the options and all arguments.
+        argv: Arguments, those for ROS included; None: those of the process.
+
+    Returns:
+        The status of `work`; 1 if an input cannot be used; 2 if an option is wrong.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     with _clear_ros_arguments(arguments):
         options = parse(remove_ros_args(arguments)[1:])
     for parameter in parameters_given(arguments):
         if parameter not in OF_RCLPY:
-            problem = f'{parameter!r} is no parameter: options of {name} stand before --ros-args'
+            problem = f'{parameter!r} is not a parameter; put options of {name} before --ros-args'
             print(printable(f'{name}: error: {problem}'), file=sys.stderr)
             return 2
     refused = (InvalidTopicNameException, rclpy_implementation.RCLError, *PARAMETER_ERRORS)
@@ -107,7 +114,7 @@ def run_tool(
 def _interruptible(
     work: Callable[[Namespace, list[str]], int], options: Namespace, arguments: list[str]
 ) -> int:
-    """Work; once a stop signal was received, any error is taken to be its consequence."""
+    """Run `work`; treat any error after a stop signal as a consequence of the signal."""
     try:
         return work(options, arguments)
     except ExternalShutdownException as error:

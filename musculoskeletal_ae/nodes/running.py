@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a node, from its parameters to its end.
+"""Runs a node: checks arguments, constructs it, spins it and destroys it.
 
-SIGINT and SIGTERM are remembered while nodes are constructed and while they run (`stop_signals`). A
-timer looks at that ten times a second, and lets the executor return. Nodes are then destroyed, and
-after them the ROS context. Without progress for 10 s the process ends by itself (`progress`).
+While nodes run, SIGINT and SIGTERM only set a flag (`stop_signals`). A timer checks the flag ten
+times a second and makes the executor return. Nodes are then destroyed, and after them the ROS
+context. The process ends itself after 10 s without progress (`progress`).
 """
 
 import gc
@@ -27,20 +27,20 @@ from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_
 from musculoskeletal_ae.nodes.shell import STEADY
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-STOP_LOOK_PERIOD = 0.1  # [s]
-NICENESS = 5  # of nodes that no command waits for
+STOP_CHECK_PERIOD = 0.1  # [s]
+NICENESS = 5  # of nodes that are not time-critical
 
 
 def run(name: str) -> int:
     """Run a node, or several in one process and thread, until it is asked to stop.
 
     Returns:
-        The exit status: 0 after a stop; 1, with one line on stderr, if something cannot be used (a
-        robot, a parameter, a checkpoint); 2 for a wrong option.
+        The exit status: 0 after a stop; 1, with one line on stderr, if a robot, parameter or
+        checkpoint cannot be used; 2 for a wrong option.
     """
     try:
         if unknown := _options_beside_ros():
-            remedy = f'parameters are given as  {name} --ros-args -p NAME:=VALUE'
+            remedy = f'set parameters by  {name} --ros-args -p NAME:=VALUE'
             print(f'{name}: error: unknown option {unknown[0]!r}; {remedy}', file=sys.stderr)
             return 2
         check_names(parameters_given(sys.argv[1:]), name)
@@ -60,7 +60,7 @@ def run(name: str) -> int:
 
 
 def _options_beside_ros() -> list[str]:
-    """Return the command-line arguments that are not ROS's: a node has no options of its own."""
+    """Return the command-line arguments that are not for ROS; a node has no options of its own."""
     arguments = sys.argv[1:]
     end = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
     return arguments[:end] or list(remove_ros_args(sys.argv)[1:])
@@ -75,21 +75,21 @@ def _run(kinds: list[Any]) -> None:
         with make_executor() as executor:
             with STOP.reacting(Reaction.EXIT_SOON):
                 for kind in kinds:
-                    _lower_priority(kind)  # before it starts processes, which inherit that
+                    _lower_priority(kind)  # child processes inherit the priority
                     nodes.append(kind())
                     _lower_priority(nodes[-1])
                     executor.add_node(nodes[-1])
                     stop_if_asked()
-                # Garbage collections need not look again at what is there from the start: they
-                # would delay a command by 40 ms.
+                # Freeze start-up objects, so that later garbage collections do not delay a command
+                # by 40 ms.
                 gc.collect()
                 gc.freeze()
 
-            def look() -> None:
+            def check_stop() -> None:
                 watch.note()
                 stop_if_asked()
 
-            nodes[0].create_timer(STOP_LOOK_PERIOD, look, clock=STEADY)
+            nodes[0].create_timer(STOP_CHECK_PERIOD, check_stop, clock=STEADY)
             if all(node.is_watched for node in nodes):
                 watch.start()
             spin(executor, nodes[0])
@@ -106,8 +106,8 @@ def _run(kinds: list[Any]) -> None:
 def spin(executor: Executor, node: Any) -> None:
     """Spin until the context is shut down, or a callback raises ExternalShutdownException.
 
-    Nodes count the exceptions of their callbacks themselves. What rclpy raises beside them, such as
-    for a message that cannot be deserialized, is counted by `node`.
+    Each node counts the exceptions of its own callbacks. `node` counts those that rclpy raises
+    outside callbacks, for example for a message that cannot be deserialized.
     """
     while rclpy.ok():
         try:
@@ -125,6 +125,6 @@ def stop_if_asked() -> None:
 
 
 def _lower_priority(node: Node | type[Node]) -> None:
-    """Let other processes go first on a busy machine, if no command waits for a node."""
+    """Lower the process priority if the node is not time-critical."""
     if not node.is_time_critical:  # type: ignore[union-attr]
         os.nice(max(0, NICENESS - os.nice(0)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all node shells share: parameters, checkpoints, subscriptions, diagnostics."""
+"""Base class of all nodes: parameters, checkpoints, subscriptions, diagnostics."""
 
 from __future__ import annotations
 
@@ -59,56 +59,66 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-if TYPE_CHECKING:  # it needs what writes bags
+if TYPE_CHECKING:  # importing it loads the bag writer
     from musculoskeletal_ae.nodes.stop_recording import StopRecording
 
-#: for ages and watchdogs; never stands still, whatever /clock does
+#: clock for message ages and watchdogs; independent of /clock
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
-MOST_ZERO = 10.0  # [m] of a length sensor
-#: what to do about a quality of service that does not fit, by who states it
+MOST_OFFSET = 10.0  # [m] of a length sensor
+#: remedies for incompatible QoS, by who states the policy and by policy
 QOS_REMEDIES = {
     ('publisher offers', QoSPolicyKind.RELIABILITY): 'publish it reliable',
     ('publisher offers', QoSPolicyKind.DURABILITY): 'publish it transient local (latched)',
     ('subscriber asks', QoSPolicyKind.RELIABILITY): 'subscribe best-effort',
     ('subscriber asks', QoSPolicyKind.DURABILITY): 'subscribe volatile',
 }
-MANY_REPORTS = QoSProfile(depth=50)  # of all nodes of the graph
+MANY_REPORTS = QoSProfile(depth=50)  # all nodes of the graph report on one topic
 
 
 class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
 
-    core: Any = None  # what computes
+    core: Any = None  # the object that computes, without ROS
     is_time_critical = True  # whether commands wait for it
     is_watched = True  # whether the process ends if it makes no progress for 10 s
-    recording: StopRecording | None = None  # told of every message that is new, before it is used
-    #: topics that have one rightful publisher, but on which this node takes what anybody sends
+    recording: StopRecording | None = None  # records every new message before it is used
+    #: topics of `AUTHORS` whose messages this node accepts from several publishers
     accepted_from_all: frozenset[str] = frozenset()
 
     def __init__(self, name: str, **options: Any) -> None:
-        """Start the node, declare its parameters and load its robot; options are those of Node."""
+        """Start the node, declare its parameters and load its robot.
+
+        Args:
+            name: Name of the node, also in `PARAMETERS`.
+            options: Keyword arguments of `Node`.
+
+        Raises:
+            MusculoskeletalError: If a parameter or the robot cannot be used.
+        """
         super().__init__(name, **options)
         self._table = PARAMETERS[name]
         self._setters: dict[str, Callable[[Any], object]] = {}
         self._prepare: dict[str, Callable[[Any], object]] = {}
-        self._proposed: dict[str, Any] = {}  # values that are being judged
+        self._proposed: dict[str, Any] = {}  # values of a request that is being checked
         for key, parameter in self._table.items():
             default = parameter.default
             default = list(default) if isinstance(default, tuple) else default
             self.declare_parameter(key, default, _descriptor(parameter))
-            self.parameter(key)  # refuses what is not legal
+            self.parameter(key)  # raises if the value is not legal
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
-        #: name of the root link's frame in messages that are published
+        #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
         self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
-        self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}  # how to subscribe anew
+        self._latched: dict[
+            str, tuple[Any, Callable[[], Any]]
+        ] = {}  # subscription, and how to renew it
         self.sources = Sources(self, self._reception.turns, self._subscribe_anew)
         self.rejected = self._reception.rejected  # messages, by topic and reason
-        #: as the estimator publishes it
+        #: offsets and isolated muscles that the estimator has published
         self.body = BodyState.healthy(self.robot.muscle_count)
         self.add_on_set_parameters_callback(self._set_parameters)
         hardware = self.robot.description.directory.name
@@ -125,7 +135,7 @@ class Shell(Node):
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
         self.checkpoint_version: int | None = None  # of the network in use
-        self.needed: list[str] = []  # topics without which the node has nothing to do
+        self.needed: list[str] = []  # topics that the node needs to work
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -133,10 +143,10 @@ class Shell(Node):
             backward, post_callback=lambda _: self.clock_jumped_back()
         )
 
-    # -- what a node overrides ------------------------------------------------------------------
+    # -- methods for subclasses to override -----------------------------------------------------
 
     def report(self) -> Report:
-        """Return what /diagnostics shows: what the core says, where there is one."""
+        """Return the diagnostic report; by default that of the core, if there is one."""
         return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
 
     def clock_jumped_back(self) -> None:
@@ -144,21 +154,21 @@ class Shell(Node):
         if self.core:
             self.core.clock_jumped_back()
 
-    # -- what must not end the node -------------------------------------------------------------
+    # -- errors in callbacks --------------------------------------------------------------------
 
     def on_callback_error(self, source: str, error: Exception) -> None:
         """Count and log an exception that escaped a callback, by topic or service."""
         if source == TIMER:  # no message caused it
-            self._fault = f'fault of its own: {type(error).__name__}: {error}'
+            self._fault = f'internal error: {type(error).__name__}: {error}'
         if self._reception.reject_error(source, error):
             self.get_logger().error(printable(traceback.format_exc()))
 
     def create_subscription(  # type: ignore[override]
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Any:
-        """Subscribe; an exception that escapes the callback is counted.
+        """Subscribe; count exceptions that escape the callback.
 
-        rclpy subscribes to /clock by this method as well.
+        rclpy calls this method for /clock as well.
         """
         guarded = self._guarded(self.resolve_topic_name(topic), callback)
         if qos_profile is RELIABLE:
@@ -172,7 +182,7 @@ class Shell(Node):
     def create_publisher(  # type: ignore[override]
         self, msg_type: Any, topic: str, qos_profile: Any, **options: Any
     ) -> Any:
-        """Advertise; a subscriber that cannot be served is reported."""
+        """Advertise; report subscribers with incompatible QoS."""
         events = PublisherEventCallbacks(
             incompatible_qos=lambda event: self._on_incompatible(topic, 'subscriber asks', event)
         )
@@ -189,11 +199,11 @@ class Shell(Node):
     def create_timer(  # type: ignore[override]
         self, timer_period_sec: float, callback: Any, **options: Any
     ) -> Any:
-        """Create a timer; an exception that escapes the callback is counted as a fault."""
+        """Create a timer; count and report exceptions that escape its callback."""
         return super().create_timer(timer_period_sec, self._guarded(TIMER, callback), **options)
 
     def _guarded(self, source: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a callback that counts what escapes `callback`; rclpy sees the same signature."""
+        """Return a callback with the same signature that counts exceptions of `callback`."""
 
         @wraps(callback)
         def call(*arguments: Any) -> None:
@@ -219,7 +229,7 @@ class Shell(Node):
     def create_service(  # type: ignore[override]
         self, srv_type: Any, srv_name: str, callback: Any, **options: Any
     ) -> Any:
-        """Offer a service that answers even if an exception escapes its callback."""
+        """Offer a service that responds even if an exception escapes its callback."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -236,14 +246,18 @@ class Shell(Node):
     # -- parameters -----------------------------------------------------------------------------
 
     def parameter(self, name: str) -> Any:
-        """Return a parameter's value, if it is legal; lists as tuples, without empty names."""
-        with _blaming(name):
+        """Return a parameter's checked value; lists as tuples, without empty names.
+
+        Raises:
+            MusculoskeletalError: If the value is not legal.
+        """
+        with _naming_parameter(name):
             value = self._proposed.get(name, self._held(name))
             return self._table[name].checked(value)
 
     def _held(self, name: str) -> Any:
         value = self.get_parameter_or(name, RosParameter(name)).value
-        # What rcl makes of an empty list that is given at the start.
+        # rcl reads an empty list on the command line as None.
         return [] if value is None and isinstance(self._table[name].default, tuple) else value
 
     def follow_parameter(
@@ -252,12 +266,18 @@ class Shell(Node):
         setter: Callable[[Any], object],
         prepare: Callable[[Any], object] | None = None,
     ) -> None:
-        """Call `setter`, which raises to refuse, with a parameter's value now and when set.
+        """Call `setter` with the value of a parameter now, and whenever the parameter is set.
 
-        It is called again with the value before if another one of those set together is refused.
-        Where that would bring nothing back, `prepare` makes of the value what the setter takes, or
-        None for nothing to do, and raises to refuse: such setters are called last, in the order in
-        which they were given, one that several parameters share once. Only the first may raise.
+        Parameters of one request are set together or not at all. If one is refused, the setters of
+        the others are called again with the previous values. Setters whose effect cannot be
+        undone in this way need `prepare`. They are called after all others, in the order of
+        registration, and once if several parameters share one. Only the first of them may raise.
+
+        Args:
+            name: Name of the parameter.
+            setter: Takes the value; raises a MusculoskeletalError to refuse it.
+            prepare: Converts the value for `setter`, or returns None if there is nothing to do;
+                raises a MusculoskeletalError to refuse it.
         """
         self._setters[name] = setter
         if prepare is not None:
@@ -265,10 +285,10 @@ class Shell(Node):
         self._take({name: self._held(name)})
 
     def _take(self, values: dict[str, Any]) -> None:
-        """Call the setters of parameters, of all or, if one is refused, of none."""
+        """Set parameters together; if one is refused, restore the others and raise."""
         legal, last = dict[str, Any](), dict[Callable[[Any], object], tuple[str, Any]]()
         for name in filter(values.__contains__, self._setters):
-            with _blaming(name):
+            with _naming_parameter(name):
                 legal[name] = self._table[name].checked(values[name])
                 if prepare := self._prepare.get(name):
                     prepared = prepare(legal.pop(name))
@@ -277,11 +297,11 @@ class Shell(Node):
         taken: list[str] = []
         try:
             for name, value in legal.items():
-                with _blaming(name):
+                with _naming_parameter(name):
                     self._setters[name](value)
                 taken.append(name)
             for setter, (name, value) in last.items():
-                with _blaming(name):
+                with _naming_parameter(name):
                     setter(value)
         except MusculoskeletalError:
             self._proposed = {}
@@ -304,10 +324,11 @@ class Shell(Node):
     def follow_accepted_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Use the network that the estimator has accepted, or until there is one that of a file.
+        """Follow the network that the estimator has accepted; until then, use that of a file.
 
-        `unfit` is called with the reason if a network cannot be computed with; the one in use
-        stays.
+        Args:
+            use: Puts a network to use.
+            unfit: Called with the reason if a network is unusable; the previous one stays in use.
         """
         has_accepted = False
 
@@ -340,7 +361,7 @@ class Shell(Node):
         self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
 
     def load_checkpoint(self, path: str) -> Mae | None:
-        """Return the network of a file, which has to be one of this robot; None without a path."""
+        """Return the network of a file for this robot; None if the path is empty."""
         return checkpoint.load(path, self.robot) if path else None
 
     def checkpoint_queue(
@@ -349,26 +370,32 @@ class Shell(Node):
         handle: Callable[[UInt8MultiArray], Iterator[None]],
         unfit: Callable[[str], None] = lambda _: None,
     ) -> CheckpointQueue:
-        """Return what handles the checkpoints of a topic in small steps."""
+        """Return a queue that handles the checkpoints of a topic in small steps."""
         return CheckpointQueue(self, self._reception, topic, handle, unfit)
 
     def stop_waiting_for(self, topic: str) -> None:
-        """Report this topic as missing no longer."""
+        """Stop reporting this topic as missing."""
         self.needed = [other for other in self.needed if other != topic]
 
     # -- messages -------------------------------------------------------------------------------
 
     def now(self) -> float:
-        """Return the time of a message that comes now, by the ROS clock [s]."""
+        """Return the time of the ROS clock [s]."""
         return self.get_clock().now().nanoseconds * 1e-9
 
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
-        """Subscribe; what comes twice or late, or the callback refuses by raising, is counted.
+        """Subscribe, and count messages that are repeated, late or refused by the callback.
 
-        Topics that have one rightful publisher are watched (`sources`). What comes while there are
-        several is rejected, unless the topic is one of `accepted_from_all`.
+        Messages of a topic of `AUTHORS` are rejected while it has several publishers (`sources`),
+        unless the topic is one of `accepted_from_all`.
+
+        Args:
+            kind: Message type.
+            topic: Name of the topic.
+            callback: Takes a message; raises a MusculoskeletalError to refuse it.
+            qos: Quality of service; LATCHED topics can be resubscribed to.
         """
         full, recording = self.resolve_topic_name(topic), self.recording
         if topic in AUTHORS and topic not in self.accepted_from_all:
@@ -384,7 +411,6 @@ class Shell(Node):
                 lambda: self.count_publishers(full),
                 is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
             )
-            # rclpy accepts (message, info) callbacks; its annotations do not know them.
             raw = recording is not None
             return self.create_subscription(kind, topic, receive, qos, raw=raw)
 
@@ -395,7 +421,7 @@ class Shell(Node):
     def _from_author(
         self, topic: str, callback: Callable[[Any], object], is_latched: bool
     ) -> Callable[[Any], None]:
-        """Return a callback that rejects what comes while several nodes publish the topic."""
+        """Return a callback that rejects messages while several nodes publish the topic."""
 
         def take(message: Any) -> None:
             self.sources.check(topic, is_latched)
@@ -404,7 +430,7 @@ class Shell(Node):
         return take
 
     def _subscribe_anew(self, topic: str) -> None:
-        """Let a latched topic bring its value again."""
+        """Resubscribe to a latched topic to receive its value again."""
         subscription, subscribe = self._latched[topic]
         self.destroy_subscription(subscription)
         self._latched[topic] = subscribe(), subscribe
@@ -415,14 +441,14 @@ class Shell(Node):
 
     @property
     def intruders(self) -> str:
-        """Which other nodes publish what this arm's nodes alone should, or ''."""
-        found = [self.sources.intruders]
+        """Other nodes that publish topics of this arm's nodes, or have this node's name; or ''."""
+        problems = [self.sources.intruders]
         if not self.twins.is_alone(time.monotonic()):
-            found.append(f'two nodes are named {self.get_fully_qualified_name()}')
-        return '; '.join(filter(None, found))
+            problems.append(f'two nodes are named {self.get_fully_qualified_name()}')
+        return '; '.join(filter(None, problems))
 
     def on_intruders(self, intruders: str) -> None:
-        """Take who publishes beside the rightful publishers; '' if nobody does."""
+        """Handle unexpected publishers, ten times a second; '' if there are none."""
 
     def follow_muscles(
         self,
@@ -431,39 +457,41 @@ class Shell(Node):
         rows: int = 1,
         qos: QoSProfile = RELIABLE,
     ) -> None:
-        """Give `follow` what comes on a topic with a value for each muscle, (M,) or (rows, M)."""
+        """Pass arrays from a topic with values for each muscle to `follow`, (M,) or (rows, M)."""
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
     def follow_muscle_messages(self, follow: Callable[[Float64MultiArray], object]) -> None:
-        """Give `follow` the messages of muscle_states as they are."""
+        """Pass unchecked messages of muscle_states to `follow`."""
         self.listen(Float64MultiArray, 'muscle_states', follow, SENSOR)
 
     def follow_offsets(self, changed: Callable[[], object]) -> None:
-        """Keep the estimator's length offsets in `body`, and call `changed` when they are others.
+        """Keep the estimator's length offsets in `body`; call `changed` when they change.
 
-        Known offsets that differ from the known ones before come from an estimator that was
-        started again and has not heard of those. They count as unknown until it has found them.
+        If known offsets replace different known ones, the estimator has restarted and does not know
+        the result of its last calibration. They count as unknown until it has calibrated again.
         """
-        heard = LengthOffsets.unknown(self.robot.muscle_count)
+        previous = LengthOffsets.unknown(self.robot.muscle_count)
 
         def take(rows: Array) -> None:
-            nonlocal heard
-            if np.abs(rows[0]).max() > MOST_ZERO or rows[1].min() < 0.0:
-                detail = f'{rows.tolist()}, legal: ± {MOST_ZERO:g} m, deviations from 0 on'
-                raise MessageError('impossible zeros', detail)
-            zeros, before, heard = LengthOffsets(*rows), heard, LengthOffsets(*rows)
-            if before.known and zeros.known:
-                if (zeros.offset == before.offset).all():
+            nonlocal previous
+            if np.abs(rows[0]).max() > MOST_OFFSET or rows[1].min() < 0.0:
+                detail = f'{rows.tolist()}, legal: ± {MOST_OFFSET:g} m, deviations from 0 on'
+                raise MessageError('impossible offsets', detail)
+            offsets, before = LengthOffsets(*rows), previous
+            previous = offsets
+            if before.known and offsets.known:
+                if (offsets.offset == before.offset).all():
                     return
-                zeros = replace(LengthOffsets.unknown(len(zeros.offset)), offset=zeros.offset)
-            self.body = self.body.with_offsets(zeros)
+                unknown = LengthOffsets.unknown(len(offsets.offset))
+                offsets = replace(unknown, offset=offsets.offset)
+            self.body = self.body.with_offsets(offsets)
             changed()
 
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 
     def follow_isolated(self, changed: Callable[[], object]) -> None:
-        """Keep in `body` which muscles the estimator has isolated, and call `changed` then."""
+        """Keep the estimator's isolated muscles in `body`; call `changed` after each message."""
 
         def take(message: String) -> None:
             muscles = self.robot.muscle_indices(read_names(message))
@@ -473,9 +501,9 @@ class Shell(Node):
         self.listen(String, 'isolated_muscles', take, LATCHED)
 
     def follow_anomaly(self, follow: Callable[[bool], object]) -> None:
-        """Tell whether the estimator has detected an anomaly, when that changes.
+        """Call `follow` whenever an anomaly begins or ends.
 
-        The end of an anomaly counts once the estimator has confirmed it, asked by a service.
+        An anomaly ends only when the estimator confirms it by a service (`AnomalyLatch`).
         """
         latch = AnomalyLatch(self, follow)
         self.listen(Bool, 'anomaly_detected', lambda message: latch.take(message.data), LATCHED)
@@ -483,10 +511,13 @@ class Shell(Node):
     def follow_posture(
         self, topic: str, follow: Callable[[Array], object], some: bool = False
     ) -> None:
-        """Give `follow` the θ [rad] (D,) that comes on a topic of joint states.
+        """Pass θ [rad] (D,) from a topic of joint states to `follow`.
 
-        If `some` joints are enough, the others are NaN. A position that is not finite then costs
-        that joint only, and is counted.
+        Args:
+            topic: Name of the topic.
+            follow: Takes θ.
+            some: Whether a message may lack joints; those are NaN. Positions that are not finite
+                are then counted, and also NaN.
         """
         joints = self.robot.joints
 
@@ -499,22 +530,23 @@ class Shell(Node):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
-    def _tell_waiting(self, missing: list[str]) -> None:
-        """Say, whenever it changes, which topics have brought nothing yet, and why."""
-        told = [
+    def _log_waiting(self, missing: list[str]) -> None:
+        """Log the needed topics without messages, and the reason, whenever they change."""
+        reasons = [
             f'{self.resolve_topic_name(topic)}, which nobody publishes'
             if self.count_publishers(topic) == 0
-            else f'{self.resolve_topic_name(topic)} that can be used'
+            else f'{self.resolve_topic_name(topic)}, on which no usable message has arrived'
             for topic in missing
         ]
-        before, self._waiting = self._waiting, '; '.join(told)
+        before, self._waiting = self._waiting, '; '.join(reasons)
         if self._waiting != before:
-            self.get_logger().info(f'waiting for {self._waiting}' if told else 'all is there')
+            text = f'waiting for {self._waiting}' if reasons else 'receiving all needed topics'
+            self.get_logger().info(text)
 
     def _report(self) -> None:
         try:
             report = self.report()
-        except Exception as error:  # noqa: BLE001 - who reports nothing seems well
+        except Exception as error:  # noqa: BLE001 - the error has to be reported
             self.on_callback_error(TIMER, error)
             report = Report('error', self._fault, {})
         if self.checkpoint_version is not None:
@@ -526,13 +558,13 @@ class Shell(Node):
             text = f'{SEVERAL}: {intruders}; {self.sources.remedy()}'
             report = Report('error', text, {**report.values, SEVERAL: intruders})
         received = self._diagnostics.tell(report)
-        self._tell_waiting([topic for topic in self.needed if topic not in received])
+        self._log_waiting([topic for topic in self.needed if topic not in received])
 
 
 def _recorded(
     recording: StopRecording, topic: str, kind: type, callback: Callable[[Any], Any]
 ) -> Callable[[bytes], Any]:
-    """Return what takes the bytes of a message, records them, and calls back with the message."""
+    """Return a callback for serialized messages that records them before `callback`."""
 
     def read(data: bytes) -> Any:
         message = deserialize_message(data, kind)
@@ -543,8 +575,8 @@ def _recorded(
 
 
 @contextmanager
-def _blaming(name: str) -> Iterator[None]:
-    """Let errors name the parameter that they are about."""
+def _naming_parameter(name: str) -> Iterator[None]:
+    """Prefix errors with the name of the parameter."""
     try:
         yield
     except (MusculoskeletalError, OSError) as error:
@@ -555,7 +587,7 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(
         description=parameter.description,
         read_only=not parameter.settable,
-        dynamic_typing=parameter.is_number_list,  # `[]` is an array of bytes to rclpy
+        dynamic_typing=parameter.is_number_list,  # rclpy reads `[]` as an array of bytes
     )
     if parameter.within is not None:
         low, high = parameter.within

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `sim`: the learned body as an arm that follows the same command as the real one.
+"""The node `sim`: simulates the learned body, driven by the same commands as the real arm.
 
 muscle_length_command → sim/joint_states, sim/muscle_states, sim/markers; with as_robot:=true it
-takes the robot's place: joint_states, muscle_states, robot_description, sim/markers. Pushed by
-sim/external_wrench, held by sim/fixed_joint_states. A command holds until the next one; before
-the first, muscles are at T_bias. muscle_tension_command is not followed, and modules stay at 25 °C.
+replaces the robot: joint_states, muscle_states, robot_description, sim/markers. The topic
+sim/external_wrench applies an external wrench, sim/fixed_joint_states fixes joints. A command holds
+until the next one; before the first, muscles are at T_bias. The node ignores
+muscle_tension_command, and its modules stay at 25 °C.
 """
 
 from functools import partial
@@ -43,8 +44,8 @@ class Sim(Arm):
         self.follow_accepted_checkpoints(self._use_checkpoint)
         self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
-        if not self.as_robot:  # which is the modules themselves
-            self.follow_offsets(lambda: None)  # `_command` reads them
+        if not self.as_robot:  # as the robot, its own sensors have no offsets
+            self.follow_offsets(lambda: None)  # `_command` reads `body.offsets`
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
@@ -61,7 +62,8 @@ class Sim(Arm):
             self.arm.use(mae)
 
     def _isolate(self) -> None:
-        if self.arm is not None and not self.as_robot:  # whose modules pull whatever is suspected
+        # As the robot, its modules pull isolated muscles as real modules do.
+        if self.arm is not None and not self.as_robot:
             self.arm.isolate(self.body.isolated)
 
     def _command(self, length: Array) -> None:
@@ -93,11 +95,11 @@ class Sim(Arm):
         return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])
 
     def clock_jumped_back(self) -> None:
-        """Count time from here; the arm stays as it is."""
+        """Measure elapsed time from now; the arm keeps its state."""
         self.ticked = self.get_clock().now()
 
     def report(self) -> Report:
-        """Return what /diagnostics shows."""
+        """Return the diagnostic report."""
         if self.arm is None:
             return Report('warn', 'waiting for a checkpoint', {})
         return self.arm.report()

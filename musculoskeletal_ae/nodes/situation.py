@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a running arm is, from what all nodes report on /diagnostics.
+"""Summarizes the state of a running arm from the reports of all nodes on /diagnostics.
 
-The situation is as bad as the worst of all nodes, and a node that no longer reports is an error.
-Only identifiers are compared, such as the controller's values `mode` and `stop cause`. Sentences
-are shown as they are.
+The level is that of the worst node; a required node that stops reporting is an error. Decisions
+compare identifiers only, such as the controller's values `mode` and `stop cause`. Sentences are
+shown unchanged.
 """
 
 import contextlib
@@ -19,18 +19,19 @@ from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.report import Level
 
-OLD = 1.0  # [s] after which something that moves is no longer shown
+OLD = 1.0  # [s] age at which a moving value is no longer shown
 #: [s] without a report after which a node counts as silent; nodes report once a second
 SILENT = 2.0
-#: [s] between two ticks, and the most that counts as such: our own pause makes no node silent
+#: [s] between two ticks, and the longest interval that is not a pause of this process; nodes do not
+#: become silent during such a pause
 TICK, LONGEST_TICK = 1.0, 1.5
 FORGOTTEN = 5.0  # [s] without a report after which any other node no longer counts
-#: nodes whose silence is an error, once they were heard of
+#: nodes whose silence is an error once they have reported
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'
-#: reports, one a second, in which the estimator's earlier networks are no mismatch, and after which
-#: another network is one
+#: A network of one of the estimator's last REPORTS reports is no mismatch. Another network is one
+#: after as many reports of its node; nodes report once a second.
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
@@ -39,20 +40,28 @@ EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value
 
 
 def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
-    """Return error and A, or what those that are NaN wait for; `measured`: θ is."""
+    """Return error and A as text; for NaN, name the topic that is missing.
+
+    Args:
+        measured: Whether θ is measured.
+        error: Estimation error [`unit`]; NaN where it is unknown.
+        anomaly: A; NaN where it is unknown.
+        unit: Unit of the error.
+    """
     joints = 'estimated_joint_states' if measured else 'joint_states'
-    told = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} {unit}'
-    return f'error {told}  A {"waits for anomaly" if math.isnan(anomaly) else f"{anomaly:.3f}"}'
+    error_text = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} {unit}'
+    anomaly_text = 'waits for anomaly' if math.isnan(anomaly) else f'{anomaly:.3f}'
+    return f'error {error_text}  A {anomaly_text}'
 
 
 class Node:
-    """What one node has reported last.
+    """The last report of one node.
 
     Attributes:
-        level: Of the report.
-        message: For people.
-        values: By name.
-        heard_at: When, not counting our own pauses [s].
+        level: Level of the report.
+        message: Message of the report.
+        values: Values of the report, by name.
+        heard_at: Time of arrival, excluding pauses of this process [s].
     """
 
     def __init__(self, status: DiagnosticStatus, heard_at: float) -> None:
@@ -63,45 +72,45 @@ class Node:
 
 
 class Situation:
-    """What the newest diagnostics of one namespace reported, and what to do about it.
+    """The newest diagnostics of one namespace, and the steps that they call for.
 
     Attributes:
         detected: Whether the estimator has detected an anomaly.
         suspect: Name of the muscle that the estimator suspects most, or ''.
-        distance: d of the anomaly detector; NaN where it is unknown.
-        limit: The d above which a message is an anomaly; NaN where it is unknown.
+        distance: Distance d of the anomaly detector; NaN if unknown.
+        limit: Value of d above which a message is an anomaly; NaN if unknown.
         samples: Number of samples learned, or '' without a learner.
         checkpoints: Number of networks published, or '' without a learner.
-        doing: What the controller does, for people.
+        doing: Message of the controller's last report.
     """
 
     def __init__(self, namespace: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Nothing has been reported yet; `clock` is a steady one [s]."""
+        """Begin without reports; `clock` returns steady time [s]."""
         self._clock = clock
         self._here = namespace.rstrip('/')
         self.detected = False
         self.samples = self.checkpoints = self.suspect = self.doing = ''
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # by full name
-        self._has_explored = False  # before it stopped
+        self._has_explored = False  # in the last mode before a stop
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # the estimator's last versions
         self._other_networks: dict[str, tuple[str, int]] = {}  # version and for how many reports
         self._ticked_at, self._slept = math.nan, 0.0  # [s]
 
     def tick(self) -> None:
-        """Let time pass: call it about once a second, before `trouble` and `level`."""
+        """Update ages; call this about once a second, before `trouble` and `level`."""
         now = self._clock()
         elapsed = now - self._ticked_at
-        if elapsed > LONGEST_TICK:  # what was sent meanwhile is still to be read
+        if elapsed > LONGEST_TICK:  # messages of the pause still wait to be read
             self._slept += elapsed - TICK
         self._ticked_at = now
         awake = now - self._slept
-        for name, node in list(self._nodes.items()):  # what another node said last is over then
+        for name, node in list(self._nodes.items()):
             if not _is_needed(name) and awake - node.heard_at > FORGOTTEN:
                 del self._nodes[name]
 
     def diagnosed(self, message: DiagnosticArray) -> None:
-        """Take a message of /diagnostics."""
+        """Process a message of /diagnostics."""
         for status in message.status:
             full_name, _, _ = status.name.partition(':')
             namespace, _, name = full_name.rpartition('/')
@@ -130,7 +139,7 @@ class Situation:
             self.limit = float(values.get('d limit', 'nan'))
 
     def _compare_network(self, node: str, version: str) -> None:
-        """Note how long a node has used a network that the estimator does not use."""
+        """Count the reports in which a node uses another network than the estimator."""
         if not version or not self._accepted or version in self._accepted:
             self._other_networks.pop(node, None)
             return
@@ -138,7 +147,7 @@ class Situation:
         self._other_networks[node] = version, reports + 1
 
     def level(self) -> Level:
-        """Return how bad it is: as bad as the worst of all nodes."""
+        """Return the level of the worst node."""
         if self.detected or self._silent() or self._mismatches():
             return 'error'
         levels = [node.level for name, node in self._nodes.items() if not _is_own(name)]
@@ -147,7 +156,7 @@ class Situation:
         return 'warn' if DiagnosticStatus.WARN in levels else 'ok'
 
     def trouble(self) -> str:
-        """Return what keeps the arm from going on, every step that is to be taken, and warnings."""
+        """Return the causes of a stop with their remedies, other errors, and warnings."""
         parts = [*self._stops(), *self._mismatches(), *self._silent()]
         errors, warnings = [], []
         for name, node in self._nodes.items():
@@ -168,10 +177,10 @@ class Situation:
         return {} if node is None else node.values
 
     def _is_shown(self, name: str, node: Node) -> bool:
-        """Whether a report is shown otherwise: an anomaly, a stop, or isolated muscles."""
+        """Whether `_stops` or `_body` already shows a report."""
         if node.level == DiagnosticStatus.OK or 'fault' in node.values:
             return False
-        if SEVERAL in node.values:  # the stop names them
+        if SEVERAL in node.values:  # shown if the stop names the same publishers
             control = self._values('controller')
             is_stopped = control.get('stop cause') == StopCause.SECOND_PUBLISHER.identifier
             return is_stopped and node.values[SEVERAL] in control.get('stop', '')
@@ -183,7 +192,7 @@ class Situation:
         return False
 
     def _stops(self) -> list[str]:
-        """Return the anomaly and the stop, each with what to do about it."""
+        """Return the anomaly and the stop, each with its remedy."""
         control = self._values('controller')
         mode, cause = control.get('mode'), control.get('stop cause')
         is_verifying = mode == VERIFYING
@@ -212,19 +221,19 @@ class Situation:
         ]
 
     def _silent(self) -> list[str]:
-        """Return which nodes have stopped reporting, and for how long."""
+        """Return the nodes that have stopped reporting, with the time since."""
         now = self._ticked_at - self._slept
         return [
-            f'{name}: no report for {now - node.heard_at:.0f} s: see its log; start it again'
+            f'{name}: no report for {now - node.heard_at:.0f} s: see its log, then restart it'
             for name, node in self._nodes.items()
             if now - node.heard_at > SILENT and _is_needed(name)
         ]
 
     def _body(self) -> list[str]:
-        """Return what is not known of the body, or left out.
+        """Return isolated muscles and unknown length offsets.
 
-        The controller may not know zeros that the estimator takes for known: one that was started
-        again takes those that were right at its first start.
+        A restarted estimator starts from the offsets of its first start, which may be wrong. The
+        controller then treats them as unknown, although the estimator reports none as unknown.
         """
         values, parts = self._values('estimator'), []
         if isolated := values.get('isolated muscles'):
@@ -236,11 +245,11 @@ class Situation:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the controller reports a stop that holds until it is reset."""
+        """Whether the controller is stopped."""
         return self._values('controller').get('mode') == STOPPED
 
     def hint(self) -> str:
-        """Return why the error may rise before anything is learned, '' once something is."""
+        """Return why the error may rise before learning begins; '' once it has begun."""
         values = self._values('learner')
         if self.samples == '' or values.get('network learned') == 'True':
             return ''
@@ -257,7 +266,7 @@ def _is_needed(name: str) -> bool:
 
 
 def _is_own(name: str) -> bool:
-    """Whether a node only repeats what others report."""
+    """Whether a node only summarizes the reports of others."""
     return name.rpartition('/')[2] == 'bringup_status'
 
 

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every topic that has one rightful publisher is checked for exactly one.
+"""Detects topics with several publishers that should have exactly one.
 
-A message does not say who sent it, so the graph has to. While several nodes publish a topic of
-`AUTHORS`, nobody uses its messages, every node that has to do with it reports an ERROR, and the
-controller stops. A latched topic is subscribed to anew afterwards: its rightful value comes again.
+A message does not name its sender, so this module looks at the ROS graph. While several nodes
+publish a topic of `AUTHORS`, its messages are rejected, every node that uses it reports an ERROR,
+and the controller stops. Afterwards nodes resubscribe to latched topics to receive the value again.
 
-Two publishers of one node name are no proof. A node that was killed stays in the graph for up to
-20 s beside its successor, but sends nothing more. Three things tell it from a second node:
+Two publishers with the same node name are no proof. A killed node stays in the graph for up to 20 s
+beside its successor, but sends no more messages. Three signs distinguish a second running node:
 
-- Messages whose numbers go back again and again come from two nodes that take turns.
-- Reports on /diagnostics carry a random identity of the node that sent them. A node that hears
-  its own name with another identity, after its own first report, has a twin.
-- Two publishers that have both been known for longer than the graph keeps a dead one are two.
+- Sequence numbers that repeatedly go back: two nodes take turns publishing.
+- A report on /diagnostics under our own name with another identity, after our first report. The
+  identity is a random number of the reporting node.
+- Two publishers that have both been in the graph for longer than it keeps a killed one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.reception import REORDERING
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
-#: the topics that have one rightful publisher, and which node that is
+#: topics that must have one publisher, with the node that publishes them
 AUTHORS = {
     'muscle_states': _DRIVER,
     'joint_states': _DRIVER,
@@ -44,36 +44,37 @@ AUTHORS = {
     'mae_checkpoint': 'the learner',
 }
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
-SEVERAL = 'several publishers'  # why a message was rejected
+SEVERAL = 'several publishers'  # rejection reason
 
-LOOK_PERIOD = 0.1  # [s] between looks at the graph
-LOOKS, TURNS = 20, 3  # looks within which so many turns tell two publishers of one name
-#: [s] for which the graph keeps a node that was killed, and some more
+LOOK_PERIOD = 0.1  # [s] between checks of the graph
+LOOKS, TURNS = 20, 3  # TURNS turns within LOOKS checks mean two publishers of one name
+#: [s] for which the graph keeps a killed node, plus a margin
 LEASE = 30.0
-#: [s] for which the graph may know a publisher, but not its node yet
+#: [s] for which the graph may know a publisher but not its node
 NAMING = 1.0
 TWIN_SILENCE = 3.0  # [s] without a report after which a second node has ended
 UNNAMED = '_NODE_NAME_UNKNOWN_'
 
 
 class Publisher(NamedTuple):
-    """One publisher, as the graph knows it."""
+    """One publisher in the ROS graph."""
 
     node: str  # full name
     identity: bytes
 
     @property
     def is_named(self) -> bool:
-        """Whether the graph knows its node."""
+        """Whether the graph knows the publisher's node."""
         return not self.node.endswith(UNNAMED)
 
 
 class Authorship:
-    """Decides from looks at the graph whether one topic has more than one publisher.
+    """Decides from checks of the graph whether a topic has more than one publisher.
 
     Attributes:
-        intruders: Which nodes publish it, if they are several: `/a and /b`; else ''.
-        is_certain: Whether the graph is clear; while it is not, latched messages can wait.
+        intruders: The publishing nodes if there are several, as `/a and /b`; else ''.
+        is_certain: Whether the graph knows the nodes of all publishers. Until then, latched
+            messages are rejected and requested again later.
     """
 
     def __init__(self) -> None:
@@ -82,7 +83,13 @@ class Authorship:
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
 
     def look(self, publishers: Iterable[Publisher], turns: int, now: float) -> None:
-        """Take who publishes the topic at `now` [s], and how often its messages took turns."""
+        """Process a check of the graph.
+
+        Args:
+            publishers: Publishers of the topic.
+            turns: Number of times so far that two publishers of one name took turns.
+            now: Time of the check [s].
+        """
         present = list(publishers)
         self._first_seen = {
             each.identity: self._first_seen.get(each.identity, now) for each in present
@@ -108,23 +115,23 @@ class Authorship:
 
 
 class Twins:
-    """Notices a second node of the same name, by its reports on /diagnostics.
+    """Detects a second node of the same name from its reports on /diagnostics.
 
-    Reports are searched as bytes: reading all reports of all nodes would take 1 % of a core.
+    Reports are searched as bytes, because deserializing those of all nodes takes 1 % of a core.
     """
 
     def __init__(self, name: str, identity: str) -> None:
-        """Watch reports under a status `name`; ours contain `identity`."""
-        # As CDR has texts: `/controller` is not found in `/left/controller`.
+        """Watch reports with status name `name`; our own contain `identity`."""
+        # With the length prefix of CDR, `/controller` does not match within `/left/controller`.
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
         self._has_reported = False
         self._heard_at = -math.inf  # of another node [s]
 
     def take(self, report: bytes, now: float) -> None:
-        """Take a report that came at `now` [s], in CDR.
+        """Process a report in CDR that arrived at `now` [s].
 
-        What comes before our own first report may be the last that a killed node has sent.
+        A report before our own first one is ignored, because a killed predecessor may have sent it.
         """
         if self._name not in report:
             return
@@ -139,42 +146,44 @@ class Twins:
 
 
 class Sources:
-    """Watches the authors of all topics that a node has to do with."""
+    """Watches the publishers of all topics that a node uses."""
 
     def __init__(self, node: Node, turns: Counter[str], renew: Callable[[str], object]) -> None:
-        """Watch nothing yet.
+        """Begin without topics.
 
         Args:
-            node: Looks at the graph.
-            turns: How often the messages of each topic took turns.
-            renew: Subscribes to a topic anew, once it has one publisher again.
+            node: Node whose view of the graph is used.
+            turns: Number of turns that publishers of one name took, by topic.
+            renew: Resubscribes to a topic; called when it has one publisher again.
         """
         self._node, self._turns, self._renew = node, turns, renew
         self._authorships: dict[str, Authorship] = {}
         self._to_renew: set[str] = set()
 
     def watch(self, *topics: str) -> None:
-        """Watch these topics as well, as far as they have one rightful publisher."""
+        """Watch these topics as well; topics that are not in `AUTHORS` are skipped."""
         for topic in topics:
             if topic in AUTHORS and topic not in self._authorships:
                 self._authorships[topic] = Authorship()
 
     def check(self, topic: str, is_latched: bool) -> None:
-        """Check a message that comes now.
+        """Check a message that has just arrived.
 
         Raises:
-            MessageError: If it may be from another node than the rightful publisher.
+            MessageError: If it may come from another node than the intended publisher.
         """
         authorship = self._authorships[topic]
-        if is_latched:  # it is rare, and may move the arm at once
+        if is_latched:  # such messages are rare and may move the arm at once
             self._look(topic)
         if authorship.intruders or (is_latched and not authorship.is_certain):
             if is_latched:
                 self._to_renew.add(topic)
-            raise MessageError(SEVERAL, authorship.intruders or 'one is not known yet')
+            raise MessageError(
+                SEVERAL, authorship.intruders or 'the node of one publisher is not known yet'
+            )
 
     def look(self) -> None:
-        """Look at the graph; read anew what could not be used."""
+        """Check the graph; resubscribe to latched topics whose messages were rejected."""
         for topic in self._authorships:
             self._look(topic)
         for topic in sorted(self._to_renew):
@@ -185,7 +194,7 @@ class Sources:
 
     @property
     def intruders(self) -> str:
-        """Which topics come from several nodes, and from which; or ''."""
+        """Topics that several nodes publish, with the names of those nodes; or ''."""
         topics: dict[str, list[str]] = {}
         for topic, each in self._authorships.items():
             if each.intruders:
@@ -195,7 +204,7 @@ class Sources:
         )
 
     def remedy(self) -> str:
-        """Return what to do about the intruders."""
+        """Return the remedy for several publishers."""
         authors = {AUTHORS[topic] for topic, each in self._authorships.items() if each.intruders}
         if not authors:
             return 'end one of them'
@@ -212,13 +221,13 @@ class Sources:
 
 
 class Stamps:
-    """Tells newer messages of one publisher from repeated ones, by their stamps."""
+    """Distinguishes new messages of one publisher from repeated ones, by their stamps."""
 
     def __init__(self) -> None:
         self._last: int | None = None  # [ns]
 
     def is_new(self, stamp: Time) -> bool:
-        """Whether a stamp is later than the one before, or the clock was set back meanwhile."""
+        """Whether a stamp is later than the previous one, or the clock was set back meanwhile."""
         time, last = stamp.sec * 1_000_000_000 + stamp.nanosec, self._last
         if last is not None and last - REORDERING < time <= last:
             return False

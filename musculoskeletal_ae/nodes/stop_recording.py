@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last seconds before a latched stop, kept as a bag that `replay` plays.
+"""Saves the last seconds before a latched stop as a bag that `replay` plays.
 
-A node remembers what it heard and said, as it came. When it stops, a thread writes that to
-`stop_DATE-TIME/` in ROS's log directory (`log/` under bringup.sh), so that the commands of the
-stop are not late; the oldest recordings beyond a number are deleted.
+A node keeps the recent messages that it received and published. When it stops, a thread writes them
+to `stop_DATE-TIME/` in ROS's log directory (`log/` under bringup.sh), which does not delay the
+commands of the stop. The oldest recordings beyond a number are deleted.
 """
 
 import shutil
@@ -21,37 +21,42 @@ from musculoskeletal_ae.bags.topics import TOPICS
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-SECONDS = 10.0  # that are kept
-MOST = 50_000  # messages, however fast they come
-MOST_BYTES = 32 << 20  # of messages, however large they are
-LARGEST_MESSAGE = 4 << 20  # [bytes] of a message that is kept; a network of ours has half a MB
+SECONDS = 10.0  # length of a recording
+MOST = 50_000  # messages of a recording
+MOST_BYTES = 32 << 20  # total size of these messages
+LARGEST_MESSAGE = 4 << 20  # [bytes] of one recorded message; a typical network has half a MB
 FILE = 'cause.txt'  # why the node stopped, in the bag's directory; written last
-#: of the bags' directories, also of those that a kill cut off
+#: pattern of the bags' directories, including bags that a kill left incomplete
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
 
 
-#: When a message came [ns], its topic, and its bytes: ten thousands of message objects would be
-#: looked through by Python's garbage collector, for 10 ms of a command.
+#: Time of arrival [ns], topic, and bytes of a message. Bytes, because Python's garbage collector
+#: would traverse tens of thousands of message objects, and delay a command by 10 ms.
 Heard = tuple[int, str, bytes]
 
 
 class StopRecording:
-    """Remembers the last seconds of some topics; writes them on request."""
+    """Keeps the last seconds of some topics, and writes them on request."""
 
     def __init__(self, resolve: Any, directory: Path | None = None) -> None:
-        """Remember nothing yet; resolve: a topic's full name; directory: where bags are written."""
+        """Begin without messages.
+
+        Args:
+            resolve: Returns the full name of a topic.
+            directory: Where bags are written; None: ROS's log directory.
+        """
         self._resolve = resolve
         self._directory = directory or Path(get_logging_directory())
         self._recent: deque[Heard] = deque()
         self._recent_size = 0  # [bytes]
-        self._latched: dict[str, Heard] = {}  # the last ones before those
+        self._latched: dict[str, Heard] = {}  # last latched messages before `_recent`
         self._writing: threading.Thread | None = None
-        self.left_out = 0  # messages that were too large
+        self.left_out = 0  # number of messages that were too large
         self.problem = ''  # why the last recording could not be written
-        self.saved: Path | None = None  # the last one
+        self.saved: Path | None = None  # directory of the last recording
 
     def heard(self, topic: str, data: bytes) -> None:
-        """Remember a message of one of `bags.topics.TOPICS`, in CDR, unless it is too large."""
+        """Keep a message, in CDR, of one of `bags.topics.TOPICS`; count it if it is too large."""
         if len(data) > LARGEST_MESSAGE:
             self.left_out += 1
             return
@@ -69,7 +74,7 @@ class StopRecording:
                 self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
-        """Write what is remembered, in the background; keep so many recordings (0: none)."""
+        """Write the kept messages in the background; keep `most` recordings (0: none)."""
         messages = list(self._recent)
         if not (messages and most) or (self._writing is not None and self._writing.is_alive()):
             return
@@ -79,7 +84,7 @@ class StopRecording:
         self._writing.start()
 
     def close(self) -> None:
-        """Wait for what is being written."""
+        """Wait until a recording has been written."""
         if self._writing is not None:
             self._writing.join()
 
@@ -88,14 +93,14 @@ class StopRecording:
         try:
             self._write(bag, cause, messages)
         except (MusculoskeletalError, OSError) as error:
-            self.problem = f'the seconds before the stop could not be kept: {error}'
+            self.problem = f'the stop recording could not be written: {error}'
             return
         self.saved, self.problem = bag, ''
         for old in sorted(self._directory.glob(NAMES))[:-most]:
-            shutil.rmtree(old, ignore_errors=True)  # one that stays takes nothing from the new one
+            shutil.rmtree(old, ignore_errors=True)  # a failure does not matter
 
     def _write(self, bag: Path, cause: str, messages: list[Heard]) -> None:
-        """Write a bag and its cause; what cannot be written whole takes no room on the disk."""
+        """Write a bag and the cause of the stop; delete the bag if that fails."""
         bag.mkdir(parents=True)
         try:
             with BagWriter(bag) as writer:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `view`: a page in the browser that shows a running arm, and moves it on request.
+"""The node `view`: shows a running arm on a web page, and moves it on request.
 
-Nothing is subscribed to while nobody looks. While somebody does, only the newest message of a topic
-is taken, at the rate of the picture: an executor would handle every one, at a tenth of a core.
+The node subscribes only while somebody views the page. It then takes only the newest message of
+each topic, at the frame rate. An executor would handle every message, for a tenth of a core.
 """
 
 import math
@@ -44,10 +44,12 @@ from musculoskeletal_ae.validity import read_array, read_muscle_states, read_nam
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
-PERIOD, TELL_PERIOD, LOOK_PERIOD = 1.0 / 30.0, 0.25, 1.0  # [s] of picture, texts, and the graph
-PATIENCE = 10.0  # [s] with a service
-STOP_LOOK_PERIOD = 0.1  # [s]
-SETTLED = 2.5  # [s] after a reset, in which a cause that is still present stops the arm again
+PERIOD = 1.0 / 30.0  # [s] between pictures
+TEXT_PERIOD = 0.25  # [s] between updates of texts and curves
+GRAPH_PERIOD = 1.0  # [s] between checks of the graph
+PATIENCE = 10.0  # [s] to wait for the response of a service
+STOP_CHECK_PERIOD = 0.1  # [s]
+SETTLED = 2.5  # [s] after a reset, within which a remaining cause stops the arm again
 ARM_TOPICS = {
     'measured': 'joint_states',
     'estimated': 'estimated_joint_states',
@@ -64,36 +66,38 @@ SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_em
 
 
 class View(Node):
-    """What comes on topics onto the page; what is asked for there to topics and services."""
+    """Shows messages on the page, and passes requests of visitors to topics and services."""
 
     def __init__(self, robot: Robot, options: Namespace) -> None:
         super().__init__('view', start_parameter_services=False)
         try:
-            page = import_heavy('musculoskeletal_ae.view.page')  # trimesh would swallow a Ctrl-C
+            # `import_heavy`, because importing trimesh may swallow Ctrl-C.
+            page = import_heavy('musculoskeletal_ae.view.page')
         except ImportError as error:
             raise MusculoskeletalError(
-                'the page needs viser: pip install -r requirements.txt installs it'
+                'the page needs viser; install it by: pip install -r requirements.txt'
             ) from error
         self.robot = robot
-        self.asked: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
-        address, ask = (options.host, options.port), lambda *what: self.asked.put(what)
-        self.page = page.Page(robot, *address, options.read_only, ask)
+        self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
+        address, request = (options.host, options.port), lambda *what: self.requests.put(what)
+        self.page = page.Page(robot, *address, options.read_only, request)
         for note in self.page.notes:
             self.get_logger().warning(f'mesh left out: {printable(note)}')
         self.situation = Situation(self.get_namespace())
         self.reception = Reception(lambda text: self.get_logger().warning(text))
         hardware = robot.description.directory.name
         self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
-        self.came: dict[str, tuple[float, Any]] = {}  # when, and what
-        self.taken: list[Any] = []  # subscriptions
-        self.told = self.looked = self.reported = -math.inf  # [s] of the monotonic clock
+        self.newest: dict[str, tuple[float, Any]] = {}  # arrival time [s] and value, by name
+        self.subscribed: list[Any] = []  # subscriptions, while somebody views the page
+        self.texts_at = self.graph_at = self.reported_at = -math.inf  # [s] of the monotonic clock
         self.ruptured: list[str] = []
         self.payload = 0.0
-        self.reset_at = math.inf  # [s], of the last reset that has not been judged yet
-        self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []  # answers to come, since
+        self.reset_at = math.inf  # [s] of a reset whose outcome has not been shown yet
+        #: service requests without a response: time sent [s], future, callback
+        self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []
         self.answers = SingleThreadedExecutor()
         self.answers.add_node(self)
-        self.ways = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
+        self.clients_of = {name: self.create_client(kind, name) for name, kind in SERVICES.items()}
         self.pushes: list[Any] = []
         if not options.read_only:
             self.targets = self.create_publisher(JointState, 'target_joint_states', RELIABLE)
@@ -102,7 +106,7 @@ class View(Node):
                 for arm in ('hardware_emulator', 'sim')
             ]
 
-    # -- what comes -----------------------------------------------------------------------------
+    # -- messages -------------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
         robot, joints = self.robot, self.robot.joints
@@ -125,80 +129,81 @@ class View(Node):
         ]  # fmt: skip
 
         def note(what: str, read: Callable[[Any], Any], message: Any) -> None:
-            self.came[what] = time.monotonic(), read(message)
+            self.newest[what] = time.monotonic(), read(message)
 
         for what, kind, topic, qos, read in table:
             publishers = partial(self.count_publishers, self.resolve_topic_name(topic))
             receive: Any = self.reception.of(topic, partial(note, what, read), publishers)
-            self.taken.append(self.create_subscription(kind, topic, receive, qos))
+            self.subscribed.append(self.create_subscription(kind, topic, receive, qos))
 
     def _newest(self, what: str, old: float = OLD) -> Any:
-        """Return what came last, None if that is too long ago."""
-        when, value = self.came.get(what, (-math.inf, None))
+        """Return the newest value; None if it is older than `old` [s]."""
+        when, value = self.newest.get(what, (-math.inf, None))
         return value if time.monotonic() - when < old else None
 
     def _take(self) -> None:
-        for each in self.taken:
+        for each in self.subscribed:
             with each.handle:
                 while message := each.handle.take_message(each.msg_type, each.raw):
                     each.callback(*message)
         for _ in range(len(self.pending) + 1 if self.pending else 0):
             self.answers.spin_once(timeout_sec=0.0)
         waiting, self.pending = self.pending, []
-        for since, future, answered in waiting:  # an executor would call back one request later
+        for since, future, answered in waiting:  # an executor would be one request late
             if future.done():
                 answered(future.result())
-            elif time.monotonic() - since < PATIENCE:  # else its node died over it
+            elif time.monotonic() - since < PATIENCE:  # else the node has ended without a response
                 self.pending.append((since, future, answered))
 
     # -- the loop -------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Show what comes until the process is asked to end."""
+        """Show messages until the process receives a stop signal."""
         while rclpy.ok() and not STOP.received:
-            looked_at = self.page.looked_at.wait(timeout=STOP_LOOK_PERIOD)
-            if (now := time.monotonic()) >= self.reported + diagnostics.PERIOD:
-                self.reported = now
-                self.diagnostics.tell(Report('ok', 'shown' if looked_at else 'nobody looks', {}))
-            while not self.asked.empty():  # also what the last visitor asked for
-                what, *value = self.asked.get()
+            is_viewed = self.page.looked_at.wait(timeout=STOP_CHECK_PERIOD)
+            if (now := time.monotonic()) >= self.reported_at + diagnostics.PERIOD:
+                self.reported_at = now
+                state = 'viewed' if is_viewed else 'nobody views the page'
+                self.diagnostics.tell(Report('ok', state, {}))
+            while not self.requests.empty():  # including the last visitor's requests
+                what, *value = self.requests.get()
                 try:
                     self._do(what, *value)
                 except Exception as error:  # noqa: BLE001 - a page may send anything
                     self.page.notify(printable(f'{what}: {error}'), False)
-            if not looked_at:
-                for subscription in self.taken:
+            if not is_viewed:
+                for subscription in self.subscribed:
                     self.destroy_subscription(subscription)
-                self.taken, self.came = [], {}
+                self.subscribed, self.newest = [], {}
                 continue
-            if not self.taken:
+            if not self.subscribed:
                 self._subscribe()
             begun = time.monotonic()
             try:
                 self._show(begun)
             except Exception as error:  # noqa: BLE001 - topics and services may bring anything
-                if self.reception.reject_error('what is shown', error):
+                if self.reception.reject_error('page', error):
                     self.get_logger().error(printable(traceback.format_exc()))
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
 
     def _show(self, now: float) -> None:
-        """Take what came, and show it; [s] of the monotonic clock."""
+        """Take the newest messages and show them; `now` is monotonic time [s]."""
         self._take()
         self.situation.tick()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
         if (measured := posture.get('measured')) is not None and np.isnan(measured).any():
-            # Joints without a sensor, or whose sensor fails, are drawn where they are estimated.
+            # Draw joints without a working sensor at their estimate.
             filled = np.where(np.isnan(measured), posture.get('estimated', measured), measured)
             posture['measured'] = filled
             if np.isnan(filled).any():
                 del posture['measured']
         states = self._newest('muscles')
         self.page.draw(posture, None if states is None else states[1], self._kinds())
-        if now >= self.told + TELL_PERIOD:
-            self.told = now
+        if now >= self.texts_at + TEXT_PERIOD:
+            self.texts_at = now
             self._tell(posture, states)
-        if now >= self.looked + LOOK_PERIOD:
-            self.looked = now
+        if now >= self.graph_at + GRAPH_PERIOD:
+            self.graph_at = now
             self._look()
 
     def _kinds(self) -> Ints:
@@ -216,30 +221,31 @@ class View(Node):
         return self._places(self._newest('isolated', math.inf) or [])
 
     def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
-        told, error, anomaly = self.situation, math.nan, self._newest('anomaly')
+        situation, error, anomaly = self.situation, math.nan, self._newest('anomaly')
         if {'measured', 'estimated'} <= posture.keys():
             error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
         anomaly = math.nan if anomaly is None else anomaly
-        distance = '' if math.isnan(told.distance) else f'  d {told.distance:.0f}'
+        distance = '' if math.isnan(situation.distance) else f'  d {situation.distance:.0f}'
         lines = [
             figures('measured' in posture, error, anomaly, self.robot.kinematics.distance_unit)
             + distance,
-            f'samples {told.samples or 0} · networks {told.checkpoints or 0} · {told.doing or "–"}',
-            'waiting for muscle_states' if states is None else told.hint(),
+            f'samples {situation.samples or 0} · networks {situation.checkpoints or 0} · '
+            f'{situation.doing or "–"}',
+            'waiting for muscle_states' if states is None else situation.hint(),
         ]
-        trouble = self.page.with_buttons(told.trouble())
+        trouble = self.page.with_buttons(situation.trouble())
         isolated = f'isolated: {self.robot.names(self._isolated())}'
-        if len(self._isolated()) and isolated not in trouble:  # without reports of the estimator
+        if len(self._isolated()) and isolated not in trouble:  # the estimator does not report them
             lines.append(isolated)
         shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
-        values = error, anomaly, told.distance, told.limit
-        now, is_urgent = time.monotonic(), told.level() == 'error'
+        values = error, anomaly, situation.distance, situation.limit
+        now, is_urgent = time.monotonic(), situation.level() == 'error'
         self.page.tell([*filter(None, lines)], trouble, shown, now, values, is_urgent)
-        self._judge_reset()
+        self._show_reset_outcome()
         self.page.follow(self.payload, self._newest('played', math.inf))
 
-    def _judge_reset(self) -> None:
-        """Say what became of a reset, once a cause that is still present has stopped it again."""
+    def _show_reset_outcome(self) -> None:
+        """Notify visitors of the outcome of a reset, after the time for a renewed stop."""
         if time.monotonic() > self.reset_at + SETTLED:
             self.reset_at = math.inf
             trouble = self.page.with_buttons(self.situation.trouble())
@@ -247,39 +253,39 @@ class View(Node):
             self.page.notify(f'stopped again: {trouble}' if is_stopped else 'reset', not is_stopped)
 
     def _reset(self) -> None:
-        """Reset anomaly and stop, unless a muscle of the emulated arm is still cut."""
-        sound = set(self.robot.names(self._isolated()).split(', '))
-        if cut := [name for name in self.ruptured if name not in sound]:
-            problem = f'{", ".join(cut)} is cut, which would stop the arm again: press "Mend" first'
-            self.page.notify(problem, False)
+        """Reset anomaly and stop, unless a muscle of the emulated arm is still ruptured."""
+        isolated = set(self.robot.names(self._isolated()).split(', '))
+        if remaining := [name for name in self.ruptured if name not in isolated]:
+            problem = f'{", ".join(remaining)}: ruptured, which would stop the arm again'
+            self.page.notify(f'{problem}; press "Mend" first', False)
             return
 
         def go_on(answer: Any) -> None:
             if answer.success:
-                self._ask('controller/reset', then=judge, quiet=True)
+                self._ask('controller/reset', then=note_reset, quiet=True)
             else:
                 self.page.notify(printable(f'estimator/reset: {answer.message}'), False)
 
-        def judge(answer: Any) -> None:
+        def note_reset(answer: Any) -> None:
             if answer.success:
                 self.reset_at = time.monotonic()
             else:
                 self.page.notify(printable(f'controller/reset: {answer.message}'), False)
 
-        if self.ways['estimator/reset'].service_is_ready():
+        if self.clients_of['estimator/reset'].service_is_ready():
             self._ask('estimator/reset', then=go_on, quiet=True)
         else:
-            self._ask('controller/reset', then=judge, quiet=True)
+            self._ask('controller/reset', then=note_reset, quiet=True)
 
     def _look(self) -> None:
-        """Offer what the nodes that are there can do, and ask the emulator how it is."""
-        there = {node for node, name in SIGNS.items() if self.ways[name].service_is_ready()}
+        """Offer the controls of running nodes, and request the state of the emulator."""
+        running = {node for node, name in SIGNS.items() if self.clients_of[name].service_is_ready()}
         if any(push.get_subscription_count() for push in self.pushes):
-            there.add('pushed')
-        self.page.offer(there)
-        self._ask(GET, self._emulated, quiet=True, names=['ruptured_muscles', 'payload'])
+            running.add('pushed')
+        self.page.offer(running)
+        self._ask(GET, self._on_emulator_state, quiet=True, names=['ruptured_muscles', 'payload'])
 
-    def _emulated(self, answer: Any) -> None:
+    def _on_emulator_state(self, answer: Any) -> None:
         match [parameter_value_to_python(value) for value in answer.values]:
             case [[*ruptured], float(payload)]:
                 self.ruptured, self.payload = [str(name) for name in ruptured if name], payload
@@ -291,30 +297,31 @@ class View(Node):
         quiet: bool = False,
         **fields: Any,
     ) -> None:
-        """Call a service, tell the page what it said unless `quiet`, and go on with the answer."""
+        """Call a service; show its response unless `quiet`, then call `then` with it."""
 
         def answered(answer: Any) -> None:
             if not quiet:
-                said = [*getattr(answer, 'results', ()), answer][0]
-                good = getattr(said, 'success', getattr(said, 'successful', False))
-                why = getattr(said, 'message', getattr(said, 'reason', '')) or 'done'
+                # SetParameters responds with a list of one result, other services with the result.
+                result = [*getattr(answer, 'results', ()), answer][0]
+                good = getattr(result, 'success', getattr(result, 'successful', False))
+                why = getattr(result, 'message', getattr(result, 'reason', '')) or 'done'
                 self.page.notify(printable(f'{name}: {why}'), good)
             if then is not None:
                 then(answer)
 
-        if self.ways[name].service_is_ready():
-            future = self.ways[name].call_async(SERVICES[name].Request(**fields))
+        if self.clients_of[name].service_is_ready():
+            future = self.clients_of[name].call_async(SERVICES[name].Request(**fields))
             self.pending.append((time.monotonic(), future, answered))
 
     def _do(self, what: str, value: Any = None) -> None:
-        """Do what a visitor asked for."""
+        """Handle a request of a visitor."""
         match what:
             case 'targets':
                 stamp, theta = self.get_clock().now().to_msg(), np.array([*value.values()])
                 self.targets.publish(joint_message([*value], theta, stamp))
             case 'hand':
                 if value.shape != (3,) or not np.isfinite(value).all():
-                    raise ValueError(f'expected a place of three numbers [m], not {value}')
+                    raise ValueError(f'expected a position of three numbers [m], not {value}')
                 if (theta := self._newest('estimated')) is not None:
                     pose = pin.SE3(np.eye(3), value)
                     target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta
@@ -339,12 +346,14 @@ class View(Node):
 
 
 def _parse(arguments: list[str]) -> Namespace:
-    parser = Parser('view', 'Shows a running arm on a page in the browser.', ROS_HELP)
+    what = 'Shows a running arm on a web page, and lets visitors move it.'
+    parser = Parser('view', what, ROS_HELP)
     parser.add_robot()
-    add, host = parser.add_argument, 'address to listen on; 0.0.0.0: the whole network may move it'
+    add = parser.add_argument
+    host = 'address to listen on; with 0.0.0.0 the whole network can move the arm'
     add('--port', type=whole(1, 65535), default=8080, metavar='N', help='port of the page')
     add('--host', default='127.0.0.1', help=host)
-    add('--read-only', action='store_true', help='no controls')
+    add('--read-only', action='store_true', help='show no controls: visitors cannot move the arm')
     return parser.parse_args(arguments)
 
 

@@ -67,7 +67,7 @@ def test_with_wait_check_driver_reports_faults_until_the_driver_is_right(graph):
     waiting = check(graph, '--wait', '--seconds', '2')
     waiting.wait_for_output(f'waiting for {graph.namespace}/muscle_states')
     start_driver(graph, faults=['bias:biceps_long:0.1'])
-    graph.wait(lambda: 'nothing may move' in waiting.output, 'the fault')
+    graph.wait(lambda: 'fix the driver before moving' in waiting.output, 'the fault')
     assert 'keeps its contract' not in waiting.output
     assert graph.set_parameter('hardware_emulator', 'faults', [''])[0]
     status, output = ended(graph, waiting)

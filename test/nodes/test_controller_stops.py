@@ -101,7 +101,8 @@ def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm.graph.end(arm.hardware)
     arm.says('stale_muscle_states')
     refused = reset(arm).message
-    assert refused.startswith('refused: muscle_states are too old') and 'call again once' in refused
+    assert refused.startswith('refused: muscle_states are too old')
+    assert 'call controller/reset again' in refused
     before = len(arm.sent())
     arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'commands to nobody')
     arm.start('hardware_emulator', seed=1)

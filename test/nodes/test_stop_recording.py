@@ -100,7 +100,7 @@ def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
     recording.save('a cause', 1)
     recording.close()
     assert recording.saved is None
-    assert 'could not be kept' in recording.problem
+    assert 'could not be written' in recording.problem
 
 
 def test_an_incomplete_recording_on_a_full_disk_is_deleted_and_reported(

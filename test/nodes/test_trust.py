@@ -106,7 +106,8 @@ def test_impossible_length_offsets_are_refused(graph, trained_file):
     zeros[0] = 1e17
     latched = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
     latched.publish(array_message(zeros, 'quantity', 'muscle'))
-    graph.wait(lambda: controller.rejected['muscle_length_zeros: impossible zeros'], 'the refusal')
+    reason = 'muscle_length_zeros: impossible offsets'
+    graph.wait(lambda: controller.rejected[reason], 'the refusal')
     assert not controller.body.offsets.offset.any()
 
 
