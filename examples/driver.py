@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A driver to start from: copy it, put your motors and sensors into `Bus`, leave the rest as it is.
+"""A driver to start from: copy it, connect your motors and sensors in `Bus`, and keep the rest.
 
     python my_driver.py --ros-args -p robot:=path/to/my_arm
 
@@ -25,8 +25,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 RATE = 100.0  # [Hz]
 SPOOL = 0.01  # [m] radius of the spools
-SILENCE = 0.5  # [s] without a command after which muscles are let go down to T_bias …
-RELEASE = 100.0  # … at this rate [N/s]
+SILENCE = 0.5  # [s] without a command after which tension decreases to T_bias
+RELEASE = 100.0  # rate of this decrease [N/s]
 
 
 class Bus:
@@ -36,26 +36,31 @@ class Bus:
         self.arm, self.read_at = EmulatedArm(robot, seed=1), time.monotonic()
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return spool angles [rad], + winds in, 0 at θ = 0 without tension; T [N]; °C; θ [rad]."""
+        """Return spool angles [rad], T [N], temperatures [°C] and θ [rad].
+
+        Positive spool angles wind in. They are 0 at θ = 0 without tension.
+        """
         now = time.monotonic()
         self.arm.step(min(round(now - self.read_at, 3), 0.1))
         self.read_at = now
-        reading = self.arm.sense()  # °C: np.full(muscles, np.nan) where there is no sensor
+        reading = self.arm.sense()  # without temperature sensors, return NaN for each muscle
         return -reading.length / SPOOL, reading.tension, reading.temperature, reading.theta
 
-    def pull(self, tension: np.ndarray) -> None:
-        """Let every motor regulate its wire to a tension [N] (M,)."""
+    def regulate(self, tension: np.ndarray) -> None:
+        """Make every motor regulate its tendon to a tension [N] (M,)."""
         self.arm.command_tension(tension)
 
 
 class Driver(Node):
+    """Publishes the states, and regulates tension by the last command."""
+
     def __init__(self) -> None:
         super().__init__('driver')
         self.robot = Robot.load(self.declare_parameter('robot', 'arm26').value)
         self.bus = Bus(self.robot)
-        # l_target [m] or T [N], whichever was commanded last, and when [s]
-        self.target, self.by_tension, self.told_at = None, False, -SILENCE
-        self.pulled = np.full(self.robot.muscle_count, self.robot.tension.bias)
+        # The last command: l_target [m] or T [N], and its time of arrival [s].
+        self.target, self.by_tension, self.commanded_at = None, False, -SILENCE
+        self.setpoint = np.full(self.robot.muscle_count, self.robot.tension.bias)
         self.states = self.create_publisher(Float64MultiArray, 'muscle_states', 10)
         self.joints = self.create_publisher(JointState, 'joint_states', 10)
         for kind in ('length', 'tension'):
@@ -64,21 +69,23 @@ class Driver(Node):
         self.create_timer(1.0 / RATE, self.tick)
 
     def command(self, message: Float64MultiArray, by_tension: bool) -> None:
+        """Take a command of either kind; ignore one that is malformed."""
         target = np.array(message.data)
         if len(target) == self.robot.muscle_count and np.isfinite(target).all():
-            self.target, self.by_tension, self.told_at = target, by_tension, time.monotonic()
+            self.target, self.by_tension, self.commanded_at = target, by_tension, time.monotonic()
 
     def tick(self) -> None:
+        """Read the sensors, regulate the tensions by the MSC law, and publish the states."""
         angle, tension, temperature, theta = self.bus.read()
         length = -SPOOL * angle
         bias, most = self.robot.tension.bias, self.robot.tension.max
-        if self.target is not None and time.monotonic() - self.told_at < SILENCE:
+        if self.target is not None and time.monotonic() - self.commanded_at < SILENCE:
             stretched = self.robot.stiffness * (length - self.target)
             wanted = self.target if self.by_tension else bias + np.maximum(0.0, stretched)
         else:
-            wanted = np.maximum(bias, self.pulled - RELEASE / RATE)
-        self.pulled = np.clip(wanted, 0.0, most)
-        self.bus.pull(self.pulled)
+            wanted = np.maximum(bias, self.setpoint - RELEASE / RATE)
+        self.setpoint = np.clip(wanted, 0.0, most)
+        self.bus.regulate(self.setpoint)
         rows = np.stack([length, tension, temperature])
         self.states.publish(array_message(rows, 'quantity', 'muscle'))
         now = self.get_clock().now().to_msg()
@@ -89,7 +96,7 @@ if __name__ == '__main__':
     rclpy.init()
     try:
         rclpy.spin(Driver())
-    except (MusculoskeletalError, ParameterException) as error:  # no such robot, not even a name
+    except (MusculoskeletalError, ParameterException) as error:  # unknown robot, or not a name
         sys.exit(f'error: {error}')
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -5,7 +5,7 @@
     pip install --extra-index-url https://download.pytorch.org/whl/cpu .      # in the repository
     python examples/learn_in_python.py
 
-Replace `EmulatedArm` by whatever reads your muscles.
+Replace `EmulatedArm` by the interface to your muscles.
 """
 
 import argparse
@@ -22,9 +22,13 @@ from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
 PERIOD = 0.01  # [s] between two readings
 
 parser = argparse.ArgumentParser(description='Learn an emulated arm, and estimate its joints.')
-parser.add_argument('--postures', type=int, default=40, help='in which the arm rests')
-parser.add_argument('--steps', type=int, default=1000, help='of the initial training')
-parser.add_argument('--out', default='learned.safetensors', help='where the network is kept')
+parser.add_argument(
+    '--postures', type=int, default=40, help='number of postures in which the arm rests'
+)
+parser.add_argument(
+    '--steps', type=int, default=1000, help='number of steps of the initial training'
+)
+parser.add_argument('--out', default='learned.safetensors', help='file for the network')
 options = parser.parse_args()
 
 robot = Robot.load('arm26')  # or the directory of your robot.urdf and muscles.yaml
@@ -33,7 +37,7 @@ arm = EmulatedArm(robot, seed=1)
 learner = Learner(robot, initial)
 
 rng, time = np.random.default_rng(0), 0.0
-errors = []  # of the initial and of the newest network, at each rest [rad]
+errors = []  # of the initial and the newest network, at each rest [rad]
 for theta in robot.random_postures(options.postures, rng):
     tension = rng.uniform(40.0, 120.0, robot.muscle_count)
     goal = robot.muscle_lengths(theta[None], tension[None])[0]
@@ -43,11 +47,11 @@ for theta in robot.random_postures(options.postures, rng):
         arm.command_length(start + (goal - start) * min(1.0, step / 50))
         arm.step(PERIOD)
         read = arm.sense()
-        way = direction.step(read.length)
+        sliding = direction.step(read.length)
         learner.step(time, read.theta, read.tension, read.length)
     estimates = [
-        # T without the friction along the wires, as far as the network knows it.
-        mae.estimate(end_tension(mae.friction, read.tension, way), read.length).theta
+        # Bone-side tension: T minus the tendon friction that the network has learned.
+        mae.estimate(end_tension(mae.friction, read.tension, sliding), read.length).theta
         for mae in (initial, learner.mae)
     ]
     errors.append([np.linalg.norm(estimate - read.theta) for estimate in estimates])

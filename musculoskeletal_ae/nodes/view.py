@@ -226,11 +226,11 @@ class View(Node):
             error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
         anomaly = math.nan if anomaly is None else anomaly
         distance = '' if math.isnan(situation.distance) else f'  d {situation.distance:.0f}'
+        learned = f'samples {situation.samples or 0} · networks {situation.checkpoints or 0}'
         lines = [
             figures('measured' in posture, error, anomaly, self.robot.kinematics.distance_unit)
             + distance,
-            f'samples {situation.samples or 0} · networks {situation.checkpoints or 0} · '
-            f'{situation.doing or "–"}',
+            f'{learned} · {situation.doing or "–"}',
             'waiting for muscle_states' if states is None else situation.hint(),
         ]
         trouble = self.page.with_buttons(situation.trouble())

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page in the browser: what it shows of an arm, without ROS."""
+"""The web page that shows an arm; independent of ROS."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm as solids: links by the URDF's meshes or as capsules, muscles as tubes.
+"""An arm as solids: links as meshes of the URDF or as capsules, muscles as tubes.
 
-A muscle is blue at T_bias and orange at T_limit, which everybody can tell apart, and thicker the
-harder it pulls. A cut one is black and dashed, an isolated one grey and dashed, a suspect one
-magenta and thick.
+Muscles are blue at T_bias and orange at T_limit, which colour-blind people can distinguish, and
+thicker at higher tension. Ruptured muscles are black and dashed, isolated ones grey and dashed, and
+suspects magenta and thick.
 """
 
 import io
@@ -25,49 +25,52 @@ from musculoskeletal_ae.robot.routes import ARC
 
 LARGEST_MESH = 50_000_000  # [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-POSTURES = 20  # in which the arm is to be seen whole
-DASHES = 5  # of a straight segment of a muscle; whole muscles show no gaps
+POSTURES = 20  # random postures that have to fit into the picture
+DASHES = 5  # tubes per straight segment of a muscle; sound muscles show no gaps
 #: red, green, blue at T_bias and at T_limit
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 
 
 class Kind(IntEnum):
-    """What is known of a muscle."""
+    """State of a muscle, as far as it is known."""
 
     SOUND = 0
     SUSPECT = 1
     ISOLATED = 2
-    CUT = 3
+    RUPTURED = 3
 
 
 MARKS = ('', '? ', '⊘ ', '✂ ')  # by kind
-#: red, green, blue of those that are not coloured by tension
-COLOURS = {Kind.SUSPECT: (200, 0, 130), Kind.ISOLATED: (140, 140, 140), Kind.CUT: (0, 0, 0)}
+#: red, green, blue of muscles that are not coloured by tension
+COLOURS = {Kind.SUSPECT: (200, 0, 130), Kind.ISOLATED: (140, 140, 140), Kind.RUPTURED: (0, 0, 0)}
 
 
 def colours(robot: Robot, tension: Array, kinds: Ints) -> Array:
-    """Return red, green and blue (M, 3), bytes, of muscles at T [N] (M,)."""
+    """Return the colours of muscles at T [N] (M,) as red, green and blue, uint8 (M, 3)."""
     rgb = LOOSE + drawing.tension_share(robot, tension)[:, None] * (TIGHT - LOOSE)
     for kind, colour in COLOURS.items():
         rgb[kinds == kind] = colour
     return rgb.astype(np.uint8)
 
 
-Solid = tuple[int, trimesh.Trimesh]  # joint of pinocchio's tree, and what moves with it [m]
+Solid = tuple[int, trimesh.Trimesh]  # joint of pinocchio's tree, and a mesh in its frame [m]
 
 
 def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
-    """Return meshes of a URDF's visuals, capsules of links without, and what was left out."""
+    """Return the solids of all links, and a note for each mesh that cannot be drawn.
+
+    Joints without meshes in the URDF get capsules.
+    """
     solids, notes = [], []
     root = ET.fromstring(robot.description.urdf)  # noqa: S314 - checked when it was loaded
-    for link in root.iterfind('{*}link'):  # those deeper are of plugins
+    for link in root.iterfind('{*}link'):  # deeper <link> elements belong to plugins
         joint, at = robot.kinematics.placement(link.get('name', ''))
         for visual in link.iterfind('{*}visual'):
             if (element := visual.find('{*}geometry/{*}mesh')) is None:
                 continue
             try:
                 mesh = _read_mesh(robot.description.directory, element)
-            except Exception as error:  # noqa: BLE001 - trimesh raises whatever a file brings about
+            except Exception as error:  # noqa: BLE001 - trimesh may raise anything
                 notes.append(f'{element.get("filename")}: {error}')
                 continue
             origin = visual.find('{*}origin')
@@ -80,7 +83,11 @@ def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
 
 
 def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
-    """Read the file of a <mesh>: package://, file:// or relative to the robot's directory."""
+    """Read the file of a <mesh>: package://, file:// or relative to the robot's directory.
+
+    Raises:
+        RobotDescriptionError: If the file cannot be drawn.
+    """
     name = element.get('filename', '')
     places, rest = [directory], name.removeprefix('file://')
     if name.startswith('package://'):
@@ -103,7 +110,7 @@ def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
 
 
 def _capsules(robot: Robot) -> list[Solid]:
-    """Return a capsule from every joint to the next, and one to each end effector."""
+    """Return a capsule from each joint to the next, and one to each end effector."""
     kin, solids = robot.kinematics, []
     bones = [*zip(kin.tree.parent[1:], kin.tree.placement_translation[1:])]
     tips = [kin.placement(link) for link in robot.description.end_effectors]
@@ -118,9 +125,9 @@ def _capsules(robot: Robot) -> list[Solid]:
 
 
 def space(robot: Robot, solids: list[Solid]) -> tuple[Array, float, float]:
-    """Return the centre [m] and the radius of a ball that holds the arm, and its lowest z.
+    """Return centre [m] and radius [m] of a sphere that contains the arm, and its lowest z [m].
 
-    That is the arm with all that is drawn of it, in its middle posture and in postures beside it.
+    The sphere contains the drawn solids and muscles in the middle posture and in random postures.
     """
     middle = 0.5 * (robot.lower + robot.upper)
     spread = 0.25 * (robot.upper - robot.lower)
@@ -143,23 +150,24 @@ def space(robot: Robot, solids: list[Solid]) -> tuple[Array, float, float]:
 
 
 def grid_cell(reach: float) -> float:
-    """Return a round size of the floor's cells [m] for an arm of a size [m]."""
+    """Return a round size [m] of the floor's cells for an arm of radius `reach` [m]."""
     return float(10.0 ** np.round(np.log10(0.15 * reach)))
 
 
 def pieces(robot: Robot) -> Ints:
-    """Return the muscle of each straight piece that is drawn: those of segments, and of arcs."""
+    """Return the muscle of each straight piece that is drawn, of segments and of arcs."""
     routes = robot.routes
     return np.sort(np.append(routes.muscle, np.repeat(routes.muscle[routes.wrapping], ARC)))
 
 
 def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dict[str, Array]:
-    """Return muscles at θ [rad] (D,) and T [N] (M,) as tubes of radius 1 from −½ to ½ along z.
+    """Return the tubes of muscles at θ [rad] (D,) and T [N] (M,), DASHES tubes per piece.
 
-    Positions [m], quaternions wxyz, scales and colours are those of DASHES tubes a piece.
+    Positions [m], quaternions wxyz and scales place a tube of radius 1 that reaches from −½ to ½
+    along z.
     """
     owner = pieces(robot)
-    # As many pieces whether a wire wraps or not: those that it then lacks have no length.
+    # The number of pieces is constant: pieces of a tendon that does not wrap have no length.
     drawn = zip(robot.routes.drawn(theta), robot.routes.pieces_drawn.tolist(), strict=True)
     lines = [
         line[np.linspace(0.0, len(line) - 1.0, n + 1).round().astype(int)] for line, n in drawn
@@ -168,7 +176,8 @@ def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dic
     line = np.concatenate([np.diff(line, axis=0) for line in lines])
     length = np.linalg.norm(line, axis=1)
     along = line / np.maximum(length, 1e-9)[:, None]
-    # The shortest turn from z: the half-way vector as quaternion; straight down, about x.
+    # Shortest rotation from z to the direction: the half-way vector as quaternion. A piece that
+    # points straight down turns about x.
     turn = np.stack([1.0 + along[:, 2], -along[:, 1], along[:, 0], 0.0 * length], axis=1)
     turn[turn[:, 0] < 1e-9] = 0.0, 1.0, 0.0, 0.0
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
@@ -176,7 +185,7 @@ def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dic
     position = first[:, None] + middle[:, None] * line[:, None]
     radius = 0.5 * drawing.MUSCLE_WIDTH * (1.0 + 1.5 * drawing.tension_share(robot, tension))
     radius = np.where(kinds == Kind.SUSPECT, drawing.MUSCLE_WIDTH * 1.5, radius)[owner]
-    # A whole muscle's dashes overlap a little, so that none of its joints can be seen.
+    # Tubes of sound muscles overlap slightly to hide the seams.
     dash = np.where(kinds >= Kind.ISOLATED, 0.55, 1.02)[owner] * length / DASHES
     each = {
         'batched_wxyzs': turn,

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page itself: three arms, curves, bars and controls, served by viser.
+"""The web page: three arms, curves, bars and controls, served by viser.
 
-What a visitor asks for goes to `act`, called in viser's threads with a name and its value:
+Requests of visitors call `act` in viser's threads, with the name of the request and its value:
 
     targets {joint: rad} · hand xyz [m] · reset · push xyz [N] · cut name · mend name · payload kg
-    position s · or the name of a service
+    position s · or the name of a service without a value
 """
 
 import contextlib
@@ -30,14 +30,14 @@ from musculoskeletal_ae.view.body import MARKS, Kind
 from musculoskeletal_ae.view.readings import ARMS, HTML, History, Readings
 from musculoskeletal_ae.view.visits import checked_visits
 
-NARROW = 900  # [pixels] of a window in which two panels would hide the arm
-CAMERA_FOV = 0.8  # [rad] of the picture's height
-#: the half-angle within which the arm is seen between the panels of a window of 1280 × 800
+NARROW = 900  # [pixels] width below which two panels would hide the arm
+CAMERA_FOV = 0.8  # [rad] vertical field of view
+#: half-angle that is visible between the panels of a window of 1280 × 800 pixels
 VISIBLE = math.atan(0.7 * math.tan(0.5 * CAMERA_FOV))
 VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
 EXPLORE, RESET, RESTORE, MEND = 'Explore', 'Reset after a stop', 'Restore isolated muscles', 'Mend'
 CALIBRATE = 'Find the length offsets'
-#: what the remedies of stops say, and the button that does it; longer phrases first
+#: phrases in remedies of stops, and the button for each; longer phrases first
 BUTTONS = {
     'call estimator/reset; call controller/reset': RESET,
     'call estimator/reset': RESET,
@@ -46,39 +46,53 @@ BUTTONS = {
     'call estimator/zero': CALIBRATE,
     'controller/explore explores again': EXPLORE,
 }
-PUSH_STIFFNESS, MOST_PUSH = 200.0, 60.0  # [N/m] of the mouse's pull, [N]
+PUSH_STIFFNESS = 200.0  # [N/m] force per distance that the mouse drags
+MOST_PUSH = 60.0  # [N]
 MOST_PAYLOAD = 5.0  # [kg]
 HOT = 80.0  # [°C] at the right end of a bar
 
 
 class Page:
-    """One page for any number of visitors."""
+    """One page, for any number of visitors."""
 
     def __init__(
         self, robot: Robot, host: str, port: int, read_only: bool, act: Callable[..., None]
     ) -> None:
-        """Serve the page on a free port; without `read_only`, `act` hears what visitors ask for."""
+        """Serve the page.
+
+        Args:
+            robot: The robot to show.
+            host: Address to listen on.
+            port: Port to listen on.
+            read_only: Whether to leave the controls out.
+            act: Called with the requests of visitors.
+
+        Raises:
+            MusculoskeletalError: If the port cannot be used.
+        """
         self._robot, self._act = robot, act
         self._visitors: set[int] = set()
         self.looked_at = threading.Event()
-        # A browser opens connections that it never uses; no traceback of each.
+        # Browsers open connections that they never use; do not log a traceback for each.
         logging.getLogger('websockets.server').setLevel(logging.CRITICAL)
-        try:  # viser waits for ever, or takes another port
+        try:  # viser would wait for ever, or use another port
             family = socket.getaddrinfo(host, port)[0][0]
             socket.create_server((host, port), family=family).close()
         except (OSError, UnicodeError) as error:
-            told = f'no page at port {port} of {host}: {getattr(error, "strerror", error)}'
-            raise MusculoskeletalError(f'{told}; choose another --port or --host') from error
-        # viser announces itself.
+            reason = getattr(error, 'strerror', error)
+            raise MusculoskeletalError(
+                f'no page at port {port} of {host}: {reason}; choose another --port or --host'
+            ) from error
+        # Discard what viser prints.
         with (
             contextlib.redirect_stdout(io.StringIO()),
             checked_visits(host, f'{robot.description.directory.name} – musculoskeletal_ae'),
         ):
             server = self._server = viser.ViserServer(host, port, verbose=False)
-        if server.get_port() != port:  # somebody was faster
+        if server.get_port() != port:  # another process took it first
             server.stop()
             raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
-        # A tunnel to the world is nothing that a visitor may ask for.
+        # Visitors must not open a tunnel to the internet.
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self._history = History()
         self._readings: dict[int, Readings] = {}  # by visitor
@@ -87,7 +101,7 @@ class Page:
         self._picked, self._targeted, self._pushing = '', False, False
         self._build_scene()
         self._build_panels()
-        self._controls: dict[str, Any] = {}  # shown while a node is there
+        self._controls: dict[str, Any] = {}  # by node; shown while it runs
         self._restore: Any = None
         if not read_only:
             self._build_controls()
@@ -106,24 +120,24 @@ class Page:
 
     def _count(self, visitor: int, here: bool) -> None:
         (self._visitors.add if here else self._visitors.discard)(visitor)
-        if not here and self._pushing:  # whoever left: a drag that goes on pushes again
+        if not here and self._pushing:  # whoever left; a continuing drag pushes again
             self._pushing = self._force.visible = False
             self._act('push', np.zeros(3))
         (self.looked_at.set if self._visitors else self.looked_at.clear)()
 
     def close(self) -> None:
-        """End the page."""
+        """Stop serving the page."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    # -- what is shown --------------------------------------------------------------------------
+    # -- display --------------------------------------------------------------------------------
 
     def _build_scene(self) -> None:
         robot, scene, kin = self._robot, self._server.scene, self._robot.kinematics
         solids, self.notes = body.link_solids(robot)
         middle = 0.5 * (robot.lower + robot.upper)
         centre, reach, bottom = body.space(robot, solids)
-        self._arms: dict[str, list[Any]] = {}  # its frame, then those of its joints
+        self._arms: dict[str, list[Any]] = {}  # root frame, then joint frames
         for arm, colour in ARMS.items():
             frames = self._arms[arm] = [scene.add_frame(f'/{arm}', show_axes=False, visible=False)]
             for i, parent in enumerate(kin.tree.parent[1:], 1):
@@ -136,7 +150,9 @@ class Page:
                 look: dict[str, Any] = {'color': colour, 'opacity': opacity, 'cast_shadow': False}
                 scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look)
         tube = trimesh.creation.cylinder(1.0, 1.0, sections=12)
-        tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)  # open ends leave no seams
+        tube.update_faces(
+            np.abs(tube.face_normals[:, 2]) < 0.5
+        )  # without end caps there are no seams
         tubes: Any = body.muscle_tubes(robot, middle, np.zeros(robot.muscle_count), self._kinds)
         look = {'lod': 'off', 'side': 'double', 'cast_shadow': False, 'visible': False}
         self._tubes: Any = scene.add_batched_meshes_simple(
@@ -152,7 +168,7 @@ class Page:
         floor = (*centre[:2], bottom - 0.1 * reach)
         size = 8.0 * reach
         scene.add_grid('/floor', size, size, position=floor, cell_size=body.grid_cell(reach))
-        # Lights that leave colours what they are.
+        # Lights that do not tint colours.
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_ambient('/light', intensity=1.5)
@@ -176,7 +192,7 @@ class Page:
             self._wanted = {arm: gui.add_checkbox(f'{arm} arm', True) for arm in ARMS}
 
     def draw(self, posture: dict[str, Array], tension: Array | None, kinds: Ints) -> None:
-        """Draw arms at θ [rad] (D,), those that are known, and muscles at T [N] (M,)."""
+        """Draw the arms at their θ [rad] (D,) if known, and muscles at T [N] (M,)."""
         kin, self._posture = self._robot.kinematics, posture
         with self._server.atomic():
             for arm, (root, *joints) in self._arms.items():
@@ -206,7 +222,7 @@ class Page:
             self._ball.position = kin.end_effector_pose(theta).translation
 
     def _mark(self) -> None:
-        """Write names where they are asked for, and always of muscles that are not sound."""
+        """Label muscles: all if requested, else those that are picked or not sound."""
         for name, kind, label in zip(self._robot.muscles, self._kinds.tolist(), self._labels):
             label.visible = self._names.value or kind > Kind.SOUND or name == self._picked
             label.text = MARKS[kind] + name + (f' {Kind(kind).name.lower()}' if kind else '')
@@ -220,9 +236,15 @@ class Page:
         values: Sequence[float],
         is_urgent: bool = True,
     ) -> None:
-        """Show what is going on: T [N] and temperatures [°C], (2, M), as bars, values as curves.
+        """Show texts, bars and curves.
 
-        Those are error [rad], A, d and its limit at a time [s]. NaN is not known.
+        Args:
+            lines: Lines of status text.
+            alarm: Text of the alarm box; '': no box.
+            states: T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
+            now: Time of `values` [s].
+            values: Error [rad], A, d and its limit, for the curves; NaN where unknown.
+            is_urgent: Whether the alarm box is red.
         """
         self._history.add(now, values)
         status, bars = (
@@ -233,7 +255,7 @@ class Page:
             readings.show(status, bars, self._history)
 
     def _muscles(self, tension: Array, temperature: Array) -> list[dict[str, Any]]:
-        """Return what the bars show of each muscle."""
+        """Return the template variables of each muscle's bar."""
         columns = {
             'rgb': map(
                 tuple, body.colours(self._robot, np.nan_to_num(tension), self._kinds).tolist()
@@ -249,37 +271,37 @@ class Page:
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
     def with_buttons(self, text: str) -> str:
-        """Return a text for people that names buttons of the page instead of their services."""
+        """Return a text in which buttons of the page replace the calls of their services."""
         for calls, button in BUTTONS.items() if self._controls else ():
             text = text.replace(calls, f'press "{button}"')
         return text
 
     def notify(self, text: str, good: bool) -> None:
-        """Show every visitor what became of a request."""
+        """Notify all visitors of the outcome of a request."""
         title, color = ('done', 'teal') if good else ('refused', 'red')
         for client in self._server.get_clients().values():
             client.add_notification(title, text, color=color, auto_close_seconds=6)
 
-    # -- what visitors ask for ------------------------------------------------------------------
+    # -- controls -------------------------------------------------------------------------------
 
     def _build_controls(self) -> None:
         gui, robot, scene = self._server.gui, self._robot, self._server.scene
 
-        def heed(listen: Any, what: str, value: Any = None) -> None:
-            def heard(event: Any) -> None:
-                if event.client is not None:  # not `follow`
+        def connect(register: Any, what: str, value: Any = None) -> None:
+            def on_event(event: Any) -> None:
+                if event.client is not None:  # None: `follow` has set the control
                     if what in ('targets', 'hand', 'reset', 'controller/explore'):
                         self._targeted = what in ('targets', 'hand')
                     self._act(what, *[value(event)] if value else [])
 
-            listen(heard)
+            register(on_event)
 
         def button(label: str, what: str, value: Any = None, color: Any = None) -> None:
-            heed(gui.add_button(label, color=color).on_click, what, value)
+            connect(gui.add_button(label, color=color).on_click, what, value)
 
         def slider(label: str, low: float, high: float, step: float, what: str, value: Any) -> Any:
             made = gui.add_slider(label, low, high, step, min(max(0.0, low), high))
-            heed(made.on_update, what, value)
+            connect(made.on_update, what, value)
             return made
 
         def chosen(event: Any) -> Any:
@@ -291,10 +313,10 @@ class Page:
             button(RESET, 'reset')
             button(CALIBRATE, 'estimator/zero')
             self._restore = gui.add_button(RESTORE, visible=False)
-            heed(self._restore.on_click, 'estimator/restore')
+            connect(self._restore.on_click, 'estimator/restore')
             gizmo = gui.add_checkbox('move the hand with the mouse', False)
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
-            # A hundredth of the range, or less, so that ends are near the limits.
+            # Steps of at most a hundredth of the range keep the ends near the limits.
             spans = np.minimum(robot.upper - robot.lower, 100.0)
             places = np.ceil(2.0 - np.log10(spans)).astype(int).tolist()
             steps = np.array([float(f'1e-{n}') for n in places])
@@ -304,7 +326,7 @@ class Page:
                 for joint, low, high, step in zip(robot.joints, *limits, steps)
             ]
         with gui.add_folder('Faults of the emulated arm') as faults:
-            self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on one')
+            self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on a muscle')
             self._muscle.on_update(lambda event: self._pick(chosen(event)))
             button('Cut', 'cut', lambda _: self._muscle.value, 'orange')
             button(MEND, 'mend', lambda _: self._muscle.value)
@@ -315,9 +337,9 @@ class Page:
             button('Play', 'replay/resume')
         look: dict[str, Any] = {'disable_rotations': True, 'depth_test': False, 'visible': False}
         self._gizmo: Any = scene.add_transform_controls('/target', 0.35 * self._reach, **look)
-        heed(self._gizmo.on_update, 'hand', lambda event: np.array(event.target.position))
+        connect(self._gizmo.on_update, 'hand', lambda event: np.array(event.target.position))
         self._ball = scene.add_icosphere('/push', 0.03, (255, 200, 0), opacity=0.55, visible=False)
-        heed(self._ball.on_drag('left'), 'push', self._push)
+        connect(self._ball.on_drag('left'), 'push', self._push)
         look = {'shaft_radius': 0.006, 'head_radius': 0.014, 'head_length': 0.04, 'visible': False}
         self._force = scene.add_arrows('/force', np.zeros((1, 2, 3)), (200, 0, 0), **look)
         self._tubes.on_click(
@@ -327,7 +349,7 @@ class Page:
         self._controls['pushed'] = self._ball
 
     def offer(self, nodes: Iterable[str]) -> None:
-        """Show the controls of those nodes that are there."""
+        """Show the controls of the running nodes only."""
         for node, handle in self._controls.items():
             handle.visible = node in nodes
         if self._controls and 'controller' not in nodes:
@@ -336,7 +358,7 @@ class Page:
             self._restore.visible = bool((self._kinds == Kind.ISOLATED).any())
 
     def follow(self, payload: float, played: Sequence[float] | None) -> None:
-        """Let the controls show what is: sliders the estimate, until a target was given."""
+        """Update the controls; sliders show the estimate until a visitor sets a target."""
         if not self._controls:
             return
         theta = self._posture.get('estimated')
@@ -355,7 +377,7 @@ class Page:
         self._mark()
 
     def _push(self, event: Any) -> Array:
-        """Draw the force of a drag and return it [N] (3,)."""
+        """Draw and return the force of a drag [N] (3,)."""
         ends = np.array([event.start_position, event.end_position])
         force = PUSH_STIFFNESS * (ends[1] - ends[0])
         self._pushing = self._force.visible = event.phase != 'end'

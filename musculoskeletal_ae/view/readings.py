@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a visitor reads beside the arm: how it is, curves, and a bar for each muscle."""
+"""Readings beside the arm: status, curves, and a bar for each muscle."""
 
 import math
 from collections import deque
@@ -17,15 +17,15 @@ from musculoskeletal_ae.view import body
 ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
 HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # its macros
-DURATION = 60.0  # [s] that curves show
-GAP = 1.0  # [s] without a value, after which a curve begins anew
+DURATION = 60.0  # [s] length of the curves
+GAP = 1.0  # [s] without a value after which a curve restarts
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
 HEIGHT = 104  # [pixels] of a plot
 
 
 class Curve(NamedTuple):
-    """One plot: its title, how its lines look, and which of the values they show."""
+    """One plot: title, line styles, and the indices of the values that it shows."""
 
     title: str
     lines: tuple[Any, ...]
@@ -33,30 +33,31 @@ class Curve(NamedTuple):
 
 
 def curves(unit: str) -> tuple[Curve, ...]:
-    """Return the plots of an arm whose postures differ by so many `unit`."""
+    """Return the plots; `unit` is that of the estimation error."""
     return (
         Curve(f'error of the estimate [{unit}]', (GREEN,), (0,)),
-        Curve('A: how badly T and l fit together', (BLUE,), (1,)),
-        Curve('d: A in healthy spreads (dashed: anomaly)', (BLUE, DASHED), (2, 3)),
+        Curve('A: mismatch between T and l', (BLUE,), (1,)),
+        Curve('d: A relative to a healthy arm (dashed: anomaly)', (BLUE, DASHED), (2, 3)),
     )
 
 
 class History:
-    """The last minute of the values that curves show; NaN is not known."""
+    """The last minute of the values for the curves; NaN where unknown."""
 
     def __init__(self) -> None:
         self._rows: deque[list[float]] = deque()
 
     def add(self, now: float, values: Sequence[float]) -> None:
-        """Take the values of a moment [s]."""
+        """Add the values at a time [s]."""
         self._rows.append([now, *values])
         while self._rows[0][0] < now - DURATION:
             self._rows.popleft()
 
     def curve(self, values: Sequence[int]) -> tuple[Array, ...]:
-        """Return the time before now [s] and values since the last gap, where the first is known.
+        """Return time relative to now [s], and the values since the last gap.
 
-        A value after it that is not known is drawn as the first one, which hides it.
+        Rows in which the first value is unknown are left out. Where another value is unknown, it is
+        replaced by the first one, whose line hides it.
         """
         table = np.array(self._rows)
         if not len(table):
@@ -72,7 +73,7 @@ class History:
 
 
 def scale_top(largest: float) -> float:
-    """Return the least 1, 2 or 5 times a power of ten that is not below a value."""
+    """Return the smallest 1, 2 or 5 times a power of ten that is at least `largest`."""
     if not 0.0 < largest < math.inf:
         return 1.0
     power = 10.0 ** math.floor(math.log10(largest))
@@ -80,7 +81,7 @@ def scale_top(largest: float) -> float:
 
 
 class Readings:
-    """The readings of one visitor, in a panel of their own unless the window is narrow."""
+    """The readings of one visitor, in a separate panel unless the window is narrow."""
 
     def __init__(self, gui: Any, robot: Robot, is_narrow: bool) -> None:
         self._plots: list[tuple[Curve, Any]] = []
@@ -118,7 +119,7 @@ class Readings:
             self._tops.append(1.0)
 
     def show(self, status: str, bars: str, history: History) -> None:
-        """Show texts as HTML, and curves."""
+        """Show the HTML texts and the curves."""
         self._status.content, self._bars.content = status, bars
         for number, (curve, plot) in enumerate(self._plots):
             data = history.curve(curve.values)
@@ -135,5 +136,5 @@ def _scales(top: float) -> dict[str, Any]:
 
 
 def _axes(top: float) -> tuple[Any, ...]:
-    """Return axes with ticks at 0, at half of the range, and at its end."""
+    """Return axes with ticks at 0, at half of the range and at its end."""
     return {'size': 30, 'space': 40}, {'incrs': [0.5 * top], 'space': 8, 'size': 56}

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may visit the page, and what a browser may send to it.
+"""Restricts who may open the page, and what a browser may send to it.
 
-A browser lets every web site open a WebSocket to localhost: without a check, any site that somebody
-reads could move the arm. And viser sets whatever attribute of a control a browser names. It offers
-no way to check either, but serves its page by the public function `websockets.asyncio.server.serve`
-and the public class `ServerConnection`, which `checked_visits` extends while viser starts.
+Browsers let every web site open a WebSocket to localhost. Without a check, any site that is open in
+a browser could move the arm. Moreover, viser sets any attribute of a control that a browser names.
+It offers no hook for either check. It serves its page by the public function
+`websockets.asyncio.server.serve` and the public class `ServerConnection`, however, and
+`checked_visits` extends these while viser starts.
 """
 
 import gzip
@@ -26,17 +27,17 @@ LOCAL = ('localhost', '127.0.0.1', '::1')
 
 
 class Visit(server.ServerConnection):
-    """A connection that leaves out messages which change more of a control than its value."""
+    """A connection that drops messages which change more of a control than its value."""
 
     async def recv(self, *arguments: Any, **options: Any) -> Any:
-        """Return the next message of the browser that may be handled."""
+        """Return the next legal message of the browser."""
         while True:
             data = await super().recv(*arguments, **options)
-            if _may_be_handled(data):
+            if _is_legal(data):
                 return data
 
 
-def _may_be_handled(data: str | bytes) -> bool:
+def _is_legal(data: str | bytes) -> bool:
     if isinstance(data, str):  # viser's messages are binary
         return False
     try:
@@ -50,7 +51,7 @@ def _may_be_handled(data: str | bytes) -> bool:
 
 
 def with_title(response: Response, title: str) -> Response:
-    """Return a page with a title of ours in the browser's tab."""
+    """Return the response with `title` as the title of the page."""
     is_packed = response.headers.get('Content-Encoding') == 'gzip'
     if not response.headers.get('Content-Type', '').startswith('text/html'):
         return response
@@ -65,28 +66,30 @@ def with_title(response: Response, title: str) -> Response:
 
 
 def is_foreign(host: str, request: Request) -> bool:
-    """Return whether a page of another site opens a connection to a page served at `host`.
+    """Whether a page of another site sent a request to the page served at `host`.
 
-    The site of a page is its origin; who sends none is no browser.
+    Browsers send the site in the header `Origin`. Other clients send none and are not foreign.
     """
     origin = request.headers.get('Origin', '')
     try:
         site = urlsplit(origin)
     except ValueError:
         return True
-    # A name of another site that leads to this machine is still another site.
+    # A domain name that resolves to this machine is still another site.
     elsewhere = host in LOCAL and site.hostname not in LOCAL
     return bool(origin) and (site.netloc != request.headers.get('Host') or elsewhere)
 
 
 @contextmanager
 def checked_visits(host: str, title: str) -> Iterator[None]:
-    """Check the visits to whatever websockets begins to serve meanwhile at `host`.
+    """Within the context, let websockets check the visits to every page that it begins to serve.
 
-    The page has a title in the browser's tab.
+    Args:
+        host: Address of the page.
+        title: Title of the page.
 
     Raises:
-        MusculoskeletalError: If it serves nothing meanwhile: then nothing would be checked.
+        MusculoskeletalError: If websockets has served nothing, because nothing is checked then.
     """
     serve, served = server.serve, False
 
@@ -96,7 +99,9 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
 
         def check(connection: server.ServerConnection, request: Request) -> Response | None:
             if is_foreign(host, request):
-                return connection.respond(HTTPStatus.FORBIDDEN, 'a page of another site\n')
+                return connection.respond(
+                    HTTPStatus.FORBIDDEN, 'refused: request from another site\n'
+                )
             answer: Response | None = process_request(connection, request)
             return answer if answer is None else with_title(answer, title)
 
@@ -109,5 +114,5 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
     finally:
         server.serve = serve  # type: ignore[misc]
     if not served:
-        problem = 'this version of viser serves its page in a way that cannot be checked'
-        raise MusculoskeletalError(f'{problem}; install the one of .ci/requirements-view.txt')
+        problem = 'visits to the page of this version of viser cannot be checked'
+        raise MusculoskeletalError(f'{problem}; install the version in .ci/requirements-view.txt')
