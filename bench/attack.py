@@ -3,18 +3,21 @@
 
     python -m bench attack [--quick] [--seeds 0,1,2,3,4] [--kinds 'false zeros',…]
 
-The whole system runs on an emulated arm, once for each seed. First it is misled in known ways
-(`attack_kinds`), in several shapes, while it holds and while it explores; the seeds share them.
-After each, what the status line advises is done literally, until the arm goes on. Then random
-events follow: targets, services, faults, suspended and killed nodes, false states of the body. Then
-a stranger publishes on every topic that a node listens to (heard messages changed, and such as were
-never sane), and calls every service with odd content. Every command, every tension and every status
-is recorded and judged. Beside it hostile files are read, and, but for the quick form, a learner is
-killed as in `kills`.
+The whole system runs on an emulated arm, once for each seed. Each run has three parts:
 
-Prints a table: promise, how often it was tried, how often it was broken. Exit status 1 if any was.
-What a stranger may do on an open graph is not tried: command the modules, whom they obey, within
-their limits; ask for a stop; set a parameter to a legal value.
+1. Known attacks (`attack_kinds`), in several variants, while the arm holds and while it explores.
+   The seeds share them. After each attack, the bench follows the advice of the status line
+   literally until the arm moves on.
+2. Random events: targets, services, faults, suspended and killed nodes, false states of the body.
+3. Messages of a hostile node. It publishes on every topic that a node subscribes to (modified
+   genuine messages, and random ones), and calls every service with illegal content.
+
+Every command, tension and status is recorded and checked. The bench also reads hostile files and,
+unless `--quick`, kills a learner as in `kills`.
+
+Prints a table: promise, number of trials, number of violations. Exit status 1 if there is any
+violation. The hostile node never does what an open graph allows: command the modules within their
+limits, request a stop, or set a parameter to a legal value.
 """
 
 import random
@@ -36,20 +39,20 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-JITTER = 0.03  # [s] by which a loaded machine publishes a command later than it was made
-RELIEF = 0.3  # [s] for which a tension that is being relieved was measured before
-SILENT = 10.0  # [s] that a node under attack may keep /diagnostics waiting
-GROWTH = 1.2  # of a node's memory, over what it was after five minutes
-YOUNG = 300.0  # [s]
-ABOVE, MOMENT = 1.1, 0.5  # of tension.limit, and how long [s] a tension may be above that
-STILL = 0.002  # [m] that a stopped arm may be wound in
+JITTER = 0.03  # [s] delay between computing and publishing a command on a loaded machine
+RELIEF = 0.3  # [s] before a command, in which an excess tension justifies fast paying out
+SILENT = 10.0  # [s] longest legal time between two reports of a node under attack
+GROWTH = 1.2  # largest legal ratio of a node's memory to that at age YOUNG
+YOUNG = 300.0  # [s] age of a node from which its memory is compared
+ABOVE, MOMENT = 1.1, 0.5  # tension / tension.limit, and the longest legal time above it [s]
+STILL = 0.002  # [m] by which a stopped arm may be wound in
 MOST_MEMORY = 500.0  # [MB] of any node at any time
 
 
 class Size(NamedTuple):
-    """How much is tried, in all seeds together."""
+    """Number of trials, over all seeds."""
 
-    attacks: int | None  # known ones; None: all of them
+    attacks: int | None  # known attacks; None: all of them
     events: int
     messages: int
     node_kills: int
@@ -61,11 +64,11 @@ class Size(NamedTuple):
 FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
 QUICK = Size(4, 20, messages=2000, node_kills=2, learner_kills=0, files=42, episodes=1)
 SEEDS = 0, 1, 2, 3, 4
-EVENTS_IN_A_ROW = 50  # until the arm is recovered
+EVENTS_IN_A_ROW = 50  # between two recoveries of the arm
 
 
 class Row(NamedTuple):
-    """One promise, how often it was tried, and how it was broken."""
+    """One promise, the number of its trials, and its violations."""
 
     promise: str
     tried: int
@@ -73,7 +76,7 @@ class Row(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """How the commands of the controller changed from one to the next."""
+    """Changes between successive commands of the controller."""
 
     count: int
     largest_in: float  # winding in, in one tick [m]
@@ -82,14 +85,14 @@ class Steps(NamedTuple):
 
 
 def changes(time: Array, number: Array, value: Array, rate: float, relieved: Array) -> Steps:
-    """Judge the commands of one life of the controller.
+    """Check the rate of the commands of one controller process.
 
     Args:
-        time: When each was published [s], (N,).
-        number: Which message it was, (N,): some may have been missed.
+        time: Times of publishing [s], (N,).
+        number: Sequence numbers, (N,); messages may be missing.
         value: Muscle lengths [m], (N, M).
-        rate: Fastest change [m/s].
-        relieved: Whether a muscle's tension was being relieved, (N, M).
+        rate: Largest legal rate [m/s].
+        relieved: Whether a muscle's excess tension was being relieved, (N, M).
     """
     step, allowed = np.diff(value, axis=0), rate * (np.diff(time)[:, None] + JITTER)
     finite = np.isfinite(value).all()
@@ -109,7 +112,10 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
 
 
 def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscles: int) -> Array:
-    """Say for commands at `time` [s] (N,) which muscles pulled more than `limit` [N], (N, M)."""
+    """Return which muscles exceeded `limit` [N] shortly before commands at `time` [s] (N,): (N, M).
+
+    `loads` are times [s] and measured T [N] (M,); `muscles` is M.
+    """
     if not loads:
         return np.zeros((len(time), muscles), dtype=bool)
     at, over = np.array([t for t, _ in loads]), np.array([load > limit for _, load in loads])
@@ -119,7 +125,7 @@ def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscle
 
 
 def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array:
-    """Return how long each muscle pulled more than `highest` [N] without a break, at most [s] (M,).
+    """Return the longest uninterrupted time of each muscle above `highest` [N]: [s] (M,).
 
     `loads` are times [s] and measured T [N] (M,).
     """
@@ -133,7 +139,7 @@ def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array
 
 
 def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
-    """Return by how much a muscle was wound in, at most, between two times [m]."""
+    """Return the largest length that any muscle was wound in between two times [m]."""
     during = value[(time > begin) & (time < end)]
     if len(during) < 2:
         return 0.0
@@ -141,7 +147,7 @@ def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
 
 
 def without(times: Array, intervals: list[tuple[float, float]]) -> Bools:
-    """Return which times lie in none of the intervals."""
+    """Return which times lie outside all intervals."""
     outside = np.ones(len(times), dtype=bool)
     for begin, end in intervals:
         outside &= (times < begin) | (times > end)
@@ -186,7 +192,7 @@ def attack_graph(
 
 
 def judged(attack: 'Attack') -> list[Row]:
-    """Return the promises and what broke them, from all that was recorded."""
+    """Return the promises and their violations, from the recorded data."""
     from bench.attack_graph import LENGTH
 
     robot, tried, found = attack.robot, attack.tried, attack.findings
@@ -251,7 +257,7 @@ def judged(attack: 'Attack') -> list[Row]:
 
 
 def together(rows: list[Row]) -> list[Row]:
-    """Return one row for each promise, of all seeds."""
+    """Merge the rows of all seeds into one for each promise."""
     merged: dict[str, Row] = {}
     for row in rows:
         before = merged.get(row.promise, Row(row.promise, 0, []))
@@ -262,15 +268,19 @@ def together(rows: list[Row]) -> list[Row]:
 
 
 def main(argv: list[str]) -> int:
-    """Attack, and print the table."""
+    """Run the attacks, and print the table."""
     from bench.attack_kinds import KINDS, all_attacks
 
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
     parser.add_quick('a minute of it')
-    parser.add_argument('--messages', type=whole(1, 10_000_000), help='instead of 100 000')
+    parser.add_argument(
+        '--messages',
+        type=whole(1, 10_000_000),
+        help='number of hostile messages (default: 100 000)',
+    )
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
-    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
-    parser.add_argument('--seeds', type=numbers, help='of what is done (default: 0,1,2,3,4)')
+    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
+    parser.add_argument('--seeds', type=numbers, help='random seeds (default: 0,1,2,3,4)')
     parser.add_argument('--kinds', type=names, help='known attacks (default: all)')
     options = parser.parse_args(argv)
     size, begun = QUICK if options.quick else FULL, time.monotonic()
@@ -310,7 +320,7 @@ def main(argv: list[str]) -> int:
 
 
 def print_rows(rows: list[Row]) -> None:
-    """Print promises, how often they were tried, and how they were broken."""
+    """Print the promises with their trials and violations."""
     print(f'\n{"promise":<46} {"tried":>8} {"broken":>8}')
     for row in rows:
         print(f'{row.promise:<46} {row.tried:>8} {len(row.broken):>8}')

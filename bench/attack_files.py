@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hostile files: robots, tables, networks, states and recordings that are not what they say.
+"""Hostile files: malformed robots, tables, networks, states and recordings.
 
-Each must be used or refused in one line, in time and memory that a laptop does not notice. They are
-read in a child process, so that one that ends the interpreter is a finding and not the end.
+The package must use each file or refuse it with one line, within limits of time and memory. A child
+process reads the files; if one crashes the interpreter, the bench records that and continues.
 """
 
 import json
@@ -26,23 +26,23 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # [s] of the processor for one file; what hangs is found by its end
+LONGEST = 5.0  # [s] of CPU time for one file
 MOST_MEMORY = 300  # [MB] that one file may add to the process's peak
 NASTY = (0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {})
 KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
 
 class Attempt(NamedTuple):
-    """What became of one file: `used`, `refused`, or a finding."""
+    """Outcome of reading one file: `used`, `refused`, or a finding."""
 
     kind: str
     outcome: str
-    seconds: float  # of the processor
+    seconds: float  # CPU time
     memory: float  # [MB] added to the peak
 
     @property
     def broken(self) -> bool:
-        """Whether it is a finding."""
+        """Whether the outcome is a finding."""
         sound = self.outcome in ('used', 'refused')
         return not sound or self.seconds > LONGEST or self.memory > MOST_MEMORY
 
@@ -51,7 +51,7 @@ class Attempt(NamedTuple):
 
 
 def strange_file(file: Path, rng: random.Random) -> None:
-    """Put something that is no such file in the place of one."""
+    """Replace a file by a pipe, link, folder, random data or another kind of wrong file."""
     file.unlink(missing_ok=True)
     kind = rng.randrange(7)
     if kind == 0:
@@ -64,7 +64,7 @@ def strange_file(file: Path, rng: random.Random) -> None:
         file.write_bytes(rng.randbytes(rng.choice([0, 1, 1000, 1_000_000])))
     elif kind == 4:
         with file.open('wb') as stream:
-            stream.truncate(rng.choice([1 << 22, 1 << 30]))  # zeros that take no disk
+            stream.truncate(rng.choice([1 << 22, 1 << 30]))  # sparse: takes no disk space
     elif kind == 5:
         file.write_text(rng.choice(['a,b\n' * 1_000_000, '[' * 400_000, '{"a":' * 400_000]))
     else:
@@ -84,7 +84,7 @@ def changed_tree(value: object, rng: random.Random) -> object:
 
 
 def bomb(rng: random.Random) -> str:
-    """Return YAML that asks for more than it is."""
+    """Return YAML that expands to far more than its own size."""
     inner = rng.choice(['[{}]', '{{<<: [{}]}}'])
     lines = [f'a{i}: &a{i} ' + inner.format(', '.join([f'*a{i - 1}'] * 9)) for i in range(1, 30)]
     keys = '\n'.join(f'k{i}: {i}' for i in range(8000))
@@ -126,7 +126,7 @@ def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
             start = rng.randrange(len(other))
             changed[at : at + size] = other[start : start + size]
         else:
-            # A length or a time: the nastiest numbers, preferably where a record's head is.
+            # Extreme values of a length or a time, preferably in the header of a record.
             value = rng.choice((0, 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1, len(data)))
             heads = [i for i in range(max(0, at - 200), at) if data[i + 2 : i + 9] == bytes(7)]
             at = rng.choice(heads) if heads else at
@@ -140,10 +140,10 @@ def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
 
 
 class Reader:
-    """Makes hostile files of every kind in a folder and reads them as the package does."""
+    """Writes hostile files of every kind to a folder, and reads them as the package does."""
 
     def __init__(self, folder: Path) -> None:
-        """Make the sound files that are damaged."""
+        """Write the valid files that are damaged later."""
         from musculoskeletal_ae.learning.samples import Sample, SampleStore
         from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
@@ -166,7 +166,7 @@ class Reader:
         self.bag = {file.name: file.read_bytes() for file in sorted(bag.iterdir())}
 
     def attempt(self, kind: str, rng: random.Random) -> Callable[[], object]:
-        """Make one hostile file; return what reads it."""
+        """Write one hostile file; return the function that reads it."""
         trial = self.folder / 'trial'
         shutil.rmtree(trial, ignore_errors=True)
         if kind in ('urdf', 'muscles', 'table'):
@@ -287,14 +287,18 @@ def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attemp
             outcome = 'used'
         except MusculoskeletalError as error:
             outcome = 'refused' if str(error).isprintable() else 'escapes in the refusal'
-        except Exception as error:  # noqa: BLE001 - whatever is let out is a finding
+        except Exception as error:  # noqa: BLE001 - every escaped exception is a finding
             outcome = f'{type(error).__name__}: {error}'[:200]
         memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / 1e6
         yield Attempt(kind, outcome, time.process_time() - begun, memory)
 
 
 def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
-    """Read so many hostile files in child processes; return tried, findings, and outcomes."""
+    """Read `count` hostile files in child processes.
+
+    Returns:
+        The number of files, the findings, and the number of each outcome.
+    """
     findings, outcomes, done = [], Counter[str](), 0
     while done < count:
         with tempfile.TemporaryDirectory() as folder:
@@ -322,7 +326,7 @@ def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
 
 
 def _child(start: str, count: str, seed: str, folder: str) -> None:
-    # What hangs ends the child, and that is a finding.
+    # A limit on CPU time ends a child that hangs, which is a finding.
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     resource.setrlimit(resource.RLIMIT_CPU, (3600, 3600))
     import faulthandler

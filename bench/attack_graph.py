@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole system on an emulated arm, and a stranger on its graph.
+"""The whole system on an emulated arm, with a hostile node on its graph.
 
-The stranger publishes on every topic that a node listens to, calls every service, breaks the arm's
-sensors, wires and motors and kills nodes, while a watch records every command of the controller.
+The hostile node publishes on every subscribed topic and calls every service. It also injects faults
+into sensors, tendons and motors, and kills nodes. All commands of the controller are recorded.
 """
 
 from __future__ import annotations
@@ -66,12 +66,12 @@ SERVICES = {
     'rcl_interfaces/srv/ListParameters': ListParameters,
 }
 OWN = QoSProfile(depth=1000)
-JUDGE_PERIOD = 0.25  # [s] between looks at what the status line would say
-PATIENCE = 90.0  # [s] for anything that has to come about
+JUDGE_PERIOD = 0.25  # [s] between checks of the status line
+PATIENCE = 90.0  # [s] to wait for any expected event
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
-#: beyond the range of every parameter
+#: values outside the range of every parameter
 ILLEGAL = (math.nan, math.inf, -math.inf, 1e308, -1e308, -1e12)
 TEXTS = ('', 'torso', '\x1b[2J', '\x9b1m', 'ö' * 300, '/dev/zero', 'a\nb', '*' * 3000)
 LENGTHS = (0, 1, 2, 6, 18, 1000)
@@ -80,18 +80,18 @@ LENGTHS = (0, 1, 2, 6, 18, 1000)
 class Command(NamedTuple):
     """One command that the controller published."""
 
-    time: float  # by its own clock [s]
-    number: int  # of the message
-    life: int  # of the controller
+    time: float  # of publishing, by the publisher's clock [s]
+    number: int  # sequence number of the message
+    life: int  # number of controller restarts before it
     topic: str
     value: Array
 
 
 class Process:
-    """One node's process, its log, and what memory it held."""
+    """One node's process, with its log and its memory over time."""
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:
-        """Start it; its output is appended to the log."""
+        """Start the process; append its output to the log."""
         self.name, self.log = name, log
         with log.open('ab') as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
@@ -99,31 +99,31 @@ class Process:
         self.memory: list[tuple[float, float]] = []  # age [s], resident [MB]
 
     def alive(self) -> bool:
-        """Whether it still runs."""
+        """Whether the process still runs."""
         return self.process.poll() is None
 
     def look(self) -> None:
-        """Note how much memory it holds."""
-        with suppress(OSError):  # it has just ended
+        """Record the memory of the process."""
+        with suppress(OSError):  # the process has just ended
             self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
     def kill(self) -> None:
-        """End it as a power cut would."""
+        """End the process by SIGKILL."""
         self.process.kill()
         self.process.wait()
 
 
 class Attack:
-    """The system under attack. Use as a context manager, which ends what was started."""
+    """The system under attack; a context manager that ends all processes at exit."""
 
     def __init__(self, folder: Path, initial: Path, seed: int, rate: float = 100.0) -> None:
         """Join the graph of ROS_DOMAIN_ID and start the system.
 
         Args:
-            folder: Of logs and of the learner's state.
+            folder: Folder of the logs and of the learner's state.
             initial: The network to start from.
-            seed: Random seed of what is done; when it takes effect is the machine's.
-            rate: Of the muscle modules' messages [Hz].
+            seed: Random seed of the attacks; their timing depends on the machine.
+            rate: Rate of the muscle modules' messages [Hz].
         """
         self.folder, self.initial, self.rate = folder, initial, rate
         self.robot = Robot.load('arm26')
@@ -137,7 +137,7 @@ class Attack:
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
         self.sent: set[int] = set()  # digests of hostile values
-        self.genuine: dict[str, Any] = {}  # the last message by topic that is not ours
+        self.genuine: dict[str, Any] = {}  # last message of the system, by topic
         self.commands: list[Command] = []
         self.life = 0
         self.loads: list[tuple[float, Array]] = []  # time [s], measured T [N] (M,)
@@ -149,13 +149,13 @@ class Attack:
         self.situation = Situation(self.namespace)
         self.status: list[tuple[float, str, str]] = []  # time [s], level and text
         self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
-        #: when commands may come from others than the controller, and when sensors lie [s]
+        #: intervals [s] in which others than the controller may command, or sensors are wrong
         self.foreign: list[tuple[float, float]] = []
         self.lying: list[tuple[float, float]] = []
-        self.strangers: list[Process] = []  # second nodes
-        self.watches_processes = True  # whether one that ends is a finding
+        self.strangers: list[Process] = []  # duplicate nodes that the attack started
+        self.watches_processes = True  # whether the end of a process is a finding
         self._learner, self._other_learners = '', set[str]()  # identities in reports
-        self._lying_since = 0.0  # [s]; 0: sensors do not
+        self._lying_since = 0.0  # [s] since when sensors are wrong; 0: they are not
         self._topics: dict[str, str] = {}
         self._services: dict[str, str] = {}
         self._looked = self._judged = 0.0
@@ -168,7 +168,7 @@ class Attack:
 
     def __exit__(self, *_: object) -> None:
         self.end_strangers()
-        for process in self.processes.values():  # one that is paused hears no other signal
+        for process in self.processes.values():  # a suspended process handles no other signal
             with suppress(ProcessLookupError):
                 process.process.send_signal(signal.SIGCONT)
         end_processes([process.process for process in self.processes.values()], signal.SIGTERM)
@@ -182,12 +182,12 @@ class Attack:
         self.life += name == 'controller'
 
     def start_second(self, name: str, node: str = '') -> None:
-        """Start a second node of a kind, under a `node` name of its own if one is given."""
+        """Start a second node of a kind; `node` is its node name if it is not the same."""
         remapping = ['-r', f'__node:={node}'] if node else []
         self.strangers.append(self.process(name, f'second_{name}', remapping))
 
     def end_strangers(self) -> None:
-        """End everything that the stranger has on the graph."""
+        """End all processes and publishers of the hostile node."""
         end_processes([process.process for process in self.strangers], signal.SIGTERM)
         self.strangers.clear()
         for publisher in self.publishers.values():
@@ -210,7 +210,7 @@ class Attack:
         return Process(name, [*command, *remapping, *words], file)
 
     def found(self, promise: str, what: str) -> None:
-        """Note a broken promise."""
+        """Record a violation of a promise."""
         self.findings.setdefault(promise, []).append(what)
 
     # -- watching -------------------------------------------------------------------------------
@@ -272,7 +272,7 @@ class Attack:
         self.samples = accepted
 
     def spin(self, seconds: float) -> None:
-        """Handle messages for a while, and look after the processes."""
+        """Handle messages for a time [s], and check the processes."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.executor.spin_once(0.05)
@@ -293,7 +293,7 @@ class Attack:
                         self.start(name)
 
     def wait(self, condition: Callable[[], Any], promise: str, what: str) -> bool:
-        """Handle messages until a condition holds; say whether it came about."""
+        """Handle messages until a condition holds; return whether it did before the deadline."""
         end = time.monotonic() + PATIENCE
         while not condition():
             if time.monotonic() > end:
@@ -303,11 +303,11 @@ class Attack:
         return True
 
     def call(self, kind: Any, service: str, request: Any = None) -> Any:
-        """Call a service; return its response, None if none comes in time."""
+        """Call a service; return its response, or None after the deadline."""
         client, futures = self._client(kind, service), []
 
         def answered() -> bool:
-            # A node that was killed seems ready for a while, and takes requests with it.
+            # A killed node seems ready for some time, and requests to it are lost.
             if client.service_is_ready() and len(futures) < 1 + (time.monotonic() - begun) / 5.0:
                 futures.append(client.call_async(request or kind.Request()))
             return any(future.done() for future in futures)
@@ -322,18 +322,18 @@ class Attack:
         return self.clients[service]
 
     def send(self, kind: Any, service: str, request: Any = None) -> None:
-        """Call a service and do not wait."""
+        """Call a service without waiting for the response."""
         client = self._client(kind, service)
         if client.service_is_ready():
             client.remove_pending_request(client.call_async(request or kind.Request()))
             self.tried['requests'] += 1
 
     def send_parameter(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter and do not wait."""
+        """Set a parameter without waiting for the response."""
         self.send(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def set_faults(self, lines: list[str]) -> None:
-        """Let the emulated arm be broken in so many ways."""
+        """Set the faults of the emulated arm."""
         if self._lying_since:
             self.lying.append((self._lying_since, time.time() + 1.0))
         is_lying = any(line.split(':')[0] not in MECHANICAL for line in lines)
@@ -342,7 +342,7 @@ class Attack:
         self.call(SetParameters, 'hardware_emulator/set_parameters', request)
 
     def moving(self) -> bool:
-        """Clear what is latched and explore; say whether commands come within patience."""
+        """Clear latches and explore; return whether commands arrive before the deadline."""
         self.wait(lambda: set(self.levels) == set(NODES), 'every node goes on', 'all reports')
         self.set_faults([])
         for node, name, value in HEALTHY:
@@ -369,15 +369,15 @@ class Attack:
     # -- attacking ------------------------------------------------------------------------------
 
     def topics(self) -> dict[str, str]:
-        """Return type by name of every topic that a node listens to."""
+        """Return the types of all subscribed topics, by name."""
         for name in NODES:
-            with suppress(NodeNameNonExistentError):  # just killed; what it listened to is known
+            with suppress(NodeNameNonExistentError):  # just killed; its topics are known already
                 pairs = self.node.get_subscriber_names_and_types_by_node(name, self.namespace)
                 self._topics |= {topic: kinds[0] for topic, kinds in pairs}
         return self._topics
 
     def services(self) -> dict[str, str]:
-        """Return type by name of every service that a node offers."""
+        """Return the types of all services, by name."""
         for name in NODES:
             with suppress(NodeNameNonExistentError):
                 pairs = self.node.get_service_names_and_types_by_node(name, self.namespace)
@@ -387,7 +387,7 @@ class Attack:
     def publish(self, topic: str, kind: str) -> None:
         """Publish one hostile message."""
         if topic not in self.publishers:
-            # What was latched goes with its publisher, when the burst is over.
+            # The publisher, and with it the latched message, is removed after the burst.
             qos = LATCHED if topic.endswith(LATCHING) else OWN
             self.publishers[topic] = self.node.create_publisher(message_class(kind), topic, qos)
             self.spin(0.1)
@@ -396,11 +396,11 @@ class Attack:
         try:
             self.publishers[topic].publish(message)
         except (TypeError, ValueError, AssertionError, UnicodeError):
-            return  # rclpy itself sends no such message
+            return  # rclpy refuses to send such a message
         self.tried['messages'] += 1
 
     def hostile(self, topic: str, kind: Any) -> Any:
-        """Return a message: one that was heard, changed; or one that was never sane."""
+        """Return a modified genuine message, or one with random content."""
         rng, last = self.rng, self.genuine.get(topic)
         if topic.endswith('_checkpoint') and last is not None and rng.random() < 0.7:
             return bytes_message(self._network(bytes(last.data)))
@@ -421,7 +421,7 @@ class Attack:
         return message
 
     def _network(self, data: bytes) -> bytes:
-        """Return a checkpoint that is damaged, or whole and of another body."""
+        """Return a damaged checkpoint, or a valid one of another body."""
         changed, rng = bytearray(data), self.rng
         way = rng.randrange(4)
         if way == 0:
@@ -438,7 +438,7 @@ class Attack:
         return checkpoint.to_bytes(replace(mae, decoder=layers))
 
     def request(self, service: str, kind: str) -> None:
-        """Call a service with odd content and do not wait."""
+        """Call a service with illegal content, without waiting for the response."""
         rng, name = self.rng, SERVICES[kind]
         request = name.Request()
         node = service.removeprefix(f'{self.namespace}/').split('/')[0]
@@ -456,7 +456,7 @@ class Attack:
             self.tried['requests'] += 1
 
     def fault(self) -> None:
-        """Break something of the arm."""
+        """Inject a random fault into the arm."""
         name = self.rng.choice(list(KINDS))
         muscle = self.rng.choice(['', *self.robot.muscles]) if KINDS[name].of_muscle else ''
         line = f'{name}:{muscle}' if muscle else name
@@ -465,18 +465,18 @@ class Attack:
         self.tried['faults'] += 1
 
     def kill(self) -> None:
-        """Kill a node and start it again."""
+        """Kill a node and restart it."""
         name = self.rng.choice(NODES)
         self.processes[name].kill()
         self.tried['kills'] += 1
         self.start(name)
 
     def episode(self, messages: int, kills: int) -> None:
-        """Attack the moving arm with so many messages, in bursts and one by one."""
+        """Attack the moving arm with `messages` messages, in bursts and singly."""
         if not self.moving():
             return
         topics, services = list(self.topics().items()), list(self.services().items())
-        # All of them, or a few: some stop the arm at once, and then no other is tried on it.
+        # All topics, or a few: some stop the arm at once, and the others then see no moving arm.
         topics = self.rng.sample(topics, self.rng.choice((1, 2, 4, len(topics))))
         until, rng = self.tried['messages'] + messages, self.rng
         when = sorted(rng.randrange(messages) for _ in range(kills))
@@ -509,8 +509,13 @@ LATCHING = (
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}
 
 
-MECHANICAL = 'stuck_motor', 'slack', 'winch_speed', 'overheat'  # faults that no sensor reads wrong
-#: parameters of an arm that is well
+MECHANICAL = (
+    'stuck_motor',
+    'slack',
+    'winch_speed',
+    'overheat',
+)  # faults that leave sensor readings correct
+#: parameters of an arm without faults
 HEALTHY: tuple[tuple[str, str, Any], ...] = (
     ('hardware_emulator', 'ruptured_muscles', ['']),
     ('controller', 'method', 'proposed'),
@@ -524,7 +529,7 @@ def set_request(name: str, value: Any) -> SetParameters.Request:
 
 
 def digest(message: Any) -> int:
-    """Return what tells a message by its values."""
+    """Return a digest of a message's values."""
     values = getattr(message, 'data', None)
     if values is None:
         values = getattr(message, 'position', None)
@@ -534,7 +539,7 @@ def digest(message: Any) -> int:
 
 
 def filled(message: Any, rng: random.Random) -> Any:
-    """Fill a message's fields with nasty values of their types."""
+    """Fill a message's fields with extreme values of their types."""
     for name, kind in message.get_fields_and_field_types().items():
         base = kind.split('[')[0].removeprefix('sequence<').split(',')[0].removesuffix('>')
         count = None
@@ -570,7 +575,7 @@ def _nasty(kind: str, rng: random.Random) -> Any:
 
 
 def illegal_value(rng: random.Random) -> ParameterValue:
-    """Return a value that no parameter may have."""
+    """Return a value that is illegal for every parameter."""
     kind = rng.choice((2, 3, 4, 7, 8, 9, 99, 255))
     number, text = rng.choice(ILLEGAL), rng.choice(TEXTS[2:])
     return ParameterValue(

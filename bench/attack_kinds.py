@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known ways to mislead an arm, each in several shapes, while it holds and while it explores.
+"""Known attacks on an arm, each in several variants, while it holds and while it explores.
 
-Each attack says while what is wrong (`Scene.wrong`). Afterwards the scene does literally what the
-status line advises, until the arm goes on.
+Each attack marks the time in which something is wrong (`Scene.wrong`). Afterwards the scene follows
+the advice of the status line literally until the arm moves on.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 
 MOMENTS = 'holding', 'exploring'
-LASTING = 4.0  # [s] of an attack
-SAID = 2.0  # [s] after which the status line has to say that something is wrong
-OFFSET = 0.08  # [m] of false length zeros
+LASTING = 4.0  # [s] duration of an attack
+SAID = 2.0  # [s] after which the status line has to report a problem
+OFFSET = 0.08  # [m] of false length offsets
 
 
 class Scene:
@@ -39,12 +39,12 @@ class Scene:
     def __init__(self, attack: Attack) -> None:
         """Attack the system of `attack`."""
         self.attack, self.rng = attack, attack.rng
-        self.what = ''  # that is tried, for findings
+        self.what = ''  # present attack, for findings
 
     # -- the course of an attack ----------------------------------------------------------------
 
     def play(self, kind: str, shape: int, moment: str) -> None:
-        """Bring the arm into the moment, attack it, and recover it by what the status line says."""
+        """Bring the arm into a state, attack it, and recover it as the status line advises."""
         self.what = f'{kind}, shape {shape}, {moment}'
         if not self.bring(moment):
             return
@@ -55,7 +55,7 @@ class Scene:
 
     @contextmanager
     def wrong(self) -> Iterator[None]:
-        """Hold the status line against what is wrong meanwhile."""
+        """Check that the status line reports a problem within the context."""
         begin = time.time()
         yield
         silent = [
@@ -69,7 +69,7 @@ class Scene:
             self.attack.found('status OK while wrong', f'{self.what}: OK after {late:.1f} s')
 
     def bring(self, moment: str) -> bool:
-        """Let a healthy arm hold a posture, or explore; say whether it does."""
+        """Make a healthy arm hold a posture or explore; return whether it does."""
         attack = self.attack
         if not attack.moving():
             return False
@@ -83,7 +83,7 @@ class Scene:
         return True
 
     def recover(self, moment: str) -> None:
-        """Do what the status line says until nothing is wrong and the arm is as it was."""
+        """Follow the status line until nothing is wrong and the arm is in its previous state."""
         attack, end, said = self.attack, time.monotonic() + PATIENCE, ''
         while time.monotonic() < end:
             attack.spin(1.0)
@@ -106,7 +106,7 @@ class Scene:
         return mode in ('idle', 'holding', 'moving', 'exploring')
 
     def follow_advice(self, said: str) -> None:
-        """Do literally what a status line says."""
+        """Do literally what a status line advises."""
         attack = self.attack
         for node in re.findall(r'/(\w+): no report', said):
             attack.processes[node].kill()
@@ -134,7 +134,7 @@ class Scene:
             for name in ('hardware_emulator', 'estimator'):
                 self.resume(name)
         elif service and service[0] == 'estimator/zero':
-            # It takes half a minute of gentle motion, and would begin anew with every call.
+            # Calibration takes half a minute of gentle motion, and restarts with every call.
             attack.call(Trigger, service[0])
             attack.call(Trigger, 'controller/reset')
             attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
@@ -147,10 +147,10 @@ class Scene:
             attack.call(Trigger, service[0])
             attack.spin(0.5)
 
-    # -- what a stranger does -------------------------------------------------------------------
+    # -- actions of the hostile node ------------------------------------------------------------
 
     def publish(self, topic: str, *messages: Any, period: float = 0.1, qos: Any = OWN) -> None:
-        """Publish messages, as a node of another name."""
+        """Publish messages from a node of another name."""
         attack = self.attack
         if topic not in attack.publishers:
             kind = type(messages[0])
@@ -163,7 +163,7 @@ class Scene:
             attack.spin(period)
 
     def latch(self, topic: str, *messages: Any) -> None:
-        """Publish messages on a latched topic, and watch what comes of them."""
+        """Publish messages on a latched topic, and check the status line."""
         with self.wrong():
             self.publish(topic, *messages, qos=LATCHED)
             self.attack.spin(LASTING)
@@ -177,11 +177,11 @@ class Scene:
         self.attack.processes[name].process.send_signal(signal.SIGSTOP)
 
     def resume(self, name: str) -> None:
-        """Let a node go on."""
+        """Resume a suspended node."""
         self.attack.processes[name].process.send_signal(signal.SIGCONT)
 
     def genuine(self, topic: str) -> Any:
-        """Return the last message of a topic that is not ours."""
+        """Return the last genuine message of a topic."""
         return self.attack.genuine[topic]
 
 
@@ -194,39 +194,39 @@ def _zeros(scene: Scene, offset: float, deviation: float) -> Float64MultiArray:
 
 
 def zeros_unknown_then_false(scene: Scene) -> None:
-    """B13."""
+    """Publish unknown length offsets, then false ones."""
     scene.latch('muscle_length_zeros', _zeros(scene, 0.0, 1.0), _zeros(scene, OFFSET, 1e-3))
 
 
 def zeros_false(scene: Scene) -> None:
-    """B13."""
+    """Publish false length offsets."""
     scene.latch('muscle_length_zeros', _zeros(scene, OFFSET, 1e-3))
 
 
 def zeros_alternating(scene: Scene) -> None:
-    """B13."""
+    """Publish alternating length offsets."""
     pair = [_zeros(scene, OFFSET, 1e-3), _zeros(scene, -OFFSET, 1e-3)]
     scene.latch('muscle_length_zeros', *pair * 10)
 
 
 def isolate_most(scene: Scene) -> None:
-    """B14."""
+    """Isolate most muscles."""
     scene.latch('isolated_muscles', String(data=','.join(scene.attack.robot.muscles[:-1])))
 
 
 def isolate_all(scene: Scene) -> None:
-    """B14."""
+    """Isolate all muscles."""
     scene.latch('isolated_muscles', String(data=','.join(scene.attack.robot.muscles)))
 
 
 def isolate_in_turns(scene: Scene) -> None:
-    """B14."""
+    """Isolate changing sets of muscles."""
     names = [String(data=name) for name in (*scene.attack.robot.muscles, '')]
     scene.latch('isolated_muscles', *names)
 
 
 def deny_an_anomaly(scene: Scene) -> None:
-    """B15."""
+    """Publish that there is no anomaly while a muscle is ruptured."""
     attack = scene.attack
     muscle = attack.robot.muscles[scene.rng.randrange(attack.robot.muscle_count)]
     scene.set('hardware_emulator', 'ruptured_muscles', [muscle])
@@ -239,7 +239,7 @@ def deny_an_anomaly(scene: Scene) -> None:
 
 
 def deny_and_go(scene: Scene) -> None:
-    """B15: the stranger leaves before the reset."""
+    """Publish that there is no anomaly, and leave the graph before the reset."""
     attack = scene.attack
     scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[0]])
     with scene.wrong():
@@ -254,7 +254,7 @@ def deny_and_go(scene: Scene) -> None:
 
 
 def repeat_an_estimate(scene: Scene) -> None:
-    """B16."""
+    """Suspend the estimator, and repeat its last estimate."""
     old = scene.genuine('estimated_joint_states')
     scene.pause('estimator')
     with scene.wrong():
@@ -263,7 +263,7 @@ def repeat_an_estimate(scene: Scene) -> None:
 
 
 def shifted(topic: str, joints: float) -> Callable[[Scene], None]:
-    """B16: return an attack that publishes joint states, shifted, beside the genuine ones."""
+    """Return an attack that publishes shifted joint states beside the genuine ones."""
 
     def attack(scene: Scene) -> None:
         with scene.wrong():
@@ -277,7 +277,7 @@ def shifted(topic: str, joints: float) -> Callable[[Scene], None]:
 
 
 def second(name: str, node: str = '') -> Callable[[Scene], None]:
-    """B16: return an attack that starts a second node."""
+    """Return an attack that starts a second node."""
 
     def attack(scene: Scene) -> None:
         begin, graph = time.time(), scene.attack
@@ -298,7 +298,7 @@ def second(name: str, node: str = '') -> Callable[[Scene], None]:
 
 
 def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
-    """B17: return an attack that proposes a network that is wrong as a whole."""
+    """Return an attack that proposes a consistently wrong network."""
 
     def attack(scene: Scene) -> None:
         mae = checkpoint.from_bytes(
@@ -312,7 +312,7 @@ def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
 
 
 def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae], Mae]:
-    """Return what scales all or some lengths of a network, in and out, and shifts them [m]."""
+    """Return a function that scales and shifts [m] all or some lengths of a network."""
 
     def change(mae: Mae) -> Mae:
         mean, std = mae.mean.copy(), mae.std.copy()
@@ -325,10 +325,12 @@ def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae
 
 
 def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
-    """A5: return an attack that suspends or kills a node."""
+    """Return an attack that suspends or kills a node."""
 
     def attack(scene: Scene) -> None:
-        scene.attack.watches_processes = False  # `recover` starts it again, if it is told to
+        scene.attack.watches_processes = (
+            False  # `recover` restarts it if the status line advises that
+        )
         if is_paused:
             scene.pause(name)
         else:
@@ -341,7 +343,7 @@ def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
 
 
 def fault(line: str, *services: str) -> Callable[[Scene], None]:
-    """A1, A2, A6: return an attack that breaks the arm, then calls services."""
+    """Return an attack that breaks the arm, then calls services."""
 
     def attack(scene: Scene) -> None:
         scene.attack.set_faults([line])
@@ -355,7 +357,7 @@ def fault(line: str, *services: str) -> Callable[[Scene], None]:
 
 
 def change_method(*methods: str) -> Callable[[Scene], None]:
-    """A3: return an attack that changes the method under way."""
+    """Return an attack that changes the control method during motion."""
 
     def attack(scene: Scene) -> None:
         for method in (*methods, 'proposed'):
@@ -366,7 +368,7 @@ def change_method(*methods: str) -> Callable[[Scene], None]:
 
 
 def stop_a_verification(scene: Scene) -> None:
-    """A2: an operator stops the arm while a suspect muscle is verified."""
+    """Stop the arm as an operator while a suspect muscle is verified."""
     attack = scene.attack
     scene.set('estimator', 'on_anomaly', 'isolate')
     scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[1]])
@@ -381,7 +383,7 @@ def stop_a_verification(scene: Scene) -> None:
 
 
 def random_event(scene: Scene) -> None:
-    """Do something that happens on a graph now and then."""
+    """Trigger one random event."""
     attack, rng = scene.attack, scene.rng
     robot = attack.robot
     name = rng.choice(NODES)
@@ -429,7 +431,7 @@ def random_event(scene: Scene) -> None:
     attack.spin(rng.uniform(0.05, 0.5))
 
 
-#: the shapes of every kind
+#: variants of each kind of attack
 KINDS: dict[str, tuple[Callable[[Scene], None], ...]] = {
     'lost zeros': (fault('unzeroed:0.05'), fault('unzeroed:0.02')),
     'stop of a verification': (stop_a_verification,),
@@ -467,7 +469,7 @@ KINDS: dict[str, tuple[Callable[[Scene], None], ...]] = {
 
 
 def all_attacks() -> list[tuple[str, int, str]]:
-    """Return every kind in every shape at every moment."""
+    """Return all combinations of kind, variant and state of the arm."""
     return [
         (kind, shape, moment)
         for kind, shapes in KINDS.items()
