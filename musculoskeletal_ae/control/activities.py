@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common form of what the arm can do: one object for each activity."""
+"""The common interface of all activities of the arm."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class Inputs(NamedTuple):
-    """What an activity knows at one step. All of it is present whenever an activity is stepped."""
+    """Inputs of an activity at one step; all of them are available in every step."""
 
     mae: Mae
     sample: MuscleSample  # the newest muscle states
     pull: Pull
     theta: Array  # the estimated posture [rad], (D,)
-    length: Array  # the last length command, or one under which the muscles pull as now [m], (M,)
-    tension: Array  # the same of tensions [N], (M,)
-    limit: Array  # the highest tension that may be planned [N], (M,)
-    dt: float  # since the last command [s]
+    length: Array  # last length command, or one that keeps the present tensions [m], (M,)
+    tension: Array  # last tension command, or one that keeps the present tensions [N], (M,)
+    limit: Array  # highest tension that may be planned [N], (M,)
+    dt: float  # time since the last command [s]
 
 
 class ActivityControl(Protocol):
-    """Commands the arm as long as one activity goes on."""
+    """Commands the arm during one activity."""
 
     def enter(self, inputs: Inputs, /) -> None:
-        """Begin, or begin again after a pause, from how the muscles pull now."""
+        """Start the activity, or restart it after a pause, from the present tensions."""
 
     def step(self, inputs: Inputs, /) -> Command | None:
         """Return the desired command; None keeps the last one."""
 
     def leave(self) -> None:
-        """End: another activity follows, or a stop."""
+        """End the activity, because another activity or a stop follows."""

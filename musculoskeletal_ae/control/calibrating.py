@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gentle motion while the length offsets are unknown, so that they can be found."""
+"""Gentle motion that provides data for the length calibration."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
-SPEED = 0.05  # [m/s] of a command, at most
-DURATION, REST = 1.5, 0.25  # [s] of a step and after it
-REACH = 0.7  # [rad] of a step, each joint; times RACK [m] of what slides
-INSIDE = 0.1  # of the joint range that goals keep from its ends
-GOALS = 20  # goals, of which the first is taken that can be held
-SHARE = 0.6  # of the way from T_bias to T_limit: the highest tension
+SPEED = 0.05  # fastest change of a length command [m/s]
+DURATION, REST = 1.5, 0.25  # duration of a step, and of the rest after it [s]
+REACH = 0.7  # largest step of each joint [rad]; for prismatic joints times RACK [m]
+INSIDE = 0.1  # distance of goals from the joint limits, as a share of the joint range
+GOALS = 20  # number of random goals, of which the first holdable one is used
+SHARE = 0.6  # highest tension, as a share of the range from T_bias to T_limit
 
 
 def gentle_limit(robot: Robot) -> Array:
-    """Return the tension [N] (M,) that no muscle exceeds while the offsets are unknown."""
+    """Return the tension limit while the length offsets are unknown [N], (M,)."""
     return robot.tension.bias + SHARE * (robot.tension.limit - robot.tension.bias)
 
 
 class Calibrating:
-    """The activity of moving gently: slow, near, and by differences of lengths only.
+    """The activity of moving gently, in small slow steps relative to the present lengths.
 
         l_target = l + ①(θ_goal, T_goal) − ①(θ_est, T) + l_comp(T_goal)
 
-    It uses lengths only relative to those of the moment, so that the offsets cancel. θ_est may be
-    off, and G with it, which muscle stiffness control takes as some more or less tension, below the
-    limit. Goals lie all over the joint range, but each is approached by a short step and held by
-    random tensions: the muscles see many postures and tensions, from different sides. That is what
-    finding the offsets needs, because how G turns tension into torque tells the posture.
+    Only differences of lengths are used, so that the length offsets cancel. θ_est and G may be
+    wrong; muscle stiffness control turns these errors into tension errors, which are limited.
+    Goals cover the whole joint range. Each is approached by a short step and held with random
+    tensions. The calibration needs such varied postures and tensions: the posture follows from the
+    way in which G turns tension into torque.
     """
 
     def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
@@ -46,11 +46,11 @@ class Calibrating:
         self.use(robot, settings)
 
     def use(self, robot: Robot, _: Settings) -> None:
-        """Move this robot, whose isolated muscles pull nothing."""
+        """Use another robot description, in which isolated muscles have no tension."""
         self._robot = robot
 
     def enter(self, _: Inputs) -> None:
-        """Begin anew, from wherever the arm is."""
+        """Start from the present posture."""
         self._ramp, self._rested = None, 0.0
 
     def step(self, inputs: Inputs) -> Command | None:
@@ -63,28 +63,32 @@ class Calibrating:
         return Command(LENGTH, self._ramp.step(inputs.dt))
 
     def leave(self) -> None:
-        """End."""
+        """Discard the present step."""
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:
-        """Return the lengths [m] (M,) of the first goal that can be held, or of the nearest."""
+        """Return the lengths [m] (M,) of the first holdable goal.
+
+        If no goal is holdable, the one with the least missing torque is used.
+        """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
         tension = inputs.sample.motor_tension * inputs.sample.usable
         limits = robot.tension.bias, gentle_limit(robot)
-        best, pull, least_missing = theta, tension, np.inf
+        best, best_tension, least_missing = theta, tension, np.inf
         radian = robot.kinematics.radian
         for goal in robot.random_postures(GOALS, self._rng, -INSIDE):
             near = theta + np.clip(goal - theta, -REACH * radian, REACH * radian)
             jacobian = mae.muscle_jacobian(near, tension)
             programme = TensionProgramme(jacobian, robot.kinematics.holding_torque(near), *limits)
             try:
-                pull = programme.nearest(self._rng.uniform(*limits, robot.muscle_count))
+                random_tension = self._rng.uniform(*limits, robot.muscle_count)
+                best_tension = programme.nearest(random_tension)
                 best = near
                 break
             except InfeasibleError:
                 exertion = programme.compromise()
                 missing = float(np.abs(radian * exertion.missing_torque).max())
                 if missing < least_missing:
-                    best, pull, least_missing = near, exertion.tension, missing
-        now = inputs.sample.length - mae.lengths(theta, tension)
-        return now + mae.lengths(best, pull) + msc_compensation(robot, pull)
+                    best, best_tension, least_missing = near, exertion.tension, missing
+        offset = inputs.sample.length - mae.lengths(theta, tension)
+        return offset + mae.lengths(best, best_tension) + msc_compensation(robot, best_tension)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands to the muscle modules, and how the muscles pull."""
+"""Commands to the muscle modules, and the tensions of the muscles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LENGTH, TENSION = 'length', 'tension'
 
 
 class Command(NamedTuple):
-    """What the muscle modules are to follow.
+    """A command to the muscle modules.
 
     Attributes:
         kind: `LENGTH` or `TENSION`.
@@ -27,14 +27,14 @@ class Command(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """How the muscles pull [N], (M,) each."""
+    """Tensions of the muscles [N], (M,) each."""
 
-    motor: Array  # T, as measured at the motors
-    bone: Array  # T_end, what tendon friction leaves of it
+    motor: Array  # motor-side tension T, as measured
+    bone: Array  # bone-side tension T_end, after tendon friction
 
 
 def msc_compensation(robot: Robot, tension: Array) -> Array:
-    """Return how far l_target lies below l for muscle stiffness control to carry a tension.
+    """Return l_target − l for which muscle stiffness control exerts a tension.
 
         l_comp(T) = −(T − T_bias) / K_stiff              (paper, §III-E, eq. 6)
 
@@ -49,7 +49,7 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
 
 
 def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
-    """Return the command of a kind under which the muscles go on to pull as they do now."""
+    """Return the command of a kind that keeps the present tensions."""
     tension = np.maximum(sample.motor_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)

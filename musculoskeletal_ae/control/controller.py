@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control as a whole: targets in, safe commands out.
+"""The controller: connects all parts that turn targets into safe commands.
 
     target, pose, trajectory ─► planner ─► activity ─┐
                                  causes ─► supervisor ┤─► limiter ─► command
                                             safe stop ┘
 
-The supervisor decides what the arm does (`supervisor`, `stops`), one object for each activity says
-how (`follower`, `ramps`, `torque`, `exploration`, `calibrating`), and the limiter is the last thing
-before publishing. This class connects them and holds no rules of its own.
+The supervisor decides what the arm does (`supervisor`, `stops`). One object for each activity
+computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibrating`). Every command
+passes the limiter before it is published.
 
-An isolated muscle has no tension in any plan, and its module is told to hold it slack. A muscle
-that is isolated while there is an anomaly is the suspect: the stopped arm winds it in a little, and
-goes on when the anomaly is over.
+Plans assume no tension in isolated muscles, and their modules are commanded to keep them slack. A
+muscle that is isolated during an anomaly is the suspect. While the arm is stopped, the suspect is
+wound in slightly to verify the fault; the arm resumes when the anomaly is over.
 
-`now` is a steady clock [s], `time` that of the messages.
+`now` is the time of a steady clock [s], `time` that of the messages [s].
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream
 
-WINDOW = 3  # messages of the median against glitches
-RESTORE = 'estimator/restore uses isolated muscles again'
-AT_ONCE = 1.0  # [s] between an anomaly and the muscle that is isolated for it
-APPROACHES = 3  # of a target by an arm that lacks a muscle and falls
+WINDOW = 3  # messages in the median filter against glitches
+RESTORE = 'call estimator/restore to use isolated muscles again'
+AT_ONCE = 1.0  # longest time between an anomaly and the isolation of its suspect [s]
+APPROACHES = 3  # attempts to reach a target with isolated muscles if the arm falls on the way
 
 
 @dataclass
 class Target:
-    """What was asked for last.
+    """The last requested target.
 
     Attributes:
-        theta: Posture [rad], (D,); None while there is none.
-        effort: Torque beyond holding the weight [N·m], (D,).
-        clamped: Joints whose target lay beyond the limits.
-        unreachable_reason: Why the arm goes elsewhere than was asked, or ''.
-        approaches_left: How often an arm that falls on its way sets out again.
+        theta: Posture [rad], (D,); None before the first target.
+        effort: Torque in addition to gravity compensation [N·m], (D,).
+        clamped: Joints whose target was beyond the joint limits.
+        unreachable_reason: Why the arm goes to another posture than requested, or ''.
+        approaches_left: Number of further attempts if the arm falls on the way.
     """
 
     effort: Array
@@ -75,7 +75,7 @@ class Target:
 
 
 class Activities:
-    """One object for each activity, and which of them commands the arm."""
+    """Holds one object for each activity, and switches between them."""
 
     def __init__(self, robot: Robot, settings: Settings, seed: int) -> None:
         self.ramps = LengthRamps(robot, settings)
@@ -86,11 +86,14 @@ class Activities:
         self.calibrating = Calibrating(robot, settings, seed)
         self.torque = TorqueControl(robot, settings)
         self.gravity_compensation = GravityCompensation(robot, settings)
-        #: the one that has commanded last, unless it was interrupted since
+        #: the activity that issued the last command, unless it was interrupted since
         self.entered: ActivityControl | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Control this robot, whose isolated muscles pull nothing, by these settings."""
+        """Use another robot description and other settings.
+
+        In the description, isolated muscles have no tension.
+        """
         for part in (
             self.ramps,
             self.follower,
@@ -103,7 +106,7 @@ class Activities:
         self.exploring.stream.use(robot, settings.preset)
 
     def of(self, activity: Activity, settings: Settings) -> ActivityControl | None:
-        """Return the object that carries out an activity; None for none."""
+        """Return the object that implements an activity; None for `IDLE`."""
         if activity in (Activity.HOLDING, Activity.MOVING):
             return self.follower if by_follower(settings) else self.ramped_target
         others: dict[Activity, ActivityControl] = {
@@ -115,13 +118,13 @@ class Activities:
         return others.get(activity)
 
     def leave(self) -> None:
-        """End what commands the arm: something else follows, or a stop."""
+        """End the present activity, because another activity or a stop follows."""
         if self.entered is not None:
             self.entered.leave()
         self.entered = None
 
     def step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        """Let one of them command the arm."""
+        """Switch to an activity if it is not the present one, and return its command."""
         if control is not self.entered:
             if self.entered is not None:
                 self.entered.leave()
@@ -131,26 +134,26 @@ class Activities:
 
 
 class Suspicion:
-    """Finds out which muscle the estimator suspects of the present anomaly.
+    """Determines which muscle the estimator suspects of causing the present anomaly.
 
-    The estimator reports an anomaly and isolates the suspect in two messages, which may come in
-    either order.
+    The estimator reports the anomaly and the isolation of the suspect in two messages, which may
+    arrive in either order.
     """
 
     def __init__(self) -> None:
-        self._isolated: tuple[int, float] | None = None  # the last muscle, and when [s]
+        self._isolated: tuple[int, float] | None = None  # last isolated muscle, and its time [s]
         self._anomaly_at = math.inf
 
     def note_anomaly(self, now: float) -> None:
-        """Take that an anomaly was detected."""
+        """Record that an anomaly was detected."""
         self._anomaly_at = now
 
     def note_isolated(self, muscle: int, now: float) -> None:
-        """Take that a muscle was isolated."""
+        """Record that a muscle was isolated."""
         self._isolated = muscle, now
 
     def suspect(self, has_anomaly: bool, isolated: tuple[int, ...]) -> int | None:
-        """Return the suspect, whichever of the two messages came first; None for none."""
+        """Return the suspect, or None if there is none."""
         if not has_anomaly or self._isolated is None:
             return None
         muscle, at = self._isolated
@@ -158,12 +161,12 @@ class Suspicion:
 
 
 def by_follower(settings: Settings) -> bool:
-    """Return whether targets are gone to by trajectories; by ramps of lengths otherwise."""
+    """Return whether the follower moves to targets, not ramps of lengths or tensions."""
     return settings.method not in (*BY_TENSION, *length_methods(settings))
 
 
 class Controller:
-    """Connects everything between a target and a command."""
+    """Connects all parts between a target and a command."""
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
@@ -179,19 +182,20 @@ class Controller:
         self.activities = Activities(robot, self.settings, seed)
         self.limiter = CommandLimiter(robot, self.settings)
         self.stopping = SafeStop(robot, self.settings, self.limiter)
-        self.sent_at = 0.0  # when the last command went out; its user says so
+        self.sent_at = 0.0  # time at which the last command was published; set by the caller
         self._estimate_problem = Persistence()
-        self._jumped_at = math.inf  # when lengths jumped [s]
+        self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
         if self.settings.method == 'float':
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
-    # -- what comes in --------------------------------------------------------------------------
+    # -- settings and messages ------------------------------------------------------------------
 
     def configure(self, settings: Settings) -> None:
-        """Take new settings; another method or preset starts from how the muscles pull then.
+        """Apply new settings; another method or preset starts from the present tensions.
 
-        A MusculoskeletalError says that the joint stiffness does not fit the robot.
+        Raises:
+            MusculoskeletalError: If the joint stiffness does not fit the robot.
         """
         before, radian = self.settings, self.robot.kinematics.radian
         stiffness = settings.desired_stiffness(radian)
@@ -206,7 +210,7 @@ class Controller:
             self.activities.follower.plan_anew()
 
     def use(self, mae: Mae) -> None:
-        """Take a checked network."""
+        """Use another network, which has been validated."""
         self.mae, self.watchdog.has_checkpoint = mae, True
         self.stream.use_friction(mae.friction)
         self.activities.follower.use_network(mae)
@@ -214,13 +218,18 @@ class Controller:
             self.activities.ramps.solve_again()
 
     def take(self, message: Any, now: float) -> None:
-        """Take a message of muscle_states; a RejectionError says why it cannot be used."""
+        """Take a message of muscle_states.
+
+        Raises:
+            RejectionError: If the message cannot be used.
+        """
         self._use_sample(self.stream.take(message, now), now)
 
     def muscles(self, states: Array, now: float) -> None:
-        """Take l as it was read [m], T [N] and temperature [°C], (3, M).
+        """Take raw l [m], T [N] and temperature [°C], (3, M).
 
-        A RejectionError says that no muscles of this arm can be so.
+        Raises:
+            RejectionError: If the values are implausible for this arm.
         """
         self._use_sample(self.stream.take_states(np.asarray(states), now), now)
 
@@ -231,12 +240,15 @@ class Controller:
         self.watchdog.take_sample(sample, now)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
-        """Take estimated θ [rad] (D,); a MessageError says that no joints can be there.
+        """Take the estimated posture θ [rad] (D,).
 
-        An estimate that is not `is_new`, such as one that is repeated, keeps its age.
+        A repeated estimate, with `is_new` false, does not count as new data for the watchdog.
+
+        Raises:
+            MessageError: If the posture is implausible.
         """
         known = self.stream.body.offsets.known
-        if not known:  # a guess of the offsets may make any posture
+        if not known:  # provisional offsets can lead to any estimate
             theta = np.clip(theta, self.robot.lower, self.robot.upper)
         try:
             check_posture(self.robot, theta, LIMITS.estimate_outside)
@@ -249,7 +261,7 @@ class Controller:
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
-        """Take which muscles are isolated, and the length offsets."""
+        """Apply a body state: isolated muscles and length offsets."""
         before = self.stream.body
         if body.offsets is not before.offsets:
             self._use_offsets(body)
@@ -277,12 +289,12 @@ class Controller:
         self.supervisor.on_offsets(is_known)
 
     def _use_parts(self) -> None:
-        """Hand robot and settings to all parts: the only place where that happens."""
+        """Pass robot and settings to all parts."""
         for part in (self.watchdog, self.planner, self.activities, self.limiter, self.stopping):
             part.use(self.robot, self.settings)
 
     def anomaly(self, detected: bool) -> None:
-        """Take anomaly_detected; once a suspect was verified, the arm goes on when it is over."""
+        """Set whether an anomaly is present; the end of a verification may resume the arm."""
         if detected and not self.watchdog.has_anomaly:
             self._suspicion.note_anomaly(self.watchdog.age.stepped_at)
         self.watchdog.has_anomaly = detected
@@ -300,19 +312,23 @@ class Controller:
             self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
-        """Count the messages' time from here."""
+        """Restart the messages' clock after a backward jump."""
         self.watchdog.age.clock_jumped_back()
         self.stream.reset()
 
-    # -- what is asked --------------------------------------------------------------------------
+    # -- commands from users --------------------------------------------------------------------
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
-        """Take θ_target [rad] and effort [N·m] of some joints; the others keep theirs, if known."""
+        """Set θ_target [rad] and effort [N·m] of some joints; other joints keep their targets.
+
+        Raises:
+            MessageError: If the target is refused.
+        """
         self._refuse_gravity_compensation()
         robot, state = self.robot, self.target_state
         kept = self.estimate if state.theta is None else state.theta
         if kept is None and len(joints) < robot.joint_count:
-            raise MessageError('no posture yet', 'give all joints, or wait for an estimate')
+            raise MessageError('no posture yet', 'name all joints, or wait for an estimate')
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, state.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         goal = np.clip(theta, robot.lower, robot.upper)
@@ -323,7 +339,7 @@ class Controller:
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
         self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
         if not (self.supervisor.is_running and by_follower(self.settings) and self._is_ready):
-            self._hold()  # it is gone to as soon as the arm may move
+            self._hold()  # the arm moves to the target as soon as it may move
             return
         try:
             self._approach(self.settings.target_duration or self.settings.first_duration)
@@ -334,9 +350,14 @@ class Controller:
             self._note_fault(error)
 
     def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
-        """Follow points from `delay` [s] on, negative: since then; None: come to rest and hold.
+        """Follow a trajectory through points, or come to rest and hold if there are none.
 
-        A MessageError says why not: nothing changes then.
+        Args:
+            points: The points; None to come to rest.
+            delay: Time until the trajectory starts [s]; negative if it started in the past.
+
+        Raises:
+            MessageError: If the trajectory is refused; nothing is changed then.
         """
         start, mae = self._ready(max(delay, 0.0))
         if points is None:
@@ -346,9 +367,15 @@ class Controller:
             self._follow(plan, max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
-        """Bring the end effector to a pose in the root link's frame, or to its position only.
+        """Move the end effector to a pose in the root link's frame.
 
-        A MessageError says why not: nothing changes then.
+        Args:
+            pose: The pose.
+            whole: Whether the orientation counts, too; otherwise only the position.
+            now: Present time [s].
+
+        Raises:
+            MessageError: If the pose is refused; nothing is changed then.
         """
         start, mae = self._ready()
         follower = self.activities.follower
@@ -358,20 +385,24 @@ class Controller:
         self._follow(self.planner.to_pose(mae, start, pose, whole, now))
 
     def twist(self, twist: Array) -> None:
-        """Move the end effector by a twist [m/s], [rad/s] (6,), axes of the root link, for a while.
+        """Move the end effector for a short time by a twist in the axes of the root link.
 
-        A MessageError says why not: nothing changes then.
+        Args:
+            twist: Linear [m/s] and angular [rad/s] velocity, (6,).
+
+        Raises:
+            MessageError: If the twist is refused; nothing is changed then.
         """
         start, mae = self._ready()
         self._follow(self.planner.by_twist(mae, start, twist))
 
     def explore(self, wanted: bool) -> str:
-        """Explore, or end it and hold; return why not, or ''."""
+        """Start or end the exploration; return why it is refused, or ''."""
         condition = self.supervisor.condition
         if wanted and condition is not None:
             return f'stopped: {condition}'
         if wanted and self.settings.method == 'float':
-            return 'method float: a hand moves the arm; set another method first'
+            return 'method float: the arm is guided by hand; set another method first'
         if wanted and not self.stream.body.used.any():
             return f'all muscles are isolated; {RESTORE}'
         if wanted != self.supervisor.explores:
@@ -379,37 +410,37 @@ class Controller:
             known = self.stream.body.offsets.known
             exploring = Activity.EXPLORING if known else Activity.CALIBRATING
             self._request(exploring if wanted else Activity.IDLE)
-        elif not wanted:  # nor is it to explore after a stop
+        elif not wanted:  # also prevents exploring again after the present stop
             self.supervisor.on_request(self.supervisor.activity)
         return ''
 
     def stop(self, cause: StopCause, detail: str = '') -> None:
-        """Latch a safe stop."""
+        """Stop the arm; the stop is latched."""
         self.supervisor.on_event(cause, detail)
 
     def reset(self, now: float) -> Condition | None:
-        """End a stop and go on to the last target; return the cause that is present, if any."""
+        """End a stop and continue to the last target, unless a stop cause is present; return it."""
         return self.supervisor.on_reset(self.conditions(now))
 
     # -- time -----------------------------------------------------------------------------------
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the causes to stop that are present, the most severe first."""
+        """Return the stop causes that are present, the most severe first."""
         present = self.watchdog.conditions(now)
-        if why := self.stream.implausible(now):
-            present.append(Condition(StopCause.IMPLAUSIBLE_MUSCLE_STATES, why))
-        if why := self._revoked_lengths(now):
-            present.append(Condition(StopCause.LENGTH_OFFSETS_REVOKED, why))
-        if why := self._estimate_problem.lasting(now):
-            present.append(Condition(StopCause.IMPLAUSIBLE_ESTIMATE, why))
+        if detail := self.stream.implausible(now):
+            present.append(Condition(StopCause.IMPLAUSIBLE_MUSCLE_STATES, detail))
+        if detail := self._revoked_lengths(now):
+            present.append(Condition(StopCause.LENGTH_OFFSETS_REVOKED, detail))
+        if detail := self._estimate_problem.lasting(now):
+            present.append(Condition(StopCause.IMPLAUSIBLE_ESTIMATE, detail))
         order = list(StopCause)
         return sorted(present, key=lambda condition: order.index(condition.cause))
 
     def _revoked_lengths(self, now: float) -> str:
-        """Return why the lengths cannot be relied on, or ''.
+        """Return why the lengths are unreliable, or ''.
 
-        The estimator decides that. Only if it takes no notice of a jump, as one that was started
-        meanwhile, does the controller itself.
+        Normally the estimator revokes the offsets. The controller does so only if the estimator
+        does not react to a jump, for example because it was restarted meanwhile.
         """
         stream = self.stream
         if stream.body.offsets.is_suspect:
@@ -420,19 +451,22 @@ class Controller:
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:
-        """Return the command of this moment, or None while nothing was ever commanded.
+        """Return the present command, or None before the first command.
 
-        `time` is the messages' [s], that of the steady clock if it is not given.
+        Args:
+            now: Time of the steady clock [s].
+            time: Time of the messages [s]; None if it is the same clock.
         """
-        # What computing took is over when a command goes out: it may bring no change with it.
+        # The rate limit must not count the time from the last step to the publication of its
+        # command.
         computing = max(self.sent_at - self.watchdog.age.stepped_at, 0.0)
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
-        if step.has_paused:  # the arm may be elsewhere by now: on from there
+        if step.has_paused:  # the arm may have moved: restart the activity from its posture
             self.activities.entered = None
         present = self.conditions(now)
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
-        if stale_estimate:  # an estimator that starts anew knows of no suspect
+        if stale_estimate:  # a restarted estimator no longer has a suspect
             self.supervisor.on_suspect(False)
         if self.limiter.command is not None or not self.supervisor.is_running:
             # Before the first command there is nothing to stop.
@@ -451,7 +485,7 @@ class Controller:
         return limited or self.limiter.command
 
     def _desired(self, dt: float) -> Command | None:
-        """Return what the activity wants; any fault of it stops the arm."""
+        """Return the activity's command; any exception stops the arm."""
         control = self.activities.of(self.supervisor.activity, self.settings)
         known = self.stream.body.offsets.known
         if control is None or not (known or control is self.activities.calibrating):
@@ -459,13 +493,13 @@ class Controller:
             return None
         try:
             return self._slack(self._step(control, self._inputs(dt)))
-        except RobotDescriptionError as error:  # too little is left to explore with
+        except RobotDescriptionError as error:  # too few postures are holdable to explore
             self._request(Activity.IDLE)
             reason = str(error)
             if isolated := self.robot.names(self.robot.isolated):
-                reason = f'what is left without {isolated} holds too few postures; {RESTORE}'
+                reason = f'too few postures are holdable without {isolated}; {RESTORE}'
             self.target_state.unreachable_reason = reason
-        except Exception as error:  # noqa: BLE001 (whatever it is, the arm must stop)
+        except Exception as error:  # noqa: BLE001 (any exception has to stop the arm)
             self._note_fault(error)
         return None
 
@@ -476,7 +510,7 @@ class Controller:
         activities, state = self.activities, self.target_state
         follower = activities.follower
         if control is follower and follower.trajectory is None and state.theta is not None:
-            # After a stop or another method: on to the target, from where the arm is.
+            # After a stop or a change of method, move to the target from the present posture.
             self._approach(self.settings.first_duration)
         elif control is follower and follower.has_fallen and state.approaches_left:
             state.approaches_left -= 1
@@ -484,7 +518,7 @@ class Controller:
             self._approach(self.settings.target_duration or self.settings.first_duration)
         command = activities.step(control, inputs)
         if control is activities.gravity_compensation:
-            # Where it is left is held by the method that comes next.
+            # The next method holds the posture in which the arm was left.
             inside = np.clip(inputs.theta, self.robot.lower, self.robot.upper)
             self.target_state = Target(np.zeros_like(inside), inside)
         if control is activities.exploring:
@@ -494,7 +528,7 @@ class Controller:
         return command
 
     def _inputs(self, dt: float) -> Inputs:
-        # Without a present cause all of them are there.
+        # Without a stop cause, all inputs are available.
         assert self.mae is not None and self.sample is not None and self.estimate is not None
         sample = self.sample
         pull = Pull(sample.motor_tension * sample.usable, sample.bone_tension * sample.usable)
@@ -510,7 +544,7 @@ class Controller:
         )
 
     def _slack(self, command: Command | None) -> Command | None:
-        """Return a command that gives isolated muscles all the length, or no tension."""
+        """Return the command with isolated muscles commanded to be slack."""
         if command is None or not self.robot.isolated:
             return command
         released = self.limiter.slack_length if command.kind == LENGTH else 0.0
@@ -523,7 +557,7 @@ class Controller:
             self.stopping.enter()
         if self.sample is None:
             return None
-        # A paused arm whose data is back waits for a moment: neither hold nor release goes on.
+        # A paused arm whose data is available again waits: the hold time does not advance.
         waits = not self.supervisor.is_latched and not present
         causes = {condition.cause for condition in present}
         is_fresh = StopCause.STALE_MUSCLE_STATES not in causes
@@ -547,7 +581,7 @@ class Controller:
         self.supervisor.on_request(activity)
 
     def _hold(self) -> None:
-        """Go to the target by the method that is set now, from how the muscles pull."""
+        """Move to the target with the present method, starting from the present tensions."""
         state = self.target_state
         by_torque = self.settings.method == 'tension'
         holding = Activity.TORQUE if by_torque else Activity.HOLDING
@@ -559,7 +593,7 @@ class Controller:
         self.supervisor.on_request(activity)
 
     def _approach(self, duration: float) -> None:
-        """Set out to the target on a way that can be held."""
+        """Start a trajectory to the target through holdable postures."""
         state = self.target_state
         assert state.theta is not None
         start, mae = self._ready()
@@ -567,7 +601,7 @@ class Controller:
         self._begin(plan, 0.0, state.effort)
 
     def _follow(self, plan: Plan, delay: float = 0.0) -> None:
-        """Follow a trajectory that was asked for."""
+        """Follow a requested trajectory, whose end becomes the target."""
         nothing = np.zeros(self.robot.joint_count)
         end = plan.trajectory.end
         self.target_state = Target(nothing, end, (), plan.unreachable_reason)
@@ -584,7 +618,7 @@ class Controller:
 
     @property
     def is_following(self) -> bool:
-        """Whether the follower commands the arm: it moves to a target, or holds one."""
+        """Whether the follower commands the arm, to move to a target or to hold it."""
         activity = self.supervisor.activity
         follower = self.activities.follower
         is_used = self.activities.of(activity, self.settings) is follower
@@ -596,9 +630,10 @@ class Controller:
         return known and self.estimate is not None and self.mae is not None
 
     def _ready(self, delay: float = 0.0) -> tuple[Setpoint, Mae]:
-        """Return where a trajectory starts in `delay` [s], and the network.
+        """Return the setpoint from which a trajectory starts in `delay` [s], and the network.
 
-        A MessageError says why none may start.
+        Raises:
+            MessageError: If no trajectory may start.
         """
         self._refuse_gravity_compensation()
         if self.estimate is None or self.mae is None:
@@ -608,7 +643,7 @@ class Controller:
         if condition is not None:
             raise MessageError('stopped', str(condition))
         if not self.stream.body.offsets.known:
-            raise MessageError('length offsets are unknown', 'find them by estimator/zero')
+            raise MessageError('length offsets are unknown', 'call estimator/zero')
         follower = self.activities.follower
         if follower.trajectory is not None:
             return follower.ahead(delay), self.mae
@@ -617,4 +652,6 @@ class Controller:
 
     def _refuse_gravity_compensation(self) -> None:
         if self.settings.method == 'float':
-            raise MessageError('floating', 'a hand moves the arm; set another method first')
+            raise MessageError(
+                'method float', 'the arm is guided by hand; set another method first'
+            )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random motion that collects data: a stream of steps, and the activity that takes them.
+"""Exploration: random motion that collects training data.
 
 The preset draws the steps (`Preset.exploration`). Preset `default` draws some joints' targets at
-one of their limits, since only their stops tell the zeros of their sensors (`learning.stops`), and
-of several random T_const takes the one that presses them there most.
+their limits, because joint-sensor offsets are identified from the stops (`learning.stops`). Of
+several random T_const it uses the one that presses these joints most strongly against their stops.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -23,9 +23,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
 TRIES = 1000
-AT_LIMITS = 0.25  # share of the targets of each joint that are at one of its limits
+AT_LIMITS = 0.25  # share of each joint's targets that are at one of its limits
 SMALL = 1e-9  # [N·m]
-PRESSES = 10  # T_const, of which the one is taken that presses most towards limits
+PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
 
 
 class Step(NamedTuple):
@@ -33,22 +33,22 @@ class Step(NamedTuple):
 
     method: str  # 'first' or 'second', of the preset's length methods
     theta: Array  # θ_target [rad], (D,)
-    # T_const [N] of `first`, (M,); of `second`, which takes the tension of the moment, what the
-    # geometric model expects that to be
+    #: T_const of `first` [N], (M,); for `second`, which uses the present tension, the tension that
+    #: the geometric model expects
     tension: Array
     duration: float  # [s]
 
 
 class Exploration:
-    """A reproducible stream of steps; iterating again goes on with it at a new posture."""
+    """A reproducible stream of steps; a new iterator continues it at a new posture."""
 
     def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
-        """Explore with `robot` as a preset does."""
+        """Draw the steps of a preset for `robot`."""
         self._rng = np.random.default_rng([seed, 0xE8])
         self.use(robot, preset)
 
     def use(self, robot: Robot, preset: str) -> None:
-        """Draw targets that this robot can hold without its isolated muscles."""
+        """Draw targets that are holdable without the robot's isolated muscles."""
         self._robot, self._draw = robot, preset_named(preset).exploration()
 
     def __iter__(self) -> Iterator[Step]:
@@ -57,7 +57,7 @@ class Exploration:
 
 
 def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_LIMITS) -> Array:
-    """Return a random θ [rad] (D,), each joint of which is at a limit in a share of the cases."""
+    """Return a random θ [rad] (D,); each joint is at a limit with probability `share`."""
     theta = robot.random_postures(1, rng)[0]
     chosen, upper = rng.uniform(size=(2, robot.joint_count))
     limit = np.where(upper < 0.5, robot.upper, robot.lower)
@@ -65,24 +65,31 @@ def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_
 
 
 def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:
-    """Return random T [N] (M,) that press the joints of θ [rad] (D,) at their limits there."""
+    """Return random T [N] (M,) that press joints of θ [rad] (D,) at a limit against their stop."""
     limits = robot.tension
-    way = (theta == robot.upper).astype(float) - (theta == robot.lower)
-    count = PRESSES if way.any() else 1
+    side = (theta == robot.upper).astype(float) - (theta == robot.lower)
+    count = PRESSES if side.any() else 1
     tension = rng.uniform(limits.bias, limits.limit, (count, robot.muscle_count))
     torque = -tension @ robot.routes.muscle_jacobian(theta)
-    pressed = torque / np.maximum(np.abs(torque).max(axis=0), SMALL) @ way
-    most: Array = tension[np.argmax(pressed)]
-    return most
+    pressure = torque / np.maximum(np.abs(torque).max(axis=0), SMALL) @ side
+    most_pressing: Array = tension[np.argmax(pressure)]
+    return most_pressing
 
 
 def holdable_postures(
     robot: Robot, postures: Iterable[Array], count: int, *others: Callable[[Array], Array]
 ) -> list[tuple[Array, Array]]:
-    """Return the first of random θ (D,) that can be held, each with the least T [N] (M,).
+    """Return the first `count` holdable postures θ (D,), each with its least T [N] (M,).
 
-    They can be held with the nominal G and with every other, given as for `muscle_hessian`; T is
-    that of the last one. A RobotDescriptionError says that there are not so many.
+    Args:
+        robot: The robot.
+        postures: Random postures.
+        count: Number of postures to return.
+        others: Further functions for G, as for `muscle_hessian`. A posture has to be holdable with
+            the nominal G and with each of these; T is that of the last one.
+
+    Raises:
+        RobotDescriptionError: If there are fewer holdable postures.
     """
     held: list[tuple[Array, Array]] = []
     for theta in postures:
@@ -93,27 +100,31 @@ def holdable_postures(
         if len(held) == count:
             return held
     raise RobotDescriptionError(
-        f'{robot.description.directory}: only {len(held)} of {TRIES} random postures can be held '
+        f'{robot.description.directory}: only {len(held)} of {TRIES} random postures are holdable '
         f'with tensions in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N; '
         'run check_robot'
     )
 
 
 class Exploring:
-    """The activity of exploring: one random step after the other, by ramps of lengths."""
+    """The activity of exploring, which executes random steps by ramps of lengths."""
 
     def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
         self.stream, self.ramps = exploration, ramps
         self._steps: Iterator[Step] | None = None
-        self.theta: Array | None = None  # the target of the moment [rad], (D,)
+        self.theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Begin with a new posture, or go on after a pause, from how the muscles pull now."""
+        """Start with a new posture, or continue after a pause, from the present tensions."""
         self.ramps.start_from(inputs.length)
         self._steps = self._steps or iter(self.stream)
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the next command; a RobotDescriptionError says that too little can be held."""
+        """Return the next command.
+
+        Raises:
+            RobotDescriptionError: If too few postures are holdable.
+        """
         assert self._steps is not None
         if self.ramps.is_over_after(inputs.dt):
             step = next(self._steps)
@@ -124,5 +135,5 @@ class Exploring:
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """End; the next time begins with another posture."""
+        """End the exploration; the next one starts with another posture."""
         self._steps = self.theta = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is corrected while the arm rests: the estimated error, and needless tension."""
+"""Feedback at rest: corrects the estimated posture error and reduces needless tension."""
 
 from __future__ import annotations
 
@@ -10,53 +10,53 @@ from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-REPLAN = 5.0  # [N] change of a tension limit that a plan depends on, for which it is made anew
-CORRECTION = 0.3  # [rad] at most, or times RACK [m]
-#: [m] at most: by how much lengths can be off, and what friction keeps of a tendon wound in
+REPLAN = 5.0  # change of a relevant tension limit that requires a new plan [N]
+CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times RACK [m]
+#: largest relief [m]: covers length errors and the tension that friction retains in a tendon
 RELIEF = 0.01
-#: [rad] of estimated error that is left alone, or times RACK [m]: about the error of the estimate
-#: itself, after which an arm with friction would creep for ever
+#: Estimated errors up to this size are not corrected [rad], for prismatic joints times RACK [m]. It
+#: is about the error of the estimate. Without it, an arm with friction would creep for ever.
 DEADBAND = 0.03
-BETWEEN = 0.1  # [s] between two programmes of which tension is needless
-SETTLING = 0.5  # [s] after a movement until the arm counts as resting
+BETWEEN = 0.1  # time between two computations of the needless tension [s]
+SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
 
 
 def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
-    """Return whether tensions planned within one limit would be others within another limit.
+    """Return whether a changed tension limit requires a new plan.
 
-    The limit of a warm muscle falls all the time. Few muscles pull as much, and a new plan would
-    lose what the feedback has found out at this rest.
+    The limit of a warm muscle falls continuously. Only tensions near their limit depend on it, and
+    an unnecessary new plan would discard the corrections of the feedback.
 
     Args:
         tension: Planned T [N], (M,).
-        before: The limit that it was planned with [N], (M,).
-        limit: The limit now [N], (M,).
+        before: Limit at the time of planning [N], (M,).
+        limit: Present limit [N], (M,).
     """
     depends = tension > np.minimum(before, limit) - REPLAN
     return bool(np.count_nonzero(depends & (np.abs(limit - before) > REPLAN)))
 
 
 class RestFeedback:
-    """Two slow integrals while the arm rests: of the estimated error, and of needless tension.
+    """Integrates the estimated error and the needless tension slowly while the arm rests.
 
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
         dr/dt = gain (T − T*)/K_stiff,           |r| ≤ RELIEF        where T > T*
               = gain min(T_end − T*, 0)/K_stiff                      elsewhere
-        (T and T_end no further than T_bias to T_limit)
+        (T and T_end are clipped to T_bias … T_limit)
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
-    Friction and errors of the network leave the arm beside its target; the estimate sees most of
-    that (arXiv 2405.11808). They also leave muscles that pull against each other: a tension that is
-    commanded as a length is off by K_stiff times the error of the length. T* exerts the torque of T
-    without friction, so that the relief moves no joint. A tendon that was wound in is paid out
-    until friction keeps nothing of its tension. One that was paid out stays so, because the arm
-    hangs on it by friction already.
+    Friction and network errors leave the arm away from its target; the estimate contains most of
+    this error (arXiv 2405.11808). They also cause antagonistic muscles to pull against each other,
+    because a length error causes a tension error of K_stiff times its size. T* exerts the joint
+    torque of T_end, so that the relief moves no joint. A tendon that was wound in is paid out until
+    friction no longer retains tension in it. A tendon that was paid out is not paid out further,
+    because friction already supports the arm there.
 
     Attributes:
         correction: c [rad], (D,).
         relief: r [m], (M,).
-        largest: Bound of the correction [rad], (D,).
+        largest: Bound on |c| [rad], (D,).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -67,11 +67,11 @@ class RestFeedback:
         self.moving()
 
     def use(self, robot: Robot) -> None:
-        """Correct by this robot, whose isolated muscles pull nothing."""
+        """Use another robot description, in which isolated muscles have no tension."""
         self._robot = robot
 
     def reset(self) -> None:
-        """Forget the corrections: a new target."""
+        """Set the corrections to zero, for a new target."""
         self.correction: Array = np.zeros(self._robot.joint_count)
         self.relief: Array = np.zeros(self._robot.muscle_count)
 
@@ -82,14 +82,14 @@ class RestFeedback:
     def step(
         self, error: Array, jacobian: Array, pull: Pull, limit: Array, gain: float, dt: float
     ) -> bool:
-        """Integrate over dt [s] if the arm rests; return whether it does.
+        """Integrate over dt [s] if the arm rests; return whether it did so.
 
         Args:
             error: θ_target − θ_estimated [rad], (D,).
             jacobian: G at the target [m/rad], (M, D).
-            pull: How the muscles pull.
-            limit: The highest tension planned [N], (M,).
-            gain: [1/s]; 0 is no feedback.
+            pull: Tensions of the muscles.
+            limit: Highest tension that may be planned [N], (M,).
+            gain: Integral gain [1/s]; 0 for no feedback.
             dt: Time since the last call [s].
         """
         self._rested += dt
@@ -111,5 +111,5 @@ class RestFeedback:
         return True
 
     def shift(self, jacobian: Array) -> Array:
-        """Return what the corrections add to the lengths [m] (M,), by G (M, D) at the target."""
+        """Return the length correction G c + r [m] (M,), with G (M, D) at the target."""
         return jacobian @ self.correction + self.relief

@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one follower: muscle lengths along a trajectory, and on where the last one has ended.
+"""The follower: computes muscle lengths along a trajectory, and holds its end.
 
-At each message, for the θ, θ̇, θ̈ that are desired then (`trajectory`),
+At each message, for the desired θ, θ̇, θ̈ (`trajectory`),
 
     τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
-    T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,         T at the bones
+    T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,         bone-side tension
     l = ①(θ + k_p e + c, T),   e = θ − θ_estimated,   dc/dt = k_i e,   |c|, |k_p e + c| ≤ CORRECTION
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
-Tendon friction: the tension at the motor is T e^{μ s}, with s the direction in which the tendon
-slides, and μ as the learner found it (`mae.touch`), else FRICTION. Winches: the motor of a module
-that follows muscle stiffness control (MSC) turns at dl/dt = (T − T_MSC)/(K_stiff λ). So its command
-has to lead by λ dl/dt, and a tendon that is pulled out at dl/dt resists with T_bias + K_stiff
-λ dl/dt even if MSC demands no more than T_bias; that is T_low. λ is measured while the arm moves
-(`winches`).
+Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
+slides, and μ is learned (`mae.touch`) or FRICTION.
 
-A trajectory that the winches cannot follow is slowed as a whole before it starts (`slowness`).
-After its end G and T stay as they are, and the feedback at rest (`feedback.RestFeedback`) goes on
-from c: holding a posture is following a trajectory that has ended.
+Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
+dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is
+drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This is
+T_low. λ is measured while the arm moves (`winches`).
 
-Method `stiffness`: argmin ‖T − T_K‖² instead, with T_K of `methods.stiffness_command` for the θ and
-τ of a moment later, and no feedback, under which a chosen stiffness would not last.
+A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
+(`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
+rest feedback (`feedback.RestFeedback`) continues from c.
+
+Method `stiffness` minimises ‖T − T_K‖² instead, where T_K is that of `methods.stiffness_command` a
+moment ahead. It uses no feedback, which would change the chosen stiffness.
 """
 
 from __future__ import annotations
@@ -42,37 +43,41 @@ from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
 PROPORTIONAL, INTEGRAL = 0.7, 4.0  # k_p; k_i [1/s]
-FRICTION = 0.05  # μ where none was learned: the mean of what hands build
-SHARE = 0.7  # of the winches' speed that lengths may use; the rest is for tensions and feedback
-MOST_MOMENTS = 12_500  # that a network is asked about; every piece of 10 000 has one still
-BLENDING = 0.3  # [s] in which what the command was before fades into the plan's
-FALLEN, FALLING = 0.2, 2.0  # [rad] off, or times RACK, so long [s] after the end
-SETTLING = 0.8  # [s] after the end, in which the feedback of the motion goes on
-TURNING = 0.005  # [m/s] of a tendon beyond which its direction is sure
-AHEAD = 0.2  # [s] to the moment of T_K, and between two of them
+FRICTION = 0.05  # μ if none was learned: a typical value of hand-built arms
+#: share of the rate limit for a trajectory's lengths; the rest is for tensions and feedback
+SHARE = 0.7
+#: most moments at which a network is evaluated; at least one for each piece of 10 000
+MOST_MOMENTS = 12_500
+BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
+#: An arm has fallen if its error exceeds FALLEN [rad], for prismatic joints times RACK [m], for
+#: FALLING [s] after the end of the trajectory.
+FALLEN, FALLING = 0.2, 2.0
+SETTLING = 0.8  # time after the end for which the feedback of the motion continues [s]
+TURNING = 0.005  # speed of a tendon above which its sliding direction is certain [m/s]
+AHEAD = 0.2  # T_K is computed for this time ahead, and at this interval [s]
 
 
 class Stiffening:
-    """The tensions T_K near which method `stiffness` plans, a moment ahead."""
+    """Computes the tensions T_K that method `stiffness` approaches, a moment ahead."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.use(robot, settings)
         self.reset()
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Plan with this robot and these settings."""
+        """Use another robot description and other settings."""
         self._robot, self._settings = robot, settings
 
     def reset(self) -> None:
-        """Begin anew."""
-        self.solution: Solution | None = None  # the last that T_K goes to
+        """Discard the present solution."""
+        self.solution: Solution | None = None  # the solution that T_K approaches
         self._near: Array = self._robot.tension.bias  # T_K [N], (M,)
-        self._solved = 0.0  # how long ago [s]
+        self._solved = 0.0  # age of the solution [s]
 
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
     ) -> Array:
-        """Return T_K [N] (M,), as fast as it may change by what the plan leaves of the winches."""
+        """Return T_K [N] (M,); its rate is limited to what trajectories leave of the rate limit."""
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt
         if solution is None or self._solved >= AHEAD:
@@ -83,7 +88,7 @@ class Stiffening:
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near
             self.solution = solution
-        # Half, since the series elastic elements stretch as well.
+        # Use half of it, because the series elastic elements stretch as well.
         largest = 0.5 * (1.0 - SHARE) * settings.rate_limit * robot.stiffness * dt
         self._near = self._near + np.clip(solution.tension - self._near, -largest, largest)
         return self._near
@@ -93,15 +98,15 @@ class Follower:
     """Follows trajectories, and holds where the last one ended.
 
     Attributes:
-        trajectory: What is followed, or was last; None before the first, and after a stop.
-        next: A trajectory that replaces it later, and in how many seconds.
-        effort: Torque beyond weight and motion [N·m], (D,).
-        time: Since the trajectory began, whatever was planned anew meanwhile [s].
-        over: Since it ended [s].
-        desired: What is desired now.
+        trajectory: The present or last trajectory; None before the first and after a stop.
+        next: A trajectory that replaces it later, and the time until then [s].
+        effort: Torque in addition to inverse dynamics [N·m], (D,).
+        time: Time since the start of the trajectory [s].
+        over: Time since its end [s].
+        desired: The present setpoint.
         error: Desired − estimated θ [rad], (D,).
-        missing_torque: What no tension within the limits gives [N·m], (D,).
-        tension: Planned T at the bones [N], (M,).
+        missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
+        tension: Planned bone-side tension [N], (M,).
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -116,46 +121,48 @@ class Follower:
         self.winches, self.feedback = Winches(robot), RestFeedback(robot)
         self.stiffening = Stiffening(robot, settings)
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
-        self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
-        self._shift: Array = np.zeros(robot.joint_count)  # of θ by the feedback [rad]
-        self._resting: tuple[Array, Array] | None = None  # l_target and G where it is held
+        self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
+        self._shift: Array = np.zeros(robot.joint_count)  # shift of θ by the feedback [rad]
+        self._resting: tuple[Array, Array] | None = None  # l_target and G while holding
         self._blend: Ramp | None = None
-        # T at the bones and at the motors [N], and s of each tendon, (M,)
         self.tension: Array = robot.tension.bias.copy()
-        self._motor: Array = self.tension
-        self._sliding: Array = np.zeros(robot.muscle_count)
+        self._motor: Array = self.tension  # planned motor-side tension [N], (M,)
+        self._sliding: Array = np.zeros(robot.muscle_count)  # s of each tendon, (M,)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Plan with this robot, whose isolated muscles pull nothing, and these settings."""
+        """Use another robot description and other settings.
+
+        In the description, isolated muscles have no tension.
+        """
         self._robot, self._settings = robot, settings
         self.winches.use(robot)
         self.feedback.use(robot)
         self.stiffening.use(robot, settings)
 
     def use_network(self, mae: Mae) -> None:
-        """Take a new network; the command goes over to it without a jump."""
+        """Use another network; the command changes without a jump."""
         touch = getattr(mae, 'touch', None)
-        known = np.full(self._robot.muscle_count, FRICTION) if touch is None else touch.friction
-        self._friction = known
+        default = np.full(self._robot.muscle_count, FRICTION)
+        self._friction = default if touch is None else touch.friction
         self.plan_anew()
 
-    # -- what is asked --------------------------------------------------------------------------
+    # -- requests -------------------------------------------------------------------------------
 
     def follow(self, trajectory: Trajectory, delay: float = 0.0) -> None:
-        """Follow a trajectory from `delay` [s] on, in the place of all that was to come after."""
+        """Follow a trajectory that starts in `delay` [s] and replaces everything after that."""
         if delay > 0.0:
             self.next = trajectory, delay
         else:
             self._begin(trajectory, 0.0)
 
     def exert(self, effort: Array) -> None:
-        """Exert a torque [N·m] (D,) beyond weight and motion, by the trajectory and after it."""
+        """Exert a torque in addition to inverse dynamics [N·m] (D,), until it is changed."""
         if (effort != self.effort).any():
             self.effort = effort
             self.plan_anew()
 
     def plan_anew(self) -> None:
-        """Go over from the last command to another without a jump; at rest, settle again."""
+        """Plan again and blend the last command into the new plan; at rest, settle again."""
         if self._resting is not None and self.trajectory is not None:
             self.time = min(self.time, self.trajectory.duration)
             self.feedback.relief = np.zeros(self._robot.muscle_count)
@@ -163,20 +170,21 @@ class Follower:
 
     @property
     def is_moving(self) -> bool:
-        """Whether a trajectory goes on or is to come."""
-        going = self.trajectory is not None and self.time < self.trajectory.duration
-        return going or self.next is not None
+        """Whether a trajectory is being followed or is due to start."""
+        is_under_way = self.trajectory is not None and self.time < self.trajectory.duration
+        return is_under_way or self.next is not None
 
     @property
     def has_fallen(self) -> bool:
-        """Whether the arm lacks a muscle and rests elsewhere than where a trajectory has led."""
-        rested = self.trajectory is not None and self.over > FALLING
-        rested = rested and self.next is None and not self._robot.used.all()
-        return bool(rested and np.abs(self.error / self._robot.kinematics.radian).max() > FALLEN)
+        """Whether an arm with isolated muscles rests far from the end of its trajectory."""
+        is_at_rest = self.trajectory is not None and self.next is None and self.over > FALLING
+        if not is_at_rest or self._robot.used.all():
+            return False
+        return bool(np.abs(self.error / self._robot.kinematics.radian).max() > FALLEN)
 
     @property
     def latest(self) -> Trajectory | None:
-        """What was to be followed last, whether it has begun or is to come."""
+        """The most recently requested trajectory, even if it has not started yet."""
         return self.next[0] if self.next is not None else self.trajectory
 
     @property
@@ -185,18 +193,18 @@ class Follower:
         return self.stiffening.solution
 
     def ahead(self, delay: float) -> Setpoint:
-        """Return what will be desired in `delay` [s], as far as is known now."""
+        """Return the setpoint of the present trajectory in `delay` [s]."""
         assert self.trajectory is not None
         return self.trajectory.sample(self.time + delay)
 
     # -- the activity ---------------------------------------------------------------------------
 
     def enter(self, _: Inputs) -> None:
-        """Begin, or go on after a pause, from how the muscles pull now."""
+        """Start, or continue after a pause, from the present tensions."""
         self._start()
 
     def leave(self) -> None:
-        """Forget what was followed."""
+        """Discard the trajectories."""
         self.trajectory = self.next = None
 
     def step(self, inputs: Inputs) -> Command | None:
@@ -206,7 +214,7 @@ class Follower:
             return None
         if self.is_moving:
             self.winches.step(inputs.sample.length, inputs.pull.motor, sent, dt)
-        else:  # noise alone says nothing of λ
+        else:  # at rest, the measurements contain only noise and do not determine λ
             self.winches.forget()
         self.time += dt
         self.over += dt if self.time >= trajectory.duration else 0.0
@@ -233,7 +241,7 @@ class Follower:
 
     def _start(self) -> None:
         self._resting = self._blend = None
-        if self.trajectory is not None:  # held, or held anew: its tensions are planned again
+        if self.trajectory is not None:  # plan the tensions of the held posture again
             self.time = min(self.time, self.trajectory.duration)
         self.tension = self._robot.tension.bias.copy()
         self._motor = self.tension
@@ -245,7 +253,7 @@ class Follower:
     def _begin(self, trajectory: Trajectory, time: float) -> None:
         self.trajectory, self.time, self.next = trajectory, time, None
         self.over = 0.0
-        if self._resting is not None:  # on the way, one goes over to the next by itself
+        if self._resting is not None:  # in motion, the trajectories join without a new plan
             self.plan_anew()
 
     @property
@@ -253,20 +261,20 @@ class Follower:
         return self._settings.method == 'stiffness'
 
     def _moving(self, trajectory: Trajectory, inputs: Inputs) -> Array:
-        """Return l_target [m] (M,) on the way and while the arm settles."""
+        """Return l_target [m] (M,) during the motion and while the arm settles."""
         feedback, largest = self.feedback, self.feedback.largest
         error = np.zeros_like(self.error) if self._is_stiff else self.error
         correction = feedback.correction + INTEGRAL * inputs.dt * error
         feedback.correction = np.clip(correction, -largest, largest)
         feedback.moving()
-        # Bounded too: an estimate that is wrong at once must not take the arm along.
+        # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
         shift = feedback.correction + PROPORTIONAL * error
         self._shift = np.clip(shift, -largest, largest)
         at = trajectory.sample(self.time + 0.5 * inputs.dt)
         return self._planned(trajectory, at, inputs)
 
     def _planned(self, trajectory: Trajectory, at: Setpoint, inputs: Inputs) -> Array:
-        """Return l_target [m] (M,) for a moment."""
+        """Return l_target [m] (M,) for one setpoint."""
         robot, lag, mae, dt = self._robot, self.winches.lag, inputs.mae, inputs.dt
         jacobian = mae.muscle_jacobian(at.theta, self.tension)
         speed = jacobian @ at.velocity
@@ -285,7 +293,7 @@ class Follower:
         return length + msc_compensation(robot, self._motor) + lag * speed
 
     def _held(self, inputs: Inputs) -> Array:
-        """Return l_target [m] (M,) at rest, for which nothing is solved that does not change."""
+        """Return l_target [m] (M,) at rest, with the plan computed only once."""
         feedback, mae = self.feedback, inputs.mae
         if self._resting is None:
             feedback.correction = self._shift
@@ -300,13 +308,13 @@ class Follower:
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
-    """Return how many times longer a trajectory has to take, so that the winches can follow.
+    """Return the factor by which a trajectory has to be slowed for the muscle modules.
 
-    One that starts in motion keeps that speed, and so needs more than that now and then. Looked at
-    are lengths at T_bias. Tensions slow nothing: near postures that are hard to hold they change
-    suddenly, however slowly the arm moves, and for them `SHARE` leaves winches time.
+    Only the lengths at T_bias count. Tensions are ignored, because near postures that are hard to
+    hold they change suddenly at any speed; `SHARE` reserves speed for them. A trajectory that
+    starts in motion keeps its initial speed, so it can need more than this factor.
     """
-    # Of very many points fewer moments between: no command may wait for a tenth of a second.
+    # Evaluate fewer moments of very long trajectories, so that no command is delayed by 0.1 s.
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]

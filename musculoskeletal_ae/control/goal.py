@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a trajectory that is an action's goal, by joint_trajectory_controller's rules."""
+"""Monitors the goal of a FollowJointTrajectory action, as joint_trajectory_controller does."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,14 +14,17 @@ from musculoskeletal_ae.exceptions import MessageError
 SUCCESSFUL, INVALID, BEYOND_PATH, BEYOND_GOAL = 0, -1, -4, -5
 
 
-def read_tolerances(given: Iterable[Any], joints: Sequence[str]) -> Array:
-    """Return by how far each joint may be off [rad] (D,), of control_msgs/JointTolerance.
+def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
+    """Return the position tolerance of each joint [rad] (D,) from control_msgs/JointTolerance.
 
-    A position of 0 (the default, which is none here) and a negative one are no bound. Velocities
-    and accelerations are not estimated, and bounds on them are left alone.
+    A position of 0, the default, and a negative one mean no tolerance. Tolerances on velocities and
+    accelerations are ignored, because these are not estimated.
+
+    Raises:
+        MessageError: If a joint is unknown or a tolerance is not finite.
     """
     bounds = np.full(len(joints), np.inf)
-    for one in given:
+    for one in tolerances:
         if one.name not in joints:
             raise MessageError('unknown joint', f'{one.name!r}; legal: {", ".join(joints)}')
         if not np.isfinite(one.position):
@@ -32,20 +35,25 @@ def read_tolerances(given: Iterable[Any], joints: Sequence[str]) -> Array:
 
 
 class FollowedGoal:
-    """The trajectory that a controller has been given last."""
+    """Monitors the latest trajectory of a controller as an action's goal."""
 
     def __init__(
         self, core: Controller, joints: Sequence[str], path: Array, goal: Array, patience: float
     ) -> None:
-        """Watch it within tolerances [rad] (D,) on its way and at its end.
+        """Start monitoring.
 
-        To come within the latter it has so much time after its end [s]; 0 is for ever.
+        Args:
+            core: The controller.
+            joints: Names of the joints.
+            path: Tolerances along the trajectory [rad], (D,).
+            goal: Tolerances at its end [rad], (D,).
+            patience: Time after the end to reach the goal tolerances [s]; 0 for no limit.
         """
         self._core, self._trajectory = core, core.activities.follower.latest
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
 
     def outcome(self) -> tuple[int, str] | None:
-        """Return an error code and what happened, or None while the goal is pursued."""
+        """Return an error code and its reason, or None while the goal is active."""
         core, trajectory = self._core, self._trajectory
         follower, condition = core.activities.follower, core.supervisor.condition
         if condition is not None:
@@ -53,7 +61,7 @@ class FollowedGoal:
         if not core.is_following or follower.latest is not trajectory or trajectory is None:
             return INVALID, 'replaced by another target'
         if follower.trajectory is not trajectory:
-            return None  # it is still to begin
+            return None  # the trajectory has not started yet
         off = np.abs(follower.error)
         if follower.time < trajectory.duration:
             return self._beyond(BEYOND_PATH, off, self._path)
@@ -66,5 +74,5 @@ class FollowedGoal:
         if off[m] <= bounds[m]:
             return None
         unit = self._core.robot.units[m].theta
-        told = f'is off by {off[m]:.3f} {unit}, tolerance {bounds[m]:.3g} {unit}'
-        return code, f'{self._joints[m]} {told}'
+        error = f'is off by {off[m]:.3f} {unit}, tolerance {bounds[m]:.3g} {unit}'
+        return code, f'{self._joints[m]} {error}'

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From poses and twists of the hand to joint trajectories.
+"""Converts poses and twists of the hand into joint trajectories.
 
-A pose becomes joint angles by inverse kinematics, from where the arm is desired to be, so that of
-several postures the nearest is taken. It has to be within the joint limits and one that the muscles
-can hold, with the learned G. Where it is not, it is refused, or, if that is wished (`unreachable`:
-nearest), the hand comes as near as it can: as the inverse kinematics leaves it, and as far on the
-way as the muscles can hold.
+Inverse kinematics converts a pose into joint angles. It starts from the desired posture, so that it
+finds the nearest of several solutions. The solution has to be within the joint limits and holdable
+with the learned G; otherwise the pose is refused. With `unreachable: nearest` the hand moves as
+close to the pose as the joint limits and the muscles allow.
 
-A single pose is gone to at `hand_speed`. Poses that come one soon after the other are a path,
-passed at the speed at which they come: each is reached when the next is due, and if no other comes
-the arm comes to rest at the last. A twist moves the hand for TWIST_TIMEOUT.
+The hand moves to a single pose at `hand_speed`. Poses in quick succession form a path, which the
+hand follows at the speed at which they arrive. Each pose is reached when the next one is due, and
+the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT.
 """
 
 import numpy as np
@@ -23,56 +22,72 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: to which a pose is sought: [m] and [rad]; only its position
+#: tolerances [m] and [rad] of the inverse kinematics for a whole pose, and for its position only
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
-FAR, TURNED = 0.005, 0.05  # [m], [rad] from a pose that is not reached
-SHORTEST = 0.3  # [s] of a movement to a single pose
-PEAK = 1.875  # fastest over mean speed of a motion of least jerk
-#: [s] and [m/s] within which poses are a path, and how soon a new interval counts
+FAR, TURNED = 0.005, 0.05  # errors above which a pose counts as unreachable [m], [rad]
+SHORTEST = 0.3  # shortest movement to a single pose [s]
+PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
+# Poses form a path if they arrive within FOLLOWING [s] and require less than FASTEST [m/s]. The
+# interval between poses is averaged with weight MEMORY.
 FOLLOWING, FASTEST, MEMORY = 0.25, 1.0, 0.2
-JOINING = 0.1  # [s] in which a path is joined, at least
-RETURNING = 2.0 * STOPPING  # [s] to the last pose of a path
-TWIST_TIMEOUT, STARTING = 0.3, 0.1  # [s]
-DAMPING = 0.02  # [m] of a joint's leverage below which it turns less
+JOINING = 0.1  # shortest time to join a path [s]
+RETURNING = 2.0 * STOPPING  # time to come to rest at the last pose of a path [s]
+TWIST_TIMEOUT, STARTING = 0.3, 0.1  # duration of a twist, and of the acceleration to it [s]
+DAMPING = 0.02  # damping of the inverse Jacobian [m]; limits the speed of joints near singularities
 
 
 class Hand:
-    """Turns what is asked of the hand into trajectories; knows the last pose."""
+    """Converts poses and twists into trajectories, and remembers the last pose."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._last: tuple[float, Array, Array] | None = None  # when [s], where [m], θ [rad]
+        #: time [s], position [m] and posture θ [rad] of the last pose
+        self._last: tuple[float, Array, Array] | None = None
         self._interval = 0.0
 
     def posture(
         self, mae: Mae, pose: pin.SE3, whole: bool, start: Array, nearest: bool
     ) -> tuple[Array, str]:
-        """Return θ [rad] (D,) for a pose, or for its position alone, and what it falls short of.
+        """Return the posture θ [rad] (D,) for a pose, and why it does not reach the pose, or ''.
 
-        A MessageError says why there is none, unless the `nearest` is wished.
+        Args:
+            mae: The network in use.
+            pose: The pose in the root link's frame.
+            whole: Whether the orientation counts.
+            start: Posture from which the search starts [rad], (D,).
+            nearest: Whether to return the nearest posture if the pose is out of reach.
+
+        Raises:
+            MessageError: If the pose is out of reach and `nearest` is false.
         """
         robot = self._robot
         theta, distance, angle, _ = inverse_kinematics(
             robot, pose, start, WHOLE if whole else POSITION
         )
-        short = ''
+        reason = ''
         if distance > FAR or (whole and angle > TURNED):
-            short = f'{1000.0 * distance:.0f} mm'
-            short += f' and {angle:.2f} rad' * whole + ' beyond the joint limits or the arm'
+            reason = f'{1000.0 * distance:.0f} mm'
+            if whole:
+                reason += f' and {angle:.2f} rad'
+            reason += ' beyond the joint limits or the arm'
         theta, lack = nearest_held(robot, mae, start, theta)
-        short = '; '.join(filter(None, (short, lack)))
-        if short and not nearest:
-            raise MessageError('out of reach', short)
-        return theta, short
+        reason = '; '.join(filter(None, (reason, lack)))
+        if reason and not nearest:
+            raise MessageError('out of reach', reason)
+        return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
-        """Return the trajectory to θ [rad] (D,), the posture of a pose that came at `now` [s].
+        """Return the trajectory to the posture of a pose.
 
-        A single one is gone to at `speed` [m/s].
+        Args:
+            start: Setpoint from which the trajectory starts.
+            theta: Posture of the pose θ [rad], (D,).
+            speed: Largest speed of the hand to a single pose [m/s].
+            now: Time at which the pose was received [s].
         """
         robot, last = self._robot, self._last
         here = robot.kinematics.end_effector_pose(start.theta).translation
-        where = robot.kinematics.end_effector_pose(theta).translation  # as near as it comes
+        where = robot.kinematics.end_effector_pose(theta).translation
         self._last = now, where, theta
         if last is not None and 0.0 < now - last[0] < FOLLOWING:
             interval, moved = now - last[0], float(np.linalg.norm(where - last[1]))
@@ -81,7 +96,7 @@ class Hand:
                 before = self._interval or interval
                 self._interval = before + MEMORY * (interval - before)
                 velocity = (theta - last[2]) / self._interval
-                # As far ahead as joining the path takes, as if it went on like this; and back.
+                # Extrapolate the path for as long as joining it takes, then return to the pose.
                 ahead = max(self._interval, JOINING)
                 further = theta + (ahead - self._interval) * velocity
                 path = np.array([np.clip(further, robot.lower, robot.upper), theta])
@@ -89,27 +104,37 @@ class Hand:
                 time, every = np.array([ahead, ahead + RETURNING]), np.arange(len(theta))
                 return Trajectory.through(start, Points(every, time, path, rates, 0.0 * rates))
         self._interval = 0.0
-        way = float(np.linalg.norm(where - here))
-        return Trajectory.to(start, theta, max(SHORTEST, PEAK * way / speed))
+        distance = float(np.linalg.norm(where - here))
+        return Trajectory.to(start, theta, max(SHORTEST, PEAK * distance / speed))
 
     def again(self, now: float) -> None:
-        """Take that the last pose came once more."""
+        """Record that the last pose was received again at `now` [s]."""
         if self._last is not None:
             self._last = now, *self._last[1:]
 
     def moved(self, mae: Mae, start: Setpoint, twist: Array) -> Trajectory:
-        """Return the trajectory that moves the hand by a twist [m/s], [rad/s] (6,) for a while."""
+        """Return the trajectory that moves the hand by a twist for TWIST_TIMEOUT.
+
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the trajectory starts.
+            twist: Linear [m/s] and angular [rad/s] velocity, (6,). The orientation of the hand is
+                free if the angular velocity is 0.
+
+        Raises:
+            MessageError: If the muscles cannot hold the arm at the end of the motion.
+        """
         robot = self._robot
         jacobian = robot.kinematics.end_effector_jacobian(start.theta)
-        rows = slice(0, 6 if twist[3:].any() else 3)  # without turning, as the arm likes
+        rows = slice(0, 6 if twist[3:].any() else 3)
         part = jacobian[rows]
         normal = part @ part.T + DAMPING**2 * np.eye(len(part))
         velocity: Array = part.T @ np.linalg.solve(normal, twist[rows])
         time = np.cumsum([STARTING, TWIST_TIMEOUT, STOPPING])
-        ways = 0.5 * STARTING + np.array([0.0, TWIST_TIMEOUT, TWIST_TIMEOUT + 0.5 * STOPPING])
-        theta = start.theta + 0.5 * STARTING * start.velocity + ways[:, None] * velocity
+        moving = 0.5 * STARTING + np.array([0.0, TWIST_TIMEOUT, TWIST_TIMEOUT + 0.5 * STOPPING])
+        theta = start.theta + 0.5 * STARTING * start.velocity + moving[:, None] * velocity
         inside = np.clip(theta, robot.lower, robot.upper)
-        # A joint that would meet its limit stops there, the others go on.
+        # A joint that would exceed its limit stops there; the others continue.
         free = (inside == theta).all(axis=0)
         if missing := lacking(robot, mae, inside[-1]):
             raise MessageError('out of reach', f'the muscles lack {missing} there')

@@ -1,31 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last thing that every command passes before it is published.
+"""The limiter: the final check of every command before publication.
 
     desired ─► rate limit ─► tension limit ─► finite check ─► published
 
-Muscle stiffness control pulls with T_bias + K (l − l_target), so that the tension limit of a muscle
-is a limit of its commanded length:
+Muscle stiffness control exerts T_bias + K (l − l_target). Therefore the tension limit of a muscle
+limits its commanded length:
 
     l_target ≥ l + l_comp(T_limit) + r,   l_comp(T) = −(T − T_bias) / K_stiff
     dr/dt = RELIEF (T − T_limit)/K_stiff,   0 ≤ r ≤ −l_comp(T_limit)
 
-Whatever a plan, a feedback, a wrong network or a push from outside asks for, no module is told to
-pull harder than T_limit. The feedback r pays a muscle out further whose measured tension exceeds
-the limit all the same, as where K_stiff or a sensor of the module is not what it should be. A
-muscle whose measured tension is above `tension.limit` is paid out faster than the rate limit; none
-is ever wound in faster.
+No module is commanded to exert more than T_limit, whatever a plan, a feedback, a wrong network or
+contact demands. If the measured tension exceeds the limit nevertheless, for example because K_stiff
+or a sensor is wrong, the feedback r pays the muscle out further. A muscle whose measured tension is
+above `tension.limit` is paid out faster than the rate limit. No muscle is wound in faster.
 
-T_limit is the least of `tension.limit`, of what the heat of the motors allows for a moment
-(`watchdog.HeatLimit`) and, while the length offsets are unknown, of `calibrating.gentle_limit`.
+T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
+(`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
 
-The rate limit compares with the last command that was published, in whatever mode. Between length
-and tension commands that is a comparison of the tension that they demand of a module:
+The rate limit applies to the change since the last published command, in every mode. Length and
+tension commands are compared by the tension that they demand of a module:
 
     T_target = T_bias + max(0, K_stiff (l − l_target))
 
-Of the lengths that demand T_bias, all that are beyond l, the one nearest to the last published
-length is taken. Before the first command the muscles go on to pull as they do: a controller that
-was restarted does not know what was commanded before.
+All lengths beyond l demand T_bias; of these, the one nearest to the last published length is used.
+The first command keeps the present tensions, because a restarted controller does not know the
+earlier commands.
 """
 
 from __future__ import annotations
@@ -44,24 +43,24 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-POSTURES = 200  # random postures that tell how long the muscles can get
-#: [m] by which a real muscle, or its sensor, may be longer than the model's
+POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
+#: largest difference between the length of a real muscle and that of the model [m]
 LENGTH_MARGIN = 0.03
-RELIEF = 5.0  # [1/s] of the feedback from measured tension; slow beside the modules (30 ms)
+RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
 
 class CommandLimiter:
-    """Limits commands; knows the last one that was published.
+    """Limits commands relative to the last published one.
 
     Attributes:
-        command: The last command that was published, or None.
-        slack_length: Of every muscle [m], (M,): commanded this length, it is slack in any posture.
-        offsets_known: Whether lengths can be relied on; otherwise no limit rests on them.
+        command: The last published command, or None.
+        slack_length: Commanded length at which each muscle is slack in any posture [m], (M,).
+        offsets_known: Whether the length offsets are known; `longest` is infinite otherwise.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.command: Command | None = None
-        #: the last length command that was published [m], (M,), and how long ago [s]
+        #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
         self._relief: Array = np.zeros(robot.muscle_count)  # r [m]
         self.offsets_known = True
@@ -71,25 +70,28 @@ class CommandLimiter:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Limit by this robot, whose isolated muscles pull nothing, and by these settings."""
+        """Use another robot description and other settings.
+
+        In the description, isolated muscles have no tension.
+        """
         self._robot, self._settings = robot, settings
 
     @property
     def longest(self) -> Array:
-        """The length [m] that no muscle exceeds, (M,); infinite while the offsets are unknown."""
+        """Largest possible muscle lengths [m], (M,); infinite while the offsets are unknown."""
         return self.slack_length if self.offsets_known else np.full_like(self.slack_length, np.inf)
 
     def shift(self, offset: Array) -> None:
-        """Measure lengths from other offsets, by which they are less [m], (M,)."""
+        """Convert the last commands after the length offsets grew by `offset` [m], (M,)."""
         if self._last_length is not None:
             self._last_length = self._last_length[0] - offset, self._last_length[1]
         if self.command is not None and self.command.kind == LENGTH:
             self.command = Command(LENGTH, self.command.value - offset)
 
     def last(self, kind: str, sample: MuscleSample) -> Command:
-        """Return the last command, or one of this kind that demands the same of the modules.
+        """Return the last command, converted to this kind if necessary.
 
-        Before the first command: one under which the muscles go on to pull as they do.
+        Before the first command, return one that keeps the present tensions.
         """
         if self.command is None:
             command = unchanging(self._robot, kind, sample)
@@ -103,7 +105,7 @@ class CommandLimiter:
         return Command(LENGTH, self._length_demanding(self.command.value, sample))
 
     def _length_demanding(self, tension: Array, sample: MuscleSample) -> Array:
-        """Return lengths [m] (M,) that demand tensions [N] (M,), near the last ones published."""
+        """Return lengths [m] (M,) that demand tensions [N] (M,), near the last published ones."""
         robot = self._robot
         demand = np.maximum(tension, robot.tension.bias)
         length = np.minimum(sample.length, self.longest) + msc_compensation(robot, demand)
@@ -115,30 +117,30 @@ class CommandLimiter:
         return np.clip(length, before - change, before + change)
 
     def largest_change(self, kind: str, dt: float) -> Array | float:
-        """Return by how much a command may change within dt [s]: [m], or [N] (M,)."""
+        """Return the largest change of a command within dt [s]: [m], or [N] (M,)."""
         rate = self._settings.rate_limit * dt
         return rate if kind == LENGTH else rate * self._robot.stiffness
 
     def limit(
         self, desired: Command, sample: MuscleSample, tension_limit: Array, dt: float
     ) -> Command | None:
-        """Return the command that may be published, and remember it as published.
+        """Limit a command and record the result as published.
 
         Args:
-            desired: What is wanted.
+            desired: The desired command.
             sample: The newest muscle states.
-            tension_limit: Highest tension of every muscle for other reasons than its
-                `tension.limit` [N], (M,).
+            tension_limit: Tension limit of each muscle in addition to `tension.limit` [N], (M,).
             dt: Time since the last command [s].
 
         Returns:
-            The limited command, or None if it is not finite; the last one stays then.
+            The limited command. None if it is not finite; the last command then stays valid.
         """
         kind = desired.kind
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
         value = np.clip(desired.value, before - change, before + change)
-        # An isolated muscle has no limit of its own; a suspect is wound in to verify it.
+        # Use the limits of the full description: isolated muscles have a limit of 0 in `_robot`,
+        # but a suspect is wound in to verify it.
         limit = np.minimum(tension_limit, self._robot.description.tension.limit)
         if kind == TENSION:
             value = np.clip(value, self._robot.tension.bias, limit)
@@ -164,7 +166,7 @@ class CommandLimiter:
         self._relief = np.clip(relief, 0.0, depth)
         length = np.minimum(sample.length, self.longest)
         shortest = length - depth + self._relief
-        # Only a muscle that is measured to pull too hard is paid out faster than the rate limit: a
-        # length sensor alone may be wrong.
+        # The rate limit is exceeded only if the measured tension is too high: a length sensor alone
+        # may be wrong.
         too_tense = tension > robot.description.tension.limit
         return np.where(too_tense, shortest, np.minimum(shortest, before + change))

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a target posture becomes muscle lengths: the methods `proposed` and `stiffness`.
+"""Control methods that convert a target posture into muscle lengths: `proposed`, `stiffness`.
 
     proposed   l_target = ①(θ_target, T) + l_comp(T)
                T = argmin ‖T‖²  subject to  τ_target + Gᵀ T = 0,  T_bias ≤ T ≤ T_limit
 
-This searches the latent space of the network on the sheet z = ①(θ_target, T), where θ_target is
-kept by construction. As constraints, torque and limits are met first, and the least tension is
-taken of what remains. (As terms of a sum of norms, ‖T‖ can outweigh the torque balance, and then
-the arm sags.) G depends on T, so the quadratic programme is solved a few times.
+This searches the network's latent space on the manifold z = ①(θ_target, T), on which θ_target is
+kept by construction. Torque balance and tension limits are constraints and therefore take priority
+over the least tension. In a weighted sum of norms, ‖T‖ could outweigh the torque balance, and the
+arm would sag. G depends on T, so the quadratic programme is solved a few times.
 
-Muscle stiffness control holds T = T_bias + max(0, K_stiff (l − l_target)), so l_comp is how far the
-command must lie below the length for the muscle to carry T there. `stiffness` chooses T for a joint
-stiffness (`stiffness_command`). `tension` commands tensions, no lengths (`torque`). The methods
-`geometric`, `first` and `second` are those that the preset lists (`Preset.length_methods`).
+Muscle stiffness control exerts T = T_bias + max(0, K_stiff (l − l_target)). Therefore l_target lies
+below the length by |l_comp|. `stiffness` chooses T for a joint stiffness (`stiffness_command`).
+`tension` commands tensions instead of lengths (`torque`). The preset provides the methods
+`geometric`, `first` and `second` (`Preset.length_methods`).
 """
 
 from __future__ import annotations
@@ -29,41 +29,44 @@ from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
 
-# Solving again with G at the new tension changes it by well under a newton after the second.
+# A third solution with G at the new tension would change the tension by well under a newton.
 SOLVES = 2
 
-# `stiffness`
-# [N] above T_bias that a push may take from a muscle before it gives way; the widest that is held.
+# Constants of `stiffness`
+# Candidates for the margin of T_low above T_bias [N]; the largest feasible one is used. An external
+# force can reduce a muscle's tension by this margin before the muscle becomes slack.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6
-# Of the least tension against the stiffness; one within reach is missed by about this share.
+# Weight of the least tension relative to the stiffness. A reachable stiffness is missed by about
+# this share.
 LEAST_TENSION_SHARE = 1e-3
-SHARES = (1.0, 0.5, 0.25, 0.125)  # of the way to a corner; K bends down in every tension
-FAR = 1e5  # [N²] turns a quadratic programme into a linear one: its gradient outweighs distance
-LEVELS = 8  # tensions between T_bias and limit at which the elongation is read
-# [rad] for the slope of G; small against the bends of a route, large against errors of the MAE.
+SHARES = (1.0, 0.5, 0.25, 0.125)  # step lengths towards a corner; K is concave in each tension
+FAR = 1e5  # scale of the gradient that makes a quadratic programme practically linear [N²]
+LEVELS = 8  # number of tensions between T_bias and limit at which the elongation is evaluated
+# Step of the finite difference of G [rad]: small relative to changes along a route, large relative
+# to errors of the MAE.
 STEP = 0.05
 
 
 class JointStiffness(NamedTuple):
-    """Stiffness that a command is expected to bring, and what the posture allows [N·m/rad]."""
+    """Expected joint stiffness of a command, and the range that the posture allows [N·m/rad]."""
 
     expected: Array  # K_θ, (D, D)
-    lowest: Array  # least K_jj, each joint alone, (D,)
-    highest: Array  # greatest ones, (D,)
+    lowest: Array  # smallest K_jj of each joint separately, (D,)
+    highest: Array  # largest K_jj of each joint separately, (D,)
 
 
 class Solution(NamedTuple):
-    """A command and what it is expected to bring."""
+    """A command with its expected tension, missing torque and stiffness."""
 
     length: Array  # l_target [m], (M,)
     tension: Array  # T [N], (M,)
-    missing_torque: Array  # torque that no tension within its limits gives [N·m], (D,)
-    stiffness: JointStiffness | None = None  # of the method `stiffness` alone
+    missing_torque: Array  # torque that no tensions within their limits provide [N·m], (D,)
+    stiffness: JointStiffness | None = None  # only for the method `stiffness`
 
 
 class LengthCommand(Protocol):
-    """Makes one command of a target."""
+    """Computes one length command for a target."""
 
     def __call__(
         self, robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, /
@@ -71,11 +74,11 @@ class LengthCommand(Protocol):
         """Return the command.
 
         Args:
-            robot: The body, whose isolated muscles pull nothing.
+            robot: The body, in which isolated muscles have no tension.
             mae: The network.
             theta: θ_target [rad], (D,).
             torque: τ_target [N·m], (D,).
-            tension: T_const, or T as the muscles pull when the method begins [N], (M,).
+            tension: T_const, or the measured T at the start of the method [N], (M,).
         """
 
 
@@ -83,9 +86,9 @@ class LengthMethod(NamedTuple):
     """A control method that ramps to one length command and holds it.
 
     Attributes:
-        command: Makes the command.
-        takes_tension: Whether the muscles are to carry the tension that is given; it is then kept
-            below the limit.
+        command: Computes the command.
+        takes_tension: Whether the command realises the tension that is passed to it; this tension
+            is then limited.
         follows_first: Whether the method `first` runs before it.
     """
 
@@ -95,7 +98,7 @@ class LengthMethod(NamedTuple):
 
 
 def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array:
-    """Return the l_target [m] (..., M) by which T [N] (..., M) holds θ_target [rad] (..., D)."""
+    """Return l_target [m] (..., M) for θ_target [rad] (..., D) and tension T [N] (..., M)."""
     return mae.lengths(theta, tension) + msc_compensation(robot, tension)
 
 
@@ -104,8 +107,13 @@ def proposed(
 ) -> Solution:
     """Return the command of `proposed`.
 
-    For θ_target [rad] (D,) and τ_target = g(θ_target) + effort [N·m] (D,); the search starts at
-    T_current [N] (M,) and plans no tension above the limit [N], scalar or (M,).
+    Args:
+        robot: The body, in which isolated muscles have no tension.
+        mae: The network.
+        theta: θ_target [rad], (D,).
+        torque: τ_target = g(θ_target) + effort [N·m], (D,).
+        tension: T_current, from which the search starts [N], (M,).
+        limit: Highest tension that may be planned [N], scalar or (M,).
     """
     bias = robot.tension.bias
     exertion = Exertion(np.clip(tension, bias, limit), np.zeros(robot.joint_count))
@@ -116,7 +124,7 @@ def proposed(
 
 
 class StiffnessModel(NamedTuple):
-    """Joint stiffness around one posture, as the MAE sees it."""
+    """Joint stiffness around one posture according to the network."""
 
     jacobian: Array  # G [m/rad], (M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
@@ -125,7 +133,7 @@ class StiffnessModel(NamedTuple):
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Read the model off the MAE at θ (D,) and T (M,)."""
+        """Compute the model from the network at θ (D,) and T (M,)."""
 
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
@@ -136,7 +144,7 @@ class StiffnessModel(NamedTuple):
         cubic = np.empty((4, robot.muscle_count))
         for low, high in np.unique(ranges, axis=1).T:
             own = (ranges[0] == low) & (ranges[1] == high)
-            levels = np.linspace(low, max(high, low + 1.0), LEVELS)  # isolated: all 0
+            levels = np.linspace(low, max(high, low + 1.0), LEVELS)  # the range is 0 if isolated
             cubic[:, own] = np.polyfit(levels, -lengths[:, own], 3)
         slope = mae.muscle_jacobian(theta, tension)
         step = STEP * robot.kinematics.radian
@@ -153,7 +161,7 @@ class StiffnessModel(NamedTuple):
         """Return k [N/m] and dk/dT [1/m] of every muscle, each of shape (M,)."""
         square, linear, constant = self.compliance
         compliance = (square * tension + linear) * tension + constant
-        # A network may err so far that a wire seems to shorten under tension; call it rigid.
+        # Treat a tendon as rigid if the network wrongly predicts that it shortens under tension.
         slope = np.where(compliance > 0.0, 2.0 * square * tension + linear, 0.0)
         k = robot_stiffness.muscle_stiffness(self.module, np.maximum(compliance, 0.0))
         return k, -k * k * slope
@@ -178,19 +186,25 @@ def stiffness_command(
     limit: Array | float,
     near: Array | None = None,
 ) -> Solution:
-    """Return the command of `stiffness`: joint stiffness as near as possible to the desired one.
+    """Return the command of `stiffness`: the joint stiffness nearest to the desired one.
 
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
-    with K_θ of `robot/stiffness.py`, whose G, ∂²l/∂θ² and L_e(T), which is −l(θ, T) up to a
-    constant, are read by entering the MAE with ① (paper, §III-E, third: variable
-    stiffness). Tensions in the null space of Gᵀ leave the posture and stiffen the elastic units.
-    T_low lies above T_bias, because a muscle that MSC holds at T_bias is stiff in one direction
-    only. K is nearly linear in T: a few quadratic programmes around the last solution suffice.
+    K_θ is that of `robot/stiffness.py`. Its G, ∂²l/∂θ² and L_e(T) = −l(θ, T) + const come from ①
+    of the network (paper, §III-E, third: variable stiffness). Tensions in the null space of Gᵀ keep
+    the posture and stiffen the elastic elements. T_low lies above T_bias, because a muscle that MSC
+    holds at T_bias is stiff in one direction only. K is nearly linear in T, so a few quadratic
+    programmes around the last solution suffice.
 
-    Desired are diagonal entries [N·m/rad] (D,); 0 for as it comes, and what lies beyond the
-    reachable range of its joint is taken as the end of that range. Others as for `proposed`. Near
-    the T [N] (M,) of a moment ago a single round does.
+    Args:
+        robot: The body, in which isolated muscles have no tension.
+        mae: The network.
+        theta: θ_target [rad], (D,).
+        torque: τ_target [N·m], (D,).
+        desired: Desired diagonal entries of K_θ [N·m/rad], (D,). 0 leaves an entry unconstrained;
+            values beyond the reachable range of a joint are clipped to it.
+        limit: Highest tension that may be planned [N], scalar or (M,).
+        near: Tension of a moment ago [N], (M,), if there is one; then a single round suffices.
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
@@ -202,7 +216,7 @@ def stiffness_command(
     rounds = SOLVES if near is None else 1
     tension = tension if near is None else near
     model = StiffnessModel.read(robot, mae, theta, tension)
-    # Where every muscle is needed for the torque nothing is left to choose.
+    # If the torque determines all tensions, there is no freedom to choose the stiffness.
     lowest = highest = np.diag(model.joint_stiffness(tension))
     for _ in range(rounds):
         programme = TensionProgramme(model.jacobian, torque, low, high)
@@ -225,21 +239,24 @@ def stiffness_command(
 def _approach(
     model: StiffnessModel, programme: TensionProgramme, tension: Array, desired: Array
 ) -> Array:
-    """Gauss–Newton on the desired entries; the others are as they come."""
+    """Return tensions near the desired stiffness, by Gauss–Newton on the constrained entries."""
     chosen, start = desired > 0.0, tension
     for _ in range(ITERATIONS if chosen.any() else 0):
         slope = model.slope(tension)[chosen]
-        short = (desired - np.diag(model.joint_stiffness(tension)))[chosen]
+        error = (desired - np.diag(model.joint_stiffness(tension)))[chosen]
         small = LEAST_TENSION_SHARE * np.square(slope).sum(axis=1).mean()
         quadratic = slope.T @ slope + small * np.eye(len(tension))
-        tension = programme.minimum(quadratic, slope.T @ (short + slope @ tension) + small * start)
+        tension = programme.minimum(quadratic, slope.T @ (error + slope @ tension) + small * start)
     return tension
 
 
 def _extreme(
     model: StiffnessModel, programme: TensionProgramme, tension: Array, joint: int, sign: float
 ) -> float:
-    """Climb to the corner that the slope points to, as far as it improves (Frank and Wolfe)."""
+    """Return the extreme stiffness of a joint, by the Frank–Wolfe method with a line search.
+
+    `sign` is 1 for the largest and −1 for the smallest stiffness.
+    """
 
     def value(tension: Array) -> float:
         return sign * float(model.joint_stiffness(tension)[joint, joint])

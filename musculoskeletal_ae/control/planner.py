@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From targets, poses and twists to trajectories that the arm can follow.
+"""Plans trajectories that the arm can follow from targets, poses and twists.
 
-Every function returns a plan or raises a MessageError that says why there is none; nothing changes
-then. A plan keeps within the joint limits, ends where the muscles can hold the arm, and is slowed
-to what the winches can follow.
+Each method returns a plan, or raises a MessageError with the reason and changes nothing. A plan
+stays within the joint limits, ends in a holdable posture, and is slowed for the muscle modules.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-ROUNDING = 1e-6  # [rad] by which a point may lie beyond a joint limit
-SAME = 1e-6  # poses that differ by less are one
+ROUNDING = 1e-6  # distance by which a point may exceed a joint limit [rad]
+SAME = 1e-6  # poses that differ by less are equal
 
 
 class Plan(NamedTuple):
-    """A trajectory as it can be followed.
+    """A trajectory that the arm can follow.
 
     Attributes:
-        trajectory: Already slowed.
-        unreachable_reason: Why it ends elsewhere than was asked, or ''.
+        trajectory: The trajectory, already slowed.
+        unreachable_reason: Why it does not end at the requested target, or ''.
     """
 
     trajectory: Trajectory
@@ -50,28 +49,34 @@ class Planner:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Plan with this robot, whose isolated muscles pull nothing, and these settings."""
+        """Use another robot description and other settings.
+
+        In the description, isolated muscles have no tension.
+        """
         self._robot, self._settings = robot, settings
 
     @property
     def takes_nearest(self) -> bool:
-        """Whether the nearest posture is approached where the one asked for is out of reach."""
+        """Whether the arm goes to the nearest holdable posture if the target is out of reach."""
         return self._settings.unreachable == 'nearest'
 
     def to_posture(self, mae: Mae, start: Setpoint, theta: Array, duration: float) -> Plan:
-        """Plan a motion to rest at θ [rad] (D,) within a duration [s], by a way that is held."""
+        """Plan a motion to rest at θ [rad] (D,) through holdable postures.
+
+        `duration` [s] is that of each segment.
+        """
         way = reach.way(self._robot, mae, start.theta, theta)
         return Plan(self._within_limits(mae, Trajectory.to(start, way, duration)))
 
     def through(self, mae: Mae, start: Setpoint, points: Points, passed: float) -> Plan:
-        """Plan a motion through points, `passed` [s] after the time that they count from."""
+        """Plan a motion through points that started `passed` [s] ago."""
         self._check_limits(points)
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
         return Plan(planned)
 
     def to_rest(self, start: Setpoint) -> Plan:
-        """Plan to come to rest within a moment."""
+        """Plan to come to rest within `trajectory.STOPPING`."""
         return Plan(Trajectory.stopping(start, self._robot))
 
     def to_pose(self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float) -> Plan:
@@ -79,19 +84,19 @@ class Planner:
 
         Args:
             mae: The network in use.
-            start: Where the motion starts.
-            pose: Where to bring the end effector.
+            start: Setpoint from which the motion starts.
+            pose: Target pose of the end effector.
             whole: Whether the orientation counts.
-            now: When the pose came [s].
+            now: Time at which the pose was received [s].
         """
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
         towards = self._hand.towards(start, theta, self._settings.hand_speed, now)
         planned = self._within_limits(mae, towards)
         self._last_pose = pose, whole, planned
-        return Plan(planned, problem and f'{problem}; nearest approached')
+        return Plan(planned, problem and f'{problem}; going to the nearest posture')
 
     def is_under_way(self, pose: pin.SE3, whole: bool, followed: Trajectory | None) -> bool:
-        """Return whether what is followed leads to this very pose already."""
+        """Return whether the followed trajectory already leads to this pose."""
         if self._last_pose is None or followed is None:
             return False
         before, whole_before, trajectory = self._last_pose
@@ -99,24 +104,24 @@ class Planner:
         return same and trajectory is followed
 
     def repeat_pose(self, now: float) -> None:
-        """Take that the last pose came once more at `now` [s]."""
+        """Record that the last pose was received again at `now` [s]."""
         self._hand.again(now)
 
     def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
-        """Plan to move the end effector by a twist [m/s], [rad/s] (6,) for a while."""
+        """Plan to move the end effector by a twist [m/s], [rad/s] (6,) for a short time."""
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return the posture that can be held without the isolated muscles, and what θ lacks.
+        """Return a posture that is holdable without the isolated muscles, and why it is not θ.
 
         Args:
             mae: The network in use.
-            start: Where the arm is [rad], (D,).
-            theta: Where it should go [rad], (D,).
-            nearest: Whether the nearest posture that can be held will do.
+            start: Present posture [rad], (D,).
+            theta: Target posture [rad], (D,).
+            nearest: Whether to return the nearest holdable posture if θ is not holdable.
 
         Raises:
-            MessageError: If the arm cannot be held at θ and `nearest` is false.
+            MessageError: If θ is not holdable and `nearest` is false.
         """
         robot = self._robot
         if robot.used.all():
@@ -125,10 +130,10 @@ class Planner:
         if not problem:
             return theta, ''
         isolated = robot.names(robot.isolated)
-        problem = f'{problem} without {isolated}; nearest posture held: {robot.told(held)}'
+        problem = f'{problem} without {isolated}; nearest holdable posture: {robot.told(held)}'
         if not nearest:
             raise MessageError('out of reach', problem)
-        return held, f'{problem}; nearest approached'
+        return held, f'{problem}; going there'
 
     def _check_limits(self, points: Points) -> None:
         robot = self._robot
@@ -145,17 +150,18 @@ class Planner:
         )
 
     def _slowed(self, mae: Mae, planned: Trajectory) -> Trajectory:
-        """Return a trajectory as slow as the winches need.
+        """Return a trajectory slowed for the muscle modules.
 
-        A MessageError says that it then leaves the joint limits: one that is slowed and starts in
-        motion takes another way.
+        Raises:
+            MessageError: If the slowed trajectory leaves the joint limits. This can happen if it
+                starts in motion, because its path then changes.
         """
         slower = planned.scaled(slowness(self._robot, mae, planned, self._settings))
         slower.check(self._robot)
         return slower
 
     def _within_limits(self, mae: Mae, planned: Trajectory) -> Trajectory:
-        """Return a trajectory within the joint limits, which comes to rest first if it has to."""
+        """Return a slowed trajectory within the joint limits; it first comes to rest if needed."""
         try:
             return self._slowed(mae, planned)
         except MessageError:

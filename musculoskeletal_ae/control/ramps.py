@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ramps of muscle lengths: how methods with one length command, and exploration, reach a posture.
+"""Ramps of muscle lengths, by which exploration and some control methods reach a posture.
 
-A target becomes one or two goals (`second` runs `first` before it); a goal is ramped to and then
-held. The preset lists the methods (`Preset.length_methods`). Every ramp starts from the command of
-the moment, so that nothing jumps:
+These methods have one length command for each posture; the preset lists them
+(`Preset.length_methods`). A target becomes one or two goals, because `second` runs `first` before
+it. Each goal is approached by a ramp and then held. A ramp starts from the present command, so that
+the command does not jump:
 
     c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
 
-It starts and ends at rest, and all muscles arrive together. T_current is read once, when a method
-starts: read again and again, `second` would raise the tension without end.
+A ramp starts and ends at rest, and all muscles arrive together. T_current is measured only at the
+start of a method: with repeated measurements, `second` would raise the tension without bound.
 """
 
 from __future__ import annotations
@@ -28,42 +29,43 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-# Share of a movement in which the command moves; the arm settles and is sampled in the rest.
+# Share of a movement's time in which the command moves. In the remaining time the arm settles and
+# is sampled.
 RAMP_SHARE = 0.6
-PEAK = 1.5  # fastest over mean speed of a ramp
-FIRST = 'first'  # the method that is commanded T_const
+PEAK = 1.5  # ratio of peak to mean speed of a ramp
+FIRST = 'first'  # the method that uses T_const
 
 
 class Ramp:
-    """A smooth way from one command to another, both of shape (M,)."""
+    """A smooth transition from one command to another, both of shape (M,)."""
 
     def __init__(self, start: Array, goal: Array, duration: float, rate_limit: float) -> None:
-        """Plan to take `duration` [s], or longer so that no entry exceeds its rate limit [1/s]."""
+        """Plan a ramp of `duration` [s], or longer if the rate limit [1/s] requires it."""
         self._start, self._goal, self._elapsed = start.copy(), goal, 0.0
         farthest = float(np.abs(goal - start).max())
         self.duration = max(duration, PEAK * farthest / rate_limit)
 
     @property
     def done(self) -> bool:
-        """Whether the goal is reached."""
+        """Whether the ramp has ended."""
         return self._elapsed >= self.duration
 
     def step(self, dt: float) -> Array:
-        """Return the command dt seconds on."""
+        """Advance by dt [s] and return the command."""
         self._elapsed += dt
         u = 1.0 if self.done else self._elapsed / self.duration
         return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
 
 
 class Goal(NamedTuple):
-    """A posture, and the method by which it becomes lengths.
+    """A posture, and the method that converts it into lengths.
 
     Attributes:
         method: One of the preset's length methods.
         theta: θ_target [rad], (D,).
-        effort: Torque beyond holding the weight [N·m], (D,).
-        duration: How long it may take [s].
-        tension: T_const [N], (M,); None reads T_current when the goal begins.
+        effort: Torque in addition to gravity compensation [N·m], (D,).
+        duration: Duration of the movement [s].
+        tension: T_const [N], (M,); None to use T_current at the start of the goal.
     """
 
     method: str
@@ -77,22 +79,25 @@ class LengthRamps:
     """Ramps to one goal after the other, and holds the last one.
 
     Attributes:
-        solution: The command of the goal that is pursued or held, and what it is to bring.
+        solution: Solution of the present goal, or None.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.use(robot, settings)
         self._goals: list[Goal] = []
-        self._goal: Goal | None = None  # that is pursued or held
-        self._remaining = 0.0  # [s] of its time
+        self._goal: Goal | None = None  # present goal, which is approached or held
+        self._remaining = 0.0  # remaining time of the goal [s]
         self._ramp: Ramp | None = None
         self._command: Array = np.zeros(robot.muscle_count)
-        self._tension: Array = robot.tension.bias  # that the goal began with [N], (M,)
-        self._limit: Array = robot.tension.limit  # that was planned with [N], (M,)
+        self._tension: Array = robot.tension.bias  # T_const or T_current of the goal [N], (M,)
+        self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         self.solution: Solution | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Plan with this robot, whose isolated muscles pull nothing, and these settings."""
+        """Use another robot description and other settings.
+
+        In the description, isolated muscles have no tension.
+        """
         self._robot, self._settings = robot, settings
 
     def is_over_after(self, dt: float) -> bool:
@@ -100,17 +105,17 @@ class LengthRamps:
         return self._remaining - dt <= 0.0 and not self._goals
 
     def start_from(self, command: Array) -> None:
-        """Continue from a command [m] (M,), without a goal."""
+        """Continue from a command [m] (M,) and discard all goals."""
         self._command, self._ramp, self._goal = command.copy(), None, None
         self._goals, self._remaining = [], 0.0
         self.solution = None
 
     def pursue(self, goals: list[Goal]) -> None:
-        """Pursue goals one after the other, in the place of all others."""
+        """Replace the pending goals."""
         self._goals, self._remaining = list(goals), 0.0
 
     def solve_again(self) -> None:
-        """Solve the goal that is held anew, as with another network, and ramp to it."""
+        """Solve the present goal again, for example with another network, and ramp to it."""
         if self._goal is None or self._ramp is None or self._goals:
             return
         duration = self._settings.second_duration
@@ -139,7 +144,7 @@ class LengthRamps:
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
         self._tension = inputs.pull.motor if goal.tension is None else goal.tension
         self._goal, self._limit = goal, inputs.limit
-        self.solution = None  # if the next line fails there is none
+        self.solution = None  # in case the next line raises an exception
         self.solution = self._solve(goal, inputs.mae, self._tension)
         length = np.where(self._robot.used, self.solution.length, self._command)
         rate_limit = self._settings.rate_limit
@@ -155,12 +160,12 @@ class LengthRamps:
 
 
 def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
-    """Return the methods that ramp to one length command, of the preset that is set."""
+    """Return the length methods of the preset in the settings."""
     return preset_named(settings.preset).length_methods()
 
 
 class RampedTarget:
-    """The activity of holding a target by a method that ramps to one length command."""
+    """The activity of moving to a target and holding it by a length method."""
 
     def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
         self.ramps = ramps
@@ -168,16 +173,16 @@ class RampedTarget:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Hold by these settings."""
+        """Use another robot description and other settings."""
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Go to a posture [rad] (D,) and exert a torque there [N·m] (D,)."""
+        """Set the posture [rad] (D,) and the torque in addition to gravity compensation [N·m]."""
         self._target = theta, effort
         self.ramps.pursue(self._goals())
 
     def enter(self, inputs: Inputs) -> None:
-        """Begin from how the muscles pull now."""
+        """Start from the present tensions."""
         self.ramps.start_from(inputs.length)
         self.ramps.pursue(self._goals())
 
@@ -186,7 +191,7 @@ class RampedTarget:
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """End; the target stays, for the next time."""
+        """End the activity; the target is kept for the next time."""
 
     def _goals(self) -> list[Goal]:
         chosen, limits = self._settings, self._robot.tension

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the muscles can hold: whether a posture, what is nearest to one, and a way that is held.
+"""Holdability: whether a posture is holdable, the nearest holdable one, and a holdable path.
 
-All with the learned G, by the least tension within the limits. An arm that lacks a muscle falls
-where the rest cannot hold it, to a joint's stop, which then bears what they lack, and cannot simply
-go straight to where they can. `way` is the cheapest path through a roadmap of random postures,
+All functions use the learned G and the least tensions within the limits. Where the remaining
+muscles cannot hold an arm with isolated muscles, it falls until a joint's stop supports it. From
+there a straight path to a holdable posture may not exist. `way` returns the cheapest path through a
+roadmap of random postures,
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
-with what slides as if a pinion of radius RACK turned it, and tensions up to
-T_bias + USED (T_limit − T_bias), so that it leads through what is held with something to spare, if
-there is such a way, and else where the least is missing. Some of the roadmap lies where joints that
-the arm leans on stay at their stops. Edges are looked at only if the cheapest path leads along them
-(lazy roadmap, Bohlin and Kavraki 2000); until then the postures at their ends say what they cost.
+Prismatic joints count as if a pinion of radius RACK turned them. Tensions are limited to
+T_bias + USED (T_limit − T_bias), so that the path keeps a reserve if possible; otherwise it
+minimises the missing torque. In some postures of the roadmap, joints that rest at their stops stay
+there. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki
+2000); until then its cost is approximated from the postures at its ends.
 """
 
 from itertools import pairwise
@@ -23,18 +24,20 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-# Where a joint slides, [rad] below are times RACK [m], [N·m] over RACK [N].
-NOTABLE = 0.05  # [N·m] of missing torque at which a posture is not held
-HALVINGS = 6  # of the way to a posture that cannot be held
+# For prismatic joints, [rad] below are times RACK [m], and [N·m] are divided by RACK [N].
+NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
+HALVINGS = 6  # bisection steps on the way to a posture that is not holdable
 
-PRICE, USED = 20.0, 0.85  # [rad/(N·m)]; of what muscles can pull above T_bias
-POSTURES, NEIGHBOURS, LOOKS = 300, 12, 40  # of the roadmap; paths that are looked at
-SPACING = 0.15  # [rad] between the postures of an edge that are looked at
-AT_STOP, STOP = 0.05, 100.0  # [rad] from a joint's limit; [N·m] that its stop bears
+PRICE = 20.0  # cost of missing torque [rad/(N·m)]
+USED = 0.85  # share of the tension range above T_bias that a path may use
+POSTURES, NEIGHBOURS = 300, 12  # postures of the roadmap, and neighbours of each
+LOOKS = 40  # largest number of paths that are evaluated
+SPACING = 0.15  # distance between the evaluated postures of an edge [rad]
+AT_STOP, STOP = 0.05, 100.0  # largest distance from a stop [rad], and its largest torque [N·m]
 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
-    """Return which joint lacks how much torque to hold θ [rad] (D,), or ''."""
+    """Return the joint with the largest missing torque at θ [rad] (D,), or '' if θ is holdable."""
     limits, radian = robot.tension, robot.kinematics.radian
     torque = radian * robot.kinematics.holding_torque(theta)
     jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
@@ -48,9 +51,10 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
-    """Return the posture nearest to θ on the way from `start` [rad] (D,) that can be held.
+    """Return the last holdable posture on the straight path from `start` to θ [rad], (D,).
 
-    And what θ itself lacks, or ''.
+    Returns:
+        The posture, and the missing torque at θ, or '' if θ is holdable.
     """
     missing = lacking(robot, mae, theta)
     if not missing:
@@ -58,16 +62,16 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         share = 0.5 * (low + high)
-        held = not lacking(robot, mae, start + share * (theta - start))
-        low, high = (share, high) if held else (low, share)
+        is_holdable = not lacking(robot, mae, start + share * (theta - start))
+        low, high = (share, high) if is_holdable else (low, share)
     return start + low * (theta - start), f'the muscles lack {missing} there'
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
-    """Return postures that lead from `start` to θ [rad] (D,), the last of them θ, (K, D)."""
+    """Return the postures of a path from `start` to θ [rad], (K, D); the last one is θ."""
     if robot.used.all():
         return theta[None]
-    # Only here, so that an arm with all its muscles does without scipy.
+    # Import here, because an arm without isolated muscles does not need scipy.
     from scipy.sparse.csgraph import dijkstra
 
     limits, joints = robot.tension, np.eye(robot.joint_count)
@@ -76,17 +80,18 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     most = limits.bias + USED * (limits.limit - limits.bias)
 
     def missing(postures: Array) -> Array:
-        pulls = np.broadcast_to(limits.bias, (len(postures), robot.muscle_count))
-        found = []
-        for at, jacobian in zip(postures, radian * mae.muscle_jacobian(postures, pulls)):
-            # A stop is a muscle that pulls away from it.
+        tensions = np.broadcast_to(limits.bias, (len(postures), robot.muscle_count))
+        torques = []
+        for at, jacobian in zip(postures, radian * mae.muscle_jacobian(postures, tensions)):
+            # Model a stop as a muscle that pulls the joint away from it.
             low, high = at < robot.lower + at_stop, at > robot.upper - at_stop
             stops = np.vstack([-joints[low], joints[high]])
             none = np.zeros(len(stops))
             ends = np.concatenate([limits.bias, none]), np.concatenate([most, none + STOP])
             torque = radian * robot.kinematics.holding_torque(at)
-            found.append(least_tension(np.vstack([jacobian, stops]), torque, *ends).missing_torque)
-        m = np.abs(found).max(axis=1)
+            exertion = least_tension(np.vstack([jacobian, stops]), torque, *ends)
+            torques.append(exertion.missing_torque)
+        m = np.abs(torques).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
 
     def cost(one: Array, other: Array) -> float:
@@ -100,7 +105,7 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
         return theta[None]
     rng = np.random.default_rng(0)
     postures = robot.random_postures(POSTURES, rng)
-    # Where the arm leans on a stop, a part of the roadmap does as well.
+    # Keep joints that rest at a stop there in a part of the roadmap.
     for joint in range(robot.joint_count):
         for stop in (robot.lower[joint], robot.upper[joint]):
             if abs(start[joint] - stop) < at_stop[joint]:
@@ -112,7 +117,7 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
     price = np.where(near | near.T, price, 0.0)
     price[0, 1] = price[1, 0] = direct
-    looked = {(0, 1), (1, 0)}
+    evaluated = {(0, 1), (1, 0)}
     path = [0, 1]
     for _ in range(LOOKS):
         before = dijkstra(price, indices=[0], return_predecessors=True)[1][0]
@@ -120,14 +125,14 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
         while path[-1] != 0:
             path.append(int(before[path[-1]]))
         path.reverse()
-        fresh = [edge for edge in pairwise(path) if edge not in looked]
-        if not fresh:
+        new_edges = [edge for edge in pairwise(path) if edge not in evaluated]
+        if not new_edges:
             break
-        for i, j in fresh:
+        for i, j in new_edges:
             price[i, j] = price[j, i] = cost(postures[i], postures[j])
-            looked |= {(i, j), (j, i)}
+            evaluated |= {(i, j), (j, i)}
     points = postures[path]
-    # What is not needed is left out.
+    # Remove postures that do not make the path cheaper.
     k = 1
     while k < len(points) - 1:
         around = cost(points[k - 1], points[k]) + cost(points[k], points[k + 1])

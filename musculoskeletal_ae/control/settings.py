@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may choose about control: one table for the core and the node's parameters."""
+"""Settings of control: one table for the core and for the node's parameters."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -9,8 +9,8 @@ from musculoskeletal_ae.parameters import PRESET, settable
 
 UNREACHABLE = ('refuse', 'nearest')
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
-BY_TENSION = ('tension', 'float')  # which command tensions, the others lengths
-MOST_STIFFNESS = 1000.0  # [N·m/rad] that may be desired of a joint
+BY_TENSION = ('tension', 'float')  # methods that command tensions; the others command lengths
+MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/rad]
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,11 @@ class Settings:
     preset: str = replace(PRESET, settable=True).field()
     joint_stiffness: tuple[float, ...] = settable(
         (0.0,),
-        f'desired diagonal of the joint stiffness, one for each joint, at most {MOST_STIFFNESS:g} '
-        'where it turns (0 or []: as it comes)',
+        f'desired joint stiffness, one value per joint, at most {MOST_STIFFNESS:g} for revolute '
+        'joints (0 or []: unconstrained)',
         'N·m/rad or N/m',
         0.0,
-        MOST_STIFFNESS / 0.06**2,  # where it slides: RACK, which --help is not to load
+        MOST_STIFFNESS / 0.06**2,  # for prismatic joints; 0.06 is RACK, whose import is slow
     )
     first_duration: float = settable(5.0, 'movement duration', 's', 0.1, 60.0)
     second_duration: float = settable(
@@ -33,8 +33,8 @@ class Settings:
     )
     target_duration: float = settable(
         1.2,
-        'movement to a target under `proposed` and `stiffness`, longer where winches need it '
-        '(0: first_duration)',
+        'duration of a movement to a target under `proposed` and `stiffness`, longer if the muscle '
+        'modules need it (0: first_duration)',
         's',
         0.0,
         60.0,
@@ -43,51 +43,73 @@ class Settings:
         0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
     )
     rate_limit: float = settable(
-        0.1, 'fastest change of a length command (of a tension: times K_stiff)', 'm/s', 0.001, 1.0
+        0.1,
+        'largest rate of a length command (for tension commands times K_stiff)',
+        'm/s',
+        0.001,
+        1.0,
     )
     position_gain: float = settable(
         10.0,
-        'torque towards the target, method `tension` (0: torque only; over 0.06² where it slides)',
+        'position gain of method `tension` (0: none; for prismatic joints divided by 0.06²)',
         'N·m/rad',
         0.0,
         200.0,
     )
     velocity_gain: float = settable(
         0.5,
-        'damping torque, method `tension` (0: none; over 0.06² where it slides)',
+        'velocity gain of method `tension` (0: none; for prismatic joints divided by 0.06²)',
         'N·m·s/rad',
         0.0,
         20.0,
     )
     feedback_gain: float = settable(
-        0.5, 'correction of `proposed` at rest: error, needless tension (0: none)', '1/s', 0.0, 2.0
+        0.5,
+        'gain of the rest feedback of `proposed` on posture error and needless tension (0: none)',
+        '1/s',
+        0.0,
+        2.0,
     )
     hand_speed: float = settable(
-        0.25, 'fastest of the hand on its way to a single target_pose', 'm/s', 0.01, 2.0
+        0.25, 'largest speed of the hand to a single target_pose', 'm/s', 0.01, 2.0
     )
     unreachable: str = settable(
         'refuse',
-        'what is done with a target_pose out of reach, or a target out of that of the muscles left',
+        'response to a target_pose out of reach, or to a target that is not holdable without the '
+        'isolated muscles',
         legal=UNREACHABLE,
     )
     max_age: float = settable(
-        0.2, 'older muscle_states or estimated_joint_states stop the arm', 's', 0.01, 10.0
+        0.2,
+        'age of muscle_states or estimated_joint_states above which the arm stops',
+        's',
+        0.01,
+        10.0,
     )
     hold_time: float = settable(
-        0.5, 'how long a stop holds the last command; data back by then resumes', 's', 0.0, 60.0
+        0.5,
+        'time for which a stop holds the last command; the arm resumes if data returns within it',
+        's',
+        0.0,
+        60.0,
     )
     temperature_limit: float = settable(
         85.0,
-        'highest of a winding, by which muscles are limited; 20 °C more stop the arm',
+        'winding temperature to which muscle tensions are limited; 20 °C above it the arm stops',
         '°C',
         40.0,
         200.0,
     )
 
     def desired_stiffness(self, radian: Iterable[float]) -> tuple[float, ...]:
-        """Return `joint_stiffness`, one for each joint; nothing, or one 0, is all as they come.
+        """Return the desired stiffness of each joint; 0 for unconstrained joints.
 
-        `radian` is what counts as one of each joint, as in `Kinematics` [rad or m].
+        Args:
+            radian: Displacement of each joint that counts as one radian, as in `Kinematics`
+                [rad or m].
+
+        Raises:
+            MusculoskeletalError: If `joint_stiffness` has the wrong size or a value out of range.
         """
         values, most = self.joint_stiffness, [MOST_STIFFNESS / each**2 for each in radian]
         if values in ((), (0.0,)):

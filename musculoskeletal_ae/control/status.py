@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What control reports of itself: its mode, and what is in its way."""
+"""The controller's status: its mode, stop causes and warnings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.body_state import KNOWN
 
-LEAST_SHARE = 10.0  # [%] of its speed, from which on a trajectory's duration says more
+LEAST_SHARE = 10.0  # share of its speed below which a slowed trajectory's duration is reported [%]
 DOING = {
     Activity.IDLE: 'no target',
     Activity.HOLDING: 'holding',
@@ -23,15 +23,15 @@ DOING = {
     Activity.EXPLORING: 'exploring',
     Activity.CALIBRATING: 'exploring',
     Activity.TORQUE: 'holding',
-    Activity.GRAVITY_COMPENSATION: 'floating',
+    Activity.GRAVITY_COMPENSATION: 'gravity compensation',
 }
 
 
 def report(core: Controller, now: float) -> Report:
-    """Return the state that /diagnostics shows: a stop, else why it waits, else all warnings.
+    """Return the status for /diagnostics: a stop, else why control waits, else all warnings.
 
-    The values `mode` and `stop cause` are stable identifiers for programs. The message is for
-    people, and so are the values `stop`, what happened, and `remedy`, how to go on.
+    The values `mode` and `stop cause` are stable identifiers for programs. The message and the
+    values `stop` and `remedy` are texts for users.
     """
     supervisor = core.supervisor
     values = {
@@ -61,7 +61,7 @@ def report(core: Controller, now: float) -> Report:
 
 
 def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
-    """Return all warnings; add what belongs to them to the values."""
+    """Return all warnings, and add their details to `values`."""
     target, robot = core.target_state, core.robot
     warnings = []
     if target.clamped:
@@ -125,40 +125,42 @@ def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
 
 
 def _missing_torque(core: Controller) -> Array:
-    """Return what the muscles cannot exert of what is wanted [N·m], (D,)."""
+    """Return the part of the desired torque that the muscles cannot exert [N·m], (D,)."""
     activities = core.activities
-    at_work: Follower | TorqueControl | Solution | None
+    source: Follower | TorqueControl | Solution | None
     if core.is_following:
-        at_work = activities.follower
-    elif activities.entered in (activities.torque, activities.gravity_compensation):
-        at_work = (
-            activities.torque
-            if activities.entered is activities.torque
-            else activities.gravity_compensation
-        )
+        source = activities.follower
+    elif activities.entered is activities.torque:
+        source = activities.torque
+    elif activities.entered is activities.gravity_compensation:
+        source = activities.gravity_compensation
     else:
-        at_work = activities.ramps.solution
-    return np.zeros(core.robot.joint_count) if at_work is None else at_work.missing_torque
+        source = activities.ramps.solution
+    return np.zeros(core.robot.joint_count) if source is None else source.missing_torque
 
 
 def slowed(follower: Follower) -> str:
-    """Return by how much the last trajectory was slowed, or ''."""
+    """Return a text on how much the last trajectory was slowed, or ''."""
     last = follower.latest
     if last is None or last.slowed == 1.0:
         return ''
     share = 100.0 / last.slowed
     if share < LEAST_SHARE:
-        short, long = last.duration / last.slowed, last.duration
-        return f'of {short:.3g} s takes {long:.3g} s: the winches are not faster'
-    return f'slowed to {share:.0f} % of its speed for the winches'
+        requested, slowed_duration = last.duration / last.slowed, last.duration
+        return (
+            f'of {requested:.3g} s takes {slowed_duration:.3g} s because of the speed limit of '
+            'the muscle modules'
+        )
+    return f'slowed to {share:.0f} % of its speed for the muscle modules'
 
 
 def _fallen(core: Controller) -> str:
-    """Return how far from its target an arm rests that fell, and what keeps it there."""
-    mae, estimate, off, robot = core.mae, core.estimate, core.activities.follower.error, core.robot
-    assert mae is not None and estimate is not None  # it has moved
-    joint = int(np.abs(off / robot.kinematics.radian).argmax())
-    far = f'{abs(off[joint]):.2f} {robot.units[joint].theta}'
-    text = f'fallen: {robot.joints[joint]} rests {far} off its target'
+    """Return how far from its target a fallen arm rests, and the torque missing there."""
+    mae, estimate, robot = core.mae, core.estimate, core.robot
+    error = core.activities.follower.error
+    assert mae is not None and estimate is not None  # the arm has moved
+    joint = int(np.abs(error / robot.kinematics.radian).argmax())
+    distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
+    text = f'fallen: {robot.joints[joint]} rests {distance} off its target'
     missing = reach.lacking(robot, mae, estimate)
     return f'{text}, where the muscles lack {missing}; lift it by hand' if missing else text

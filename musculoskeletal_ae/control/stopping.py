@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stopped arm does: it holds, is released, and a suspect muscle may be wound in a little.
+"""Commands of a stopped arm: hold, release, and winding in a suspect muscle.
 
 The last command is held for `hold_time`, except after an overload. Then lengths are paid out at the
-rate limit until muscle stiffness control holds only T_bias, and tensions fall to T_bias at K_stiff
-times that rate.
+rate limit until muscle stiffness control demands only T_bias. Tension commands fall to T_bias at
+K_stiff times the rate limit.
 
-While a suspect is verified after an anomaly (`estimation/verification`), it is wound in once the
-others are paid out: slowly, until its tension, or what muscle stiffness control demands of it, has
-risen by `LARGEST_RISE`, or its command has fallen by `DEPTH`, whatever its sensors read.
+After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
+once the other muscles are paid out. Winding ends when its measured tension, or the tension that
+muscle stiffness control demands, has risen by `LARGEST_RISE`. It also ends when its command has
+fallen by `DEPTH`, independently of its sensors.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-PAYING_OUT = 1.5  # [s] of releasing the arm before a suspect is wound in
-LARGEST_RISE, DEPTH, SPEED = 30.0, 0.015, 0.02  # [N], [m], [m/s] of a suspect that is wound in
+PAYING_OUT = 1.5  # time for releasing the arm before a suspect is wound in [s]
+LARGEST_RISE, DEPTH, SPEED = 30.0, 0.015, 0.02  # limits for winding in a suspect [N], [m], [m/s]
 
 
 class SafeStop:
     """Commands a stopped arm.
 
     Attributes:
-        suspect: Position of the muscle that may be wound in, or None.
-        is_entered: Whether a stop goes on.
+        suspect: Index of the muscle that may be wound in, or None.
+        is_entered: Whether the arm is in a stop.
     """
 
     def __init__(self, robot: Robot, settings: Settings, limiter: CommandLimiter) -> None:
@@ -40,19 +41,19 @@ class SafeStop:
         self.leave()
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Release this robot, whose isolated muscles do not count, by these settings."""
+        """Use another robot description and other settings."""
         self._robot, self._settings = robot, settings
 
     def enter(self) -> None:
-        """Begin a stop."""
+        """Start a stop."""
         self.leave()
         self.is_entered = True
 
     def leave(self) -> None:
         """End a stop."""
         self.is_entered = False
-        self._held = 0.0  # [s]
-        self._wound_from: float | None = None  # the suspect's command before it is wound in [m]
+        self._held = 0.0  # time since the start of the stop [s]
+        self._wound_from: float | None = None  # suspect's command before it was wound in [m]
 
     @property
     def is_releasing(self) -> bool:
@@ -67,14 +68,14 @@ class SafeStop:
         may_wind: bool,
         releases_at_once: bool = False,
     ) -> Command | None:
-        """Return the desired command, dt [s] after the last one; None before the first.
+        """Return the desired command; None if no command was ever published.
 
         Args:
             sample: The newest muscle states.
-            dt: How long the stop has gone on since the last call [s].
-            is_fresh: Whether the sample still tells where the muscles are.
+            dt: Time of the stop since the last call [s].
+            is_fresh: Whether the sample is still up to date.
             may_wind: Whether the suspect may be wound in.
-            releases_at_once: Whether the last command is not to be held.
+            releases_at_once: Whether to release the arm without holding the last command.
         """
         last = self._limiter.command
         if last is None:
@@ -90,17 +91,17 @@ class SafeStop:
             and is_fresh
             and self._held > self._settings.hold_time + PAYING_OUT
         )
-        if winds:  # tensions are released by now; a suspect is wound in by its length
+        if winds:  # tensions are at T_bias now; a suspect is wound in by length commands
             last = self._limiter.last(LENGTH, sample)
         if last.kind == TENSION:
             change = self._limiter.largest_change(TENSION, dt)
             return Command(TENSION, np.maximum(self._robot.tension.bias, last.value - change))
         change = self._limiter.largest_change(LENGTH, dt)
         longest = self._limiter.longest
-        # At the measured length muscle stiffness control pulls with T_bias only. Where the length
-        # is not known, the muscle is paid out to the longest it can be.
+        # With l_target at the measured length, muscle stiffness control demands only T_bias. If the
+        # length is out of date, the muscle is paid out to its largest possible length.
         end = sample.length if is_fresh else np.maximum(sample.length, longest)
-        # What an isolated muscle reads may be anything.
+        # The length sensor of an isolated muscle may be faulty.
         end = np.where(self._robot.used, end, np.minimum(end, longest))
         value = np.minimum(last.value + change, np.maximum(end, last.value))
         if winds and self.suspect is not None:
@@ -110,7 +111,7 @@ class SafeStop:
         return Command(LENGTH, value)
 
     def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:
-        """Return the next command of the suspect [m], after `command`."""
+        """Return the suspect's next length command [m]; `command` is its last one."""
         if self._wound_from is None:
             self._wound_from = command
         length, tension, _ = sample.newest[:, muscle]

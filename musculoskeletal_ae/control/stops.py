@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every reason to stop the arm, declared once: condition, action, end, text and remedy.
+"""Declares every stop cause with its condition, action, clear condition, text and remedy.
 
-The page on stops in the documentation is generated from this table. Clients compare
-`StopCause.identifier`, which is stable; the texts are for people.
+The reference page on stops is generated from this table. Programs compare the stable
+`StopCause.identifier`; the texts are for users.
 """
 
 from __future__ import annotations
@@ -12,45 +12,45 @@ from typing import NamedTuple
 
 
 class Action(IntEnum):
-    """What the arm does in a stop; of several stops the most severe action wins."""
+    """Action of a stop; if several causes are present, the most severe action applies."""
 
-    #: keep the last command; if the stop outlasts `hold_time`, release
+    #: keep the last command; release if the stop lasts longer than `hold_time`
     HOLD = 1
     #: keep the last command for `hold_time`, then pay out until every muscle is at T_bias
     RELEASE = 2
-    #: pay out at once, until every muscle is at T_bias
+    #: pay out at once until every muscle is at T_bias
     RELEASE_AT_ONCE = 3
 
 
 class Clears(Enum):
-    """What ends a stop."""
+    """How a stop ends."""
 
-    #: the condition clears before the arm is released; afterwards only a reset
+    #: auto-recoverable until the arm is released; afterwards only by a reset
     CONDITION = 'when the condition clears within hold_time, else on controller/reset'
-    #: the estimator has verified the suspect muscle, or a reset
+    #: by the estimator's verification of the suspect muscle, or by a reset
     VERIFICATION = 'when a verification of the suspect muscle ends, else on controller/reset'
-    #: a reset by the operator
+    #: only by a reset
     RESET = 'on controller/reset'
 
 
 class Declaration(NamedTuple):
-    """What is declared of a stop cause."""
+    """Declaration of a stop cause."""
 
-    condition: str  # when it holds
+    condition: str  # when the cause is present
     action: Action
     clears: Clears
-    text: str  # what happened, for people
-    remedy: str  # what to do, in the order in which to do it
+    text: str  # what happened, for users
+    remedy: str  # what to do, in this order
 
 
 RESET = 'call controller/reset'
 REPAIR = 'repair the muscle; call estimator/reset'
 ZERO = 'call estimator/zero'
-EXPLORE = 'controller/explore explores again'
+EXPLORE = 'call controller/explore to explore again'
 
 
 class StopCause(Enum):
-    """Every reason to stop; the value is the stable identifier. Declared by severity."""
+    """All stop causes in order of severity; the value contains the stable identifier."""
 
     def __init__(self, identifier: str, declaration: Declaration) -> None:
         self.identifier = identifier
@@ -72,7 +72,7 @@ class StopCause(Enum):
             'an exception escaped the computation of a command',
             Action.RELEASE,
             Clears.RESET,
-            'fault of control',
+            'internal error of the controller',
             f'report the log; {RESET}',
         ),
     )
@@ -93,7 +93,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'unfit checkpoint',
-            f'stop whoever publishes accepted_checkpoint of another robot; {RESET}',
+            f'stop the node that publishes accepted_checkpoint of another robot; {RESET}',
         ),
     )
     NO_CHECKPOINT = (
@@ -119,11 +119,11 @@ class StopCause(Enum):
     LENGTH_OFFSETS_REVOKED = (
         'length_offsets_revoked',
         Declaration(
-            'lengths jumped or disagree with joint sensors; their offsets are not found yet',
+            'lengths jumped or disagree with joint sensors, and are not calibrated again yet',
             Action.RELEASE,
             Clears.RESET,
-            'the lengths cannot be relied on',
-            f'call estimator/zero; {RESET}; {EXPLORE}, gently until the offsets are found',
+            'the lengths are unreliable',
+            f'call estimator/zero; {RESET}; {EXPLORE}, gently until the offsets are known',
         ),
     )
     SECOND_PUBLISHER = (
@@ -134,7 +134,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'several publishers',
-            f'end the node that does not belong to this arm; {RESET}',
+            f'stop the node that does not belong to this arm; {RESET}',
         ),
     )
     IMPLAUSIBLE_MUSCLE_STATES = (
@@ -144,7 +144,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.VERIFICATION,
             'muscle_states are implausible',
-            f'check the sensor that is named, or call estimator/zero if lengths are off; {RESET}',
+            f'check the named sensor, or call estimator/zero if lengths are off; {RESET}',
         ),
     )
     IMPLAUSIBLE_ESTIMATE = (
@@ -170,7 +170,7 @@ class StopCause(Enum):
     OVERHEATED = (
         'overheated',
         Declaration(
-            'a winding is 20 °C above temperature_limit, or all are so hot that none may pull',
+            'a winding is 20 °C above temperature_limit, or heat limits all muscles to T_bias',
             Action.RELEASE,
             Clears.RESET,
             'overheated',
@@ -184,7 +184,7 @@ class StopCause(Enum):
             Action.HOLD,
             Clears.CONDITION,
             'muscle_states are too old',
-            f'check that the driver runs; {RESET}',
+            f'check that the driver is running; {RESET}',
         ),
     )
     STALE_ESTIMATE = (
@@ -194,13 +194,13 @@ class StopCause(Enum):
             Action.HOLD,
             Clears.CONDITION,
             'estimated_joint_states are too old',
-            f'check that the estimator runs; {RESET}',
+            f'check that the estimator is running; {RESET}',
         ),
     )
 
 
 class Condition(NamedTuple):
-    """A reason to stop that is present, with its details: values and names."""
+    """A stop cause that is present, with details such as values and names."""
 
     cause: StopCause
     detail: str = ''
@@ -210,7 +210,7 @@ class Condition(NamedTuple):
 
 
 def table() -> str:
-    """Return the table of stop causes as Markdown."""
+    """Return the stop causes as a Markdown table."""
     rows = ['| cause | condition | action | ends | remedy |', '|---|---|---|---|---|']
     for cause in StopCause:
         action = cause.action.name.lower().replace('_', ' ')

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from musculoskeletal_ae.control import stops, supervisor
 
 INTRODUCTION = """\
-# Why the arm stops, and what lets it go on
+# Why the arm stops, and how to continue
 
 This page is generated from the code: `python -m musculoskeletal_ae.control.stops_page > \
 doc/reference/stops.md`. While the arm is *running*, the mode that the controller reports is \
@@ -26,10 +26,10 @@ controller in `/diagnostics` name the same.
 
 ## Causes
 
-The action `hold` keeps the last command; a stop that outlasts `hold_time` releases the arm. The \
-action `release` keeps the last command for `hold_time` and then pays all muscles out until each \
-pulls with T_bias; `release at once` does not wait for `hold_time`. Of causes that begin together, \
-the first in this table is reported.
+The action `hold` keeps the last command; if the stop lasts longer than `hold_time`, the arm is \
+released. The action `release` keeps the last command for `hold_time` and then pays out all \
+muscles until each exerts T_bias; `release at once` does not wait for `hold_time`. If several \
+causes begin together, the first one in this table is reported.
 
 {table}
 """

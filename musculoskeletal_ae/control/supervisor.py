@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides what the arm does, when it stops and when it may go on. Knows nothing about muscles.
+"""The supervisor: decides what the arm does, when it stops and when it may continue.
 
-Two values say all of it. The *activity* is what the arm does, or will do again after a stop. The
-*stop state* says whether it may: `TRANSITIONS` is the complete table of its changes, and no other
-code changes it. The mode that users see follows from the two.
+It has two state variables and is independent of muscles. The *activity* is what the arm does, or
+will do after a stop. The *stop state* determines whether it may. `TRANSITIONS` is the complete
+table of changes of the stop state; no other code changes it. Both together give the mode that users
+see.
 """
 
 from __future__ import annotations
@@ -13,47 +14,47 @@ from enum import Enum
 
 from musculoskeletal_ae.control.stops import Action, Clears, Condition, StopCause
 
-RESUME = 0.2  # [s] without a cause after which a paused arm goes on
+RESUME = 0.2  # time without a cause after which a paused arm continues [s]
 
 
 class Activity(Enum):
     """What the arm does when nothing stops it."""
 
-    IDLE = 'idle'  # no target has been given
+    IDLE = 'idle'  # no target yet
     HOLDING = 'holding'
-    MOVING = 'moving'  # along a trajectory: to a target or a pose, or as one was given
+    MOVING = 'moving'  # along a trajectory
     EXPLORING = 'exploring'
     CALIBRATING = 'calibrating'  # exploring gently while the length offsets are unknown
-    TORQUE = 'torque'  # tensions are commanded (method `tension`)
-    GRAVITY_COMPENSATION = 'gravity_compensation'  # a hand moves the arm (method `float`)
+    TORQUE = 'torque'  # commanding tensions (method `tension`)
+    GRAVITY_COMPENSATION = 'gravity_compensation'  # hand guiding (method `float`)
 
 
 class StopState(Enum):
     """Whether the arm may move; the values are part of the interface."""
 
     RUNNING = 'running'
-    PAUSED = 'paused'  # for a cause that may clear by itself
+    PAUSED = 'paused'  # stopped by an auto-recoverable cause
     STOPPED = 'stopped'  # latched
     VERIFYING = 'verifying'  # stopped; a suspect muscle is wound in
-    RESUMING = 'resuming'  # the suspect is verified; the arm goes on once no cause is present
+    RESUMING = 'resuming'  # the suspect is verified; the arm continues once no cause is present
 
 
 class Event(Enum):
-    """What changes the stop state."""
+    """Events that change the stop state; the values label the diagram."""
 
-    CLEARING_CAUSE = 'a cause that may clear by itself'
+    CLEARING_CAUSE = 'an auto-recoverable cause'
     LATCHING_CAUSE = 'any other cause'
     CLEARED = 'no cause for 0.2 s'
-    RELEASED = 'hold_time is over: the arm is being released'
+    RELEASED = 'hold_time is over and the arm is released'
     SUSPECT = 'the estimator has isolated a suspect muscle'
-    SUSPECT_LOST = 'the estimator is gone, and its suspect with it'
-    VERIFIED = 'the anomaly ended by verification, and every cause clears by that'
-    VERIFIED_IN_VAIN = 'the anomaly ended by verification, and another cause needs a reset'
+    SUSPECT_LOST = 'the estimator has stopped during the verification'
+    VERIFIED = 'verification ended the anomaly, and no cause needs a reset'
+    VERIFIED_IN_VAIN = 'verification ended the anomaly, but another cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
     RESET = 'controller/reset without a cause present'
 
 
-#: activities that a latched stop ends for good, and what the arm does afterwards instead
+#: activities that a latched stop ends, and the activity that follows the stop instead
 AFTER_A_STOP = {
     Activity.MOVING: Activity.HOLDING,
     Activity.EXPLORING: Activity.IDLE,
@@ -61,7 +62,7 @@ AFTER_A_STOP = {
 }
 
 _S, _E = StopState, Event
-#: the complete table: (state, event) → state; any other event leaves the state as it is
+#: the complete table (state, event) → state; any other event has no effect
 TRANSITIONS: dict[tuple[StopState, Event], StopState] = {
     (_S.RUNNING, _E.CLEARING_CAUSE): _S.PAUSED,
     (_S.RUNNING, _E.LATCHING_CAUSE): _S.STOPPED,
@@ -82,47 +83,47 @@ TRANSITIONS: dict[tuple[StopState, Event], StopState] = {
 
 
 class Supervisor:
-    """Owns the activity and the stop of one arm.
+    """Manages the activity and the stop state of one arm.
 
     Attributes:
-        activity: What the arm does, or will do again after a stop.
-        state: Whether it may.
-        condition: The cause that is shown; None while running.
+        activity: What the arm does, or will do after a stop.
+        state: The stop state.
+        condition: The reported stop cause; None while running.
     """
 
     def __init__(self) -> None:
         self.activity = Activity.IDLE
         self.state = StopState.RUNNING
         self.condition: Condition | None = None
-        self._causes: set[StopCause] = set()  # all latching ones since the stop began
-        self._explored = False  # when the stop began
-        self._clear_for = 0.0  # [s] without a cause
+        self._causes: set[StopCause] = set()  # all latching causes since the stop began
+        self._explored = False  # whether the arm explored when the stop began
+        self._clear_for = 0.0  # time without a cause [s]
 
     @property
     def mode(self) -> str:
-        """What the arm does now: the identifier of the activity, or that of the stop state."""
+        """The mode: the identifier of the activity while running, else that of the stop state."""
         return (self.activity if self.state is StopState.RUNNING else self.state).value
 
     @property
     def is_running(self) -> bool:
-        """Whether the activity may command anything new."""
+        """Whether the activity may command the arm."""
         return self.state is StopState.RUNNING
 
     @property
     def is_latched(self) -> bool:
-        """Whether the arm is stopped and does not go on by itself."""
+        """Whether the stop is latched."""
         return self.state in (StopState.STOPPED, StopState.VERIFYING, StopState.RESUMING)
 
     @property
     def may_wind_suspect(self) -> bool:
-        """Whether a suspect muscle may be wound in; an operator's stop outranks that."""
+        """Whether a suspect muscle may be wound in; not during an operator's stop."""
         return self.state is StopState.VERIFYING and StopCause.OPERATOR not in self._causes
 
     @property
     def action(self) -> Action:
-        """What the arm does in this stop: the most severe action of all that caused it."""
-        shown = () if self.condition is None else (self.condition.cause,)
-        return max((cause.action for cause in (*self._causes, *shown)), default=Action.HOLD)
+        """The action of the present stop: the most severe one of all its causes."""
+        reported = () if self.condition is None else (self.condition.cause,)
+        return max((cause.action for cause in (*self._causes, *reported)), default=Action.HOLD)
 
     @property
     def explores(self) -> bool:
@@ -132,17 +133,20 @@ class Supervisor:
     # -- activity -------------------------------------------------------------------------------
 
     def on_request(self, activity: Activity) -> None:
-        """Do something else, during a stop after it.
+        """Change the activity; during a stop, the change takes effect after the stop.
 
-        The arm does not start to move or explore with the end of a stop: it holds its last target.
-        Nor does it explore again after the stop, once something else was requested.
+        At the end of a latched stop, the arm holds its last target; it does not start to move or
+        explore. A request during a stop also prevents an interrupted exploration from resuming.
         """
         if self.is_latched:
             activity = AFTER_A_STOP.get(activity, activity)
         self.activity, self._explored = activity, False
 
     def on_offsets(self, known: bool) -> None:
-        """Take whether the length offsets are known; while they are not, explore gently only."""
+        """Adapt the activity to whether the length offsets are known.
+
+        While they are unknown, the arm can only explore gently.
+        """
         if not known and self.activity is Activity.EXPLORING:
             self.activity = Activity.CALIBRATING
         elif known and self.activity is Activity.CALIBRATING:
@@ -151,23 +155,23 @@ class Supervisor:
             self.activity = Activity.HOLDING
 
     def on_arrival(self) -> None:
-        """Hold the end of the trajectory that was followed."""
+        """Switch to holding at the end of a trajectory."""
         if self.activity is Activity.MOVING:
             self.activity = Activity.HOLDING
 
     # -- stops ----------------------------------------------------------------------------------
 
     def on_event(self, cause: StopCause, detail: str = '') -> None:
-        """Stop for something that has happened, such as a call of controller/stop."""
+        """Stop because of a single event, such as a call of controller/stop."""
         self._take([Condition(cause, detail)])
 
     def on_conditions(self, present: Sequence[Condition], elapsed: float, released: bool) -> None:
-        """Take all causes that are present now, the most severe first.
+        """Update the stop state from all causes that are present.
 
         Args:
-            present: The causes with their details.
-            elapsed: How long the data has been as it is since the last call [s].
-            released: Whether the arm was held for `hold_time` and is being released.
+            present: The causes with their details, the most severe first.
+            elapsed: Time since the last call [s].
+            released: Whether `hold_time` is over and the arm is released.
         """
         if present:
             self._clear_for = 0.0
@@ -181,20 +185,19 @@ class Supervisor:
             self._fire(Event.RELEASED)
 
     def on_suspect(self, is_isolated: bool) -> None:
-        """Take that a suspect muscle is isolated and being verified, or that the estimator is gone.
+        """Start the verification of an isolated suspect, or end it if the estimator has stopped.
 
-        A suspect that is no longer isolated was found healthy: the verification ends with the
-        anomaly.
+        If the suspect is restored as healthy, the verification ends with the anomaly instead.
         """
         self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
 
     def on_verified(self) -> None:
-        """Take that the anomaly is over after a verification."""
+        """Resume if a verification has ended the anomaly and no cause needs a reset."""
         verifiable = all(cause.clears is Clears.VERIFICATION for cause in self._causes)
         self._fire(Event.VERIFIED if verifiable else Event.VERIFIED_IN_VAIN)
 
     def on_reset(self, present: Sequence[Condition]) -> Condition | None:
-        """End the stop, unless a cause is present; return that cause."""
+        """End the stop, or return the first cause that is still present."""
         if present:
             return present[0]
         self._explored = False
@@ -228,7 +231,7 @@ class Supervisor:
                 self.activity = Activity.EXPLORING
         elif self.is_latched:
             self.activity = AFTER_A_STOP.get(self.activity, self.activity)
-            if self.condition is not None:  # one that might have cleared by itself has latched
+            if self.condition is not None:  # an auto-recoverable cause has become latched
                 self._causes.add(self.condition.cause)
 
 

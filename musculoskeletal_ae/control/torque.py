@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tensions that exert a joint torque, moment by moment: methods `tension` and `float`."""
+"""Joint torque control by muscle tensions: methods `tension` and `float`."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-SMOOTHING = 0.05  # [s] time constant of the low pass on the estimate, which is as noisy as T and l
+SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
 
-# Gravity compensation; as of a pinion of radius RACK where a joint slides.
+# Gravity compensation; for prismatic joints, the values apply to a pinion of radius RACK.
 BAND, HOLD = 0.05, 15.0  # [rad], [N·m/rad]
 DAMPING = 1.0  # [N·m·s/rad]
 WALL, WALL_AT = 30.0, 0.05  # [N·m/rad], [rad]
@@ -26,13 +26,13 @@ class TorqueControl:
         τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
         T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
 
-    with G from the network at (θ, T) (paper, §III-E, third; Kawamura 2016). θ is the
-    estimate, smoothed. Where a joint slides, K_p and K_d are those of a pinion of radius RACK. With
-    both gains zero the arm's weight is carried and `effort` is exerted, nothing more: such an arm
-    keeps no posture.
+    G is that of the network at (θ, T) (paper, §III-E, third; Kawamura 2016), and θ is the
+    low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius RACK.
+    With both gains zero, only gravity is compensated and `effort` exerted; the arm then does not
+    keep its posture.
 
     Attributes:
-        missing_torque: What the tensions of the last step do not deliver [N·m], (D,).
+        missing_torque: Torque that the tensions of the last step do not provide [N·m], (D,).
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -43,26 +43,29 @@ class TorqueControl:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Control this robot, whose isolated muscles pull nothing, by these settings."""
+        """Use another robot description and other settings.
+
+        In the description, isolated muscles have no tension.
+        """
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Go to a posture [rad] (D,) and exert a torque beyond the weight [N·m] (D,)."""
+        """Set the posture [rad] (D,) and the torque in addition to gravity compensation [N·m]."""
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:
-        """Begin from how the muscles pull now."""
+        """Start from the present tensions."""
         self._command = np.maximum(inputs.tension, self._robot.tension.bias)
         self._smooth = None
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the tensions to command, or None without a target."""
+        """Return the tension command, or None without a target."""
         if self._target is None:
             return None
         return self._command_towards(*self._target, inputs)
 
     def leave(self) -> None:
-        """End; the target stays, for the next time."""
+        """End the activity; the target is kept for the next time."""
 
     def _command_towards(self, target: Array, effort: Array, inputs: Inputs) -> Command:
         robot, dt = self._robot, inputs.dt
@@ -75,7 +78,8 @@ class TorqueControl:
         tension, self.missing_torque = least_tension(
             jacobian, torque, robot.tension.bias, inputs.limit
         )
-        # All muscles change by the same share: between two tensions that hold the arm, it is held.
+        # Change all muscles by the same share: each tension between two that hold the arm holds it,
+        # too.
         change = tension - self._command
         fastest = robot.stiffness * self._settings.rate_limit * dt
         share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
@@ -83,21 +87,21 @@ class TorqueControl:
         return Command(TENSION, self._command.copy())
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        """Return the torque by posture and velocity [N·m], (D,)."""
+        """Return the feedback torque from posture and velocity [N·m], (D,)."""
         chosen, radian = self._settings, self._robot.kinematics.radian
         torque = chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
         return torque / radian**2
 
 
 class GravityCompensation(TorqueControl):
-    """The arm's weight is carried, and a hand moves the arm: the method `float`.
+    """Gravity compensation for hand guiding: the method `float`.
 
         τ = g(θ) + HOLD (θ_held − θ) − DAMPING dθ/dt + WALL (clip(θ) − θ)
         θ_held ← clip(θ_held, θ − BAND, θ + BAND)
 
-    The spring to θ_held, which comes along once it is stretched by BAND, acts as the friction of a
-    joint: what the model of gravity leaves does not make the arm creep. Clip is to WALL_AT inside
-    the limits.
+    A spring holds the arm at θ_held, which follows once the spring is stretched by BAND. It acts
+    like joint friction, so that errors of the gravity model do not make the arm creep. Near the
+    joint limits, a wall pushes the arm back; clip(θ) is to WALL_AT inside the limits.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -105,12 +109,12 @@ class GravityCompensation(TorqueControl):
         self.held: Array | None = None  # θ_held [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Hold where the arm is, from how the muscles pull now."""
+        """Hold the present posture, starting from the present tensions."""
         super().enter(inputs)
         self.held = None
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the tensions to command."""
+        """Return the tension command."""
         return self._command_towards(inputs.theta, np.zeros_like(inputs.theta), inputs)
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint trajectories: what is between their points, what replaces what, and slowing one down.
+"""Joint trajectories: interpolation between points, replacement, and slowing.
 
-Points are joined as joint_trajectory_controller does, by what they give:
+As in joint_trajectory_controller, the interpolation depends on the fields of the points:
 
     positions                                  straight lines: velocity jumps at the points
     positions, velocities                      cubics: velocity is continuous
     positions, velocities, accelerations       quintics: acceleration is continuous
 
-from the state that is desired at the start. Points whose time has passed are left out, the joints
-that a message does not name keep the position that they have at the start, and after the last point
-its position is held. An empty message brings the arm to rest.
+The curve begins at the setpoint at the start. Points whose time has passed are skipped. Joints that
+a message does not name keep their position at the start, and the position of the last point is
+held. An empty message brings the arm to rest.
 
-A trajectory is slowed as a whole: all its points come s times later, with velocities that are s and
-accelerations that are s² times smaller. From rest that is the same path through the joint space.
+A trajectory is slowed as a whole by a factor s: all times are multiplied by s, velocities divided
+by s and accelerations divided by s². If it starts at rest, its path stays the same.
 """
 
 from __future__ import annotations
@@ -26,12 +26,14 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
 
-BEYOND = 0.02  # [rad], or times RACK, by which the curve between points may leave the limits
-STOPPING = 0.3  # [s] in which a cancelled motion comes to rest
-SAMPLES, WITHIN = 200, 5  # of a trajectory that are looked at, and of each piece at least
-AT_ONCE = 0.01  # [s]
-RESOLUTION = 1e-11  # share of a time that there is to the next, or doubles cannot tell any between
-#: of u(τ) = Σ c_k τ^k with τ in [0, 1]: c from position, velocity, acceleration at both ends
+#: largest excess of the joint limits between points [rad]; for prismatic joints times RACK [m]
+BEYOND = 0.02
+STOPPING = 0.3  # time in which a cancelled motion comes to rest [s]
+SAMPLES, WITHIN = 200, 5  # number of evaluated moments, and their smallest number for each piece
+AT_ONCE = 0.01  # time of a point that is requested for time 0 [s]
+RESOLUTION = 1e-11  # smallest relative distance between two times that doubles can resolve
+# Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
+# and acceleration at both ends.
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
 CUBIC = np.array(
     [[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [-3, -2, 0, 3, -1, 0], [2, 1, 0, -2, 1, 0],
@@ -44,7 +46,7 @@ QUINTIC = np.array(
 
 
 class Setpoint(NamedTuple):
-    """What is desired at one moment, or at N of them: each (D,) or (N, D)."""
+    """Desired motion at one moment or at N moments; each array is (D,) or (N, D)."""
 
     theta: Array  # [rad]
     velocity: Array  # [rad/s]
@@ -57,16 +59,16 @@ class Setpoint(NamedTuple):
 
 
 class Points(NamedTuple):
-    """K points of some joints, as a message gives them; see `validity.read_trajectory`."""
+    """K points of some joints, as read from a message; see `validity.read_trajectory`."""
 
-    joints: Ints  # places in θ, (J,)
-    time: Array  # from the start [s], (K,)
+    joints: Ints  # indices in θ, (J,)
+    time: Array  # times from the start [s], (K,)
     position: Array  # (K, J)
     velocity: Array | None
     acceleration: Array | None
 
     def later(self, slower: float) -> Points:
-        """Return the same, passed so many times later and slower."""
+        """Return the points slowed by the factor `slower`."""
         velocity, acceleration = self.velocity, self.acceleration
         return self._replace(
             time=self.time * slower,
@@ -77,28 +79,30 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Curves through points, from `start` on."""
+    """A piecewise polynomial curve from `start` through points."""
 
     start: Setpoint
-    points: Points  # that are left
-    time: Array  # of the points, the first at 0 [s], (K,)
-    coefficients: Array  # of each piece, (K−1, 6, D)
-    end: Array  # what is held after the last point [rad], (D,)
-    slowed: float = 1.0  # how many times longer it takes
+    points: Points  # the remaining points
+    time: Array  # times of the knots, the first one 0 [s], (K,)
+    coefficients: Array  # coefficients of each piece, (K−1, 6, D)
+    end: Array  # posture that is held after the last point [rad], (D,)
+    slowed: float = 1.0  # factor by which the trajectory was slowed
 
     @classmethod
     def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
-        """Lead through points, `passed` [s] after the time that they count from.
+        """Return the trajectory through points that started `passed` [s] ago.
 
-        One at time 0 is gone to at once. A MessageError says that no point is left, or that two are
-        as good as at the same time.
+        A single point at time 0 is reached as fast as possible.
+
+        Raises:
+            MessageError: If no point remains, or two points are too close in time.
         """
         kept = points.time > passed + 1e-9
-        if not kept.any() and passed == 0.0:  # at once: as fast as it is slowed to
+        if not kept.any() and passed == 0.0:  # the planner slows it as far as necessary
             points = points._replace(time=points.time + AT_ONCE)
             kept = points.time >= AT_ONCE
         if not kept.any():
-            raise MessageError('all points have passed', f'{passed:.3g} s ago it began')
+            raise MessageError('all points have passed', f'it started {passed:.3g} s ago')
         velocity, acceleration = (None if part is None else part[kept] for part in points[3:])
         time, position = points.time[kept] - passed, points.position[kept]
         if ((apart := np.diff(time, prepend=0.0)) < RESOLUTION * time).any():
@@ -114,9 +118,9 @@ class Trajectory:
         every[0] = start.theta
         every[:, 0] = start
         every[0, 1:, points.joints] = points.position.T
-        for order, given in enumerate(degrees, 1):
-            if given is not None:
-                every[order, 1:, points.joints] = given.T
+        for order, values in enumerate(degrees, 1):
+            if values is not None:
+                every[order, 1:, points.joints] = values.T
         shape = LINEAR if degrees[0] is None else CUBIC if degrees[1] is None else QUINTIC
         span = np.diff(time)[:, None]
         first, last = every[:, :-1], every[:, 1:]
@@ -127,9 +131,10 @@ class Trajectory:
 
     @classmethod
     def to(cls, start: Setpoint, theta: Array, duration: float) -> Trajectory:
-        """Lead to rest at θ [rad] (D,) by a quintic, from rest the motion of least jerk.
+        """Return a quintic to rest at θ [rad], (D,) or (K, D).
 
-        Or to rest at each of some postures (K, D), each within the duration [s].
+        From rest this is a minimum-jerk motion. With K postures, the arm comes to rest at each of
+        them. `duration` [s] is the time for each posture.
         """
         path = np.atleast_2d(theta)
         (count, joints), still = path.shape, np.zeros(path.shape)
@@ -138,13 +143,14 @@ class Trajectory:
 
     @classmethod
     def stopping(cls, start: Setpoint, robot: Robot) -> Trajectory:
-        """Come to rest within a moment, where that leads."""
+        """Return a trajectory that comes to rest within `STOPPING`."""
         return cls.to(start, _halt(start, robot), STOPPING)
 
     def after_rest(self, robot: Robot) -> Trajectory:
-        """Return one through points of all joints that comes to rest before it passes them.
+        """Return a trajectory that first comes to rest and then passes through the points.
 
-        A start in motion carries a curve the farther, the longer it lasts.
+        The points have to name all joints. A slowed curve that starts in motion overshoots more if
+        it lasts longer; coming to rest first avoids that.
         """
         points, still = self.points, np.zeros((1, len(self.end)))
         time = np.append(STOPPING, STOPPING + points.time)
@@ -153,20 +159,24 @@ class Trajectory:
         return self.through(self.start, Points(points.joints, time, where, *rates))
 
     def check(self, robot: Robot) -> None:
-        """Refuse, by a MessageError, a curve that leaves the joint limits between its points."""
+        """Check that the curve stays within the joint limits between its points.
+
+        Raises:
+            MessageError: If it leaves the limits by more than `BEYOND`.
+        """
         _, theta = self.path
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
         if not np.isfinite(out).all():
-            raise MessageError('leaves the joint limits', 'its curve is too steep for a number')
+            raise MessageError('leaves the joint limits', 'the curve overflows floating point')
         beyond = out / robot.kinematics.radian
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
-            told = f'{robot.joints[j]} by {out[j]:.3g} {robot.units[j].theta}'
-            raise MessageError('leaves the joint limits', told)
+            excess = f'{robot.joints[j]} by {out[j]:.3g} {robot.units[j].theta}'
+            raise MessageError('leaves the joint limits', excess)
 
     @property
     def path(self) -> tuple[Array, Array]:
-        """Moments [s] (N,) that show each piece, and so many of all, and θ [rad] (N, D) then."""
+        """Times [s] (N,) that cover every piece, and θ [rad] (N, D) at these times."""
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
         inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
         theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)
@@ -175,11 +185,11 @@ class Trajectory:
 
     @property
     def duration(self) -> float:
-        """How long it takes [s]."""
+        """Duration of the trajectory [s]."""
         return float(self.time[-1])
 
     def sample(self, time: Array | float) -> Setpoint:
-        """Return what is desired at times [s] (N,), or at one; before and after it rests."""
+        """Return the setpoint at one time or at times (N,) [s]; outside the duration it rests."""
         inner = np.clip(np.asarray(time), 0.0, self.time[-1])
         piece = np.clip(np.searchsorted(self.time, inner, side='right') - 1, 0, len(self.time) - 2)
         span = np.diff(self.time)[piece]
@@ -194,10 +204,10 @@ class Trajectory:
         return Setpoint(theta, moving * velocity * rate, moving * acceleration * rate**2)
 
     def scaled(self, slower: float) -> Trajectory:
-        """Return one whose points come so many times later."""
+        """Return the trajectory slowed by the factor `slower`."""
         return self._joined(self.start, self.points.later(slower), self.slowed * slower)
 
 
 def _halt(start: Setpoint, robot: Robot) -> Array:
-    """Return θ [rad] (D,) where a motion comes to rest within a moment."""
+    """Return the posture [rad] (D,) where a motion comes to rest within `STOPPING`."""
     return np.clip(start.theta + 0.5 * STOPPING * start.velocity, robot.lower, robot.upper)

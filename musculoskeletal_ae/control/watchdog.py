@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which causes to stop the arm are present now, by the age of data, load and heat.
+"""The watchdog: detects stop causes from the age of data, load and temperature.
 
-`now` is a steady clock [s], on which ages run; `time` is that of the messages, by which commands
-change. Where the messages' clock is slow, as of a slow simulator, data may be older by as much, up
-to `SLOWEST`; a fast clock makes no age limit shorter. The controller's own pauses make no data old.
+`now` is the time of a steady clock [s], which determines ages. `time` is that of the messages [s],
+which determines the change of commands. If the messages' clock is slow, as in a slow simulator, the
+allowed age grows in proportion, up to 1/`SLOWEST`. A fast clock does not shorten it. Pauses of the
+controller itself do not count as age.
 """
 
 from __future__ import annotations
@@ -21,48 +22,51 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-LONGEST_STEP = 0.1  # [s]; after a pause control goes on instead of catching up
-OWN_PAUSE = 0.3  # [s] between two steps; what is longer counts for no age
-SLOWEST = 0.05  # pace of the messages' clock, of real time, below which ages grow no further
-PACE_SPAN = 1.0  # [s] over which the two clocks are compared
-OVERHEATED = 20.0  # [°C] above temperature_limit
-#: times tension.limit, and for how long [s] a tension may be higher: the limiter pays such a muscle
-#: out at once; where that does not help, the whole arm is paid out
+LONGEST_STEP = 0.1  # largest time step [s]; after a pause, control does not catch up
+OWN_PAUSE = 0.3  # longest time between two steps that counts as age [s]
+SLOWEST = 0.05  # smallest pace of the messages' clock that is compensated
+PACE_SPAN = 1.0  # time constant for comparing the two clocks [s]
+OVERHEATED = 20.0  # excess of temperature_limit at which the arm stops [°C]
+#: A tension above OVERLOAD times tension.limit for OVERLOAD_TIME [s] stops the arm. Until then, the
+#: limiter pays out only that muscle.
 OVERLOAD, OVERLOAD_TIME = 1.1, 0.2
 
 MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMATE
 
 
 class Step(NamedTuple):
-    """How much time one step of control stands for."""
+    """Duration of one step of control."""
 
     dt: float  # on the messages' clock [s]
     elapsed: float  # on the steady clock [s]
-    has_paused: bool  # whether control itself paused before: the arm may be elsewhere
+    has_paused: bool  # whether control paused before the step, so that the arm may have moved
 
 
 class DataAge:
-    """How old the data is, and how fast the messages' clock runs."""
+    """Measures the age of data and the pace of the messages' clock."""
 
     def __init__(self) -> None:
         self.stepped_at = -math.inf
         self._came_at = {MUSCLE_STATES: -math.inf, ESTIMATE: -math.inf}
-        self._time = math.nan  # of the messages at the last step [s]
-        self._asleep = 0.0  # [s] of own pauses so far
-        self.pace = 1.0  # of the messages' clock beside the steady one
+        self._time = math.nan  # time of the messages at the last step [s]
+        self._asleep = 0.0  # total time of the controller's own pauses [s]
+        self.pace = 1.0  # pace of the messages' clock relative to the steady clock
 
     def awake(self, now: float) -> float:
-        """Return the time [s] without the pauses of the controller itself."""
+        """Return the time without the controller's own pauses [s]."""
         return now - self._asleep
 
-    def received(self, what: StopCause, now: float) -> float:
-        """Note that data came whose age `what` is about; return the time since the last [s]."""
-        awake, before = self.awake(now), self._came_at[what]
-        self._came_at[what] = awake
+    def received(self, cause: StopCause, now: float) -> float:
+        """Record that data was received; return the time since the previous data [s].
+
+        `cause` is the stop cause for the age of this data.
+        """
+        awake, before = self.awake(now), self._came_at[cause]
+        self._came_at[cause] = awake
         return awake - before if before > -math.inf else 0.0
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
-        """Return which data is older than `max_age` [s]."""
+        """Return the causes of data older than `max_age` [s]."""
         allowed = max_age / min(max(self.pace, SLOWEST), 1.0)
         return [
             Condition(cause, f'older than {allowed:.3g} s')
@@ -71,11 +75,11 @@ class DataAge:
         ]
 
     def clock_jumped_back(self) -> None:
-        """Count the messages' time from here."""
+        """Restart the comparison of the clocks after a backward jump."""
         self._time, self.pace = math.nan, 1.0
 
     def step(self, now: float, time: float, is_stopped: bool) -> Step:
-        """Return how much time has passed since the last step."""
+        """Return the time since the last step."""
         elapsed, passed = max(now - self.stepped_at, 0.0), time - self._time
         if self.stepped_at == -math.inf or math.isnan(passed):
             elapsed = passed = 0.0
@@ -86,7 +90,7 @@ class DataAge:
         if counted > 0.0 and not has_jumped:
             share = 1.0 - math.exp(-counted / PACE_SPAN)
             self.pace += share * (passed / counted - self.pace)
-        # Where the messages' clock stands still for good, a stop must release the arm all the same.
+        # A stop has to release the arm even if the messages' clock stands still.
         if self.pace < SLOWEST and is_stopped:
             passed = elapsed
         dt = min(max(passed, 0.0), LONGEST_STEP)
@@ -94,25 +98,26 @@ class DataAge:
 
 
 class Overload:
-    """Which muscles pull above OVERLOAD times `tension.limit`, and for how long."""
+    """Detects muscles with tensions above OVERLOAD times `tension.limit`."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._level: Array = OVERLOAD * robot.tension.limit
-        self._since: Array = np.full(robot.muscle_count, math.inf)  # above it, since when [s]
+        #: time since when each muscle exceeds the level [s]; ∞ if it does not
+        self._since: Array = np.full(robot.muscle_count, math.inf)
 
     def take(self, tension: Array, awake: float) -> None:
-        """Take T [N] (M,), without glitches."""
+        """Take filtered tensions T [N], (M,), at the time `awake` [s]."""
         self._since = np.where(tension > self._level, np.minimum(self._since, awake), math.inf)
 
     @property
     def tense(self) -> list[str]:
-        """Names of the muscles that pull too hard, and how hard is too hard."""
+        """Names of the muscles with too much tension, and their levels."""
         each = zip(self._robot.muscles, self._level, self._since, strict=True)
         return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
 
     def conditions(self, awake: float) -> list[Condition]:
-        """Return the overload, if there is one."""
+        """Return the overload if it has lasted longer than OVERLOAD_TIME."""
         m = int(self._since.argmin())
         if awake - self._since[m] <= OVERLOAD_TIME:
             return []
@@ -122,12 +127,12 @@ class Overload:
 
 
 class HeatLimit:
-    """What the temperature of the windings lets the muscles pull.
+    """Tension limits from the temperatures of the windings.
 
     Attributes:
-        heat: The thermal model of all modules.
+        heat: The thermal model of all muscle modules.
         planned: Highest tension that may be planned for each muscle [N], (M,).
-        momentary: Highest tension that is never exceeded [N], (M,).
+        momentary: Highest tension that may be commanded to each muscle [N], (M,).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -137,20 +142,25 @@ class HeatLimit:
         self.momentary = self.planned
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
-        """Take muscle states, `elapsed` [s] after the last ones."""
-        tension = sample.newest[1]
-        # The tension that an isolated muscle reads may be anything; it is told to pull T_bias.
-        pull = np.where(robot.used, tension, robot.description.tension.bias)
-        self.heat.step(pull, sample.temperature, elapsed)
+        """Take muscle states, `elapsed` [s] after the previous ones."""
+        # The tension sensor of an isolated muscle may be faulty; its module is commanded T_bias.
+        bias = robot.description.tension.bias
+        tension = np.where(robot.used, sample.newest[1], bias)
+        self.heat.step(tension, sample.temperature, elapsed)
 
     def lower(self, highest: float, fall: Array | float) -> None:
-        """Let the limits follow the temperatures, and fall by at most so much [N]."""
+        """Update the tension limits.
+
+        Args:
+            highest: Temperature limit of the windings [°C].
+            fall: Largest decrease of the tension limits [N], scalar or (M,).
+        """
         planned, momentary = self.heat.limits(highest)
         self.planned = np.maximum(planned, self.planned - fall)
         self.momentary = np.maximum(momentary, self.momentary - fall)
 
     def conditions(self, robot: Robot, highest: float) -> list[Condition]:
-        """Return the overheating, if there is one; it lasts until all are below `highest` [°C]."""
+        """Return overheating, if present; it ends when all windings are below `highest` [°C]."""
         winding = np.fmax(self.heat.core, -np.inf)  # NaN is unknown
         m = int(winding.argmax())
         is_hot = bool(winding[m] > highest + (0.0 if self._is_overheated else OVERHEATED))
@@ -164,16 +174,16 @@ class HeatLimit:
 
 
 class Watchdog:
-    """Collects the causes that are present."""
+    """Collects the stop causes that are present."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.age, self.overload, self.heat = DataAge(), Overload(robot), HeatLimit(robot)
         self.has_checkpoint = self.has_anomaly = False
-        self.second_publisher = ''  # who publishes beside the rightful publishers
+        self.second_publisher = ''  # description of an additional publisher of a topic, or ''
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Watch this robot, whose isolated muscles do not count, by these settings."""
+        """Use another robot description and other settings."""
         self._robot, self._settings = robot, settings
 
     def take_sample(self, sample: MuscleSample, now: float) -> None:
@@ -182,11 +192,11 @@ class Watchdog:
         self.overload.take(sample.motor_tension * sample.usable, self.age.awake(now))
 
     def take_estimate(self, now: float) -> None:
-        """Take that a plausible estimate came."""
+        """Record that a plausible estimate was received."""
         self.age.received(ESTIMATE, now)
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the causes that are present now, the most severe first."""
+        """Return the stop causes that are present, the most severe first."""
         present = []
         if not self.has_checkpoint:
             present.append(Condition(StopCause.NO_CHECKPOINT))

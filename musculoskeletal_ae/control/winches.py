@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the muscle modules lag behind what muscle stiffness control demands."""
+"""Measures the lag of the muscle modules behind muscle stiffness control (MSC)."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.robot.robot import Robot
 
-WINDING = 0.03  # [m/s] from which a winch tells its lag
-LAGS = 2.0e-3  # [m²/s²] of winding that the first guess of λ, none, counts for
-LARGEST_LAG, SPAN = 0.1, 0.0095  # [s]; over which l tells how fast it winds, above its noise
+WINDING = 0.03  # winding speed above which a muscle contributes to the measurement [m/s]
+LAGS = 2.0e-3  # weight of the initial guess λ = 0 [m²/s²]
+LARGEST_LAG = 0.1  # [s]
+SPAN = 0.0095  # shortest time over which a speed is computed, so that noise is small [s]
 
 
 class Winches:
@@ -19,7 +20,7 @@ class Winches:
 
         l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
 
-    by least squares over all muscles that wind fast enough to tell.
+    The fit is by least squares over all muscles whose speed exceeds WINDING.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -29,17 +30,20 @@ class Winches:
         self._length: Array | None = None
 
     def use(self, robot: Robot) -> None:
-        """Look at the muscles that this robot uses."""
+        """Use another robot description; its isolated muscles are ignored."""
         self._robot = robot
 
     @property
     def lag(self) -> float:
-        """λ as far as it is known [s]."""
+        """The present estimate of λ [s]."""
         return min(max(self._products / self._squares, 0.0), LARGEST_LAG)
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
-        """Take l [m], T [N] (M,), `dt` [s] after the ones before, and what was commanded then."""
-        # Medians of three messages tell how it was one message ago.
+        """Take l [m] and T [N], (M,), and the length command at that time.
+
+        `dt` [s] is the time since the previous call.
+        """
+        # The values are medians of three messages, which lag by one message.
         self._since, self._last = self._since + self._last, dt
         if self._length is not None and self._since < SPAN:
             return
@@ -49,10 +53,10 @@ class Winches:
             return
         speed = (length - before) / since
         lacking = length - command + msc_compensation(self._robot, tension)
-        telling = (np.abs(speed) > WINDING) & (length > command) & self._robot.used
-        self._products -= float(lacking[telling] @ speed[telling])
-        self._squares += float(speed[telling] @ speed[telling])
+        is_usable = (np.abs(speed) > WINDING) & (length > command) & self._robot.used
+        self._products -= float(lacking[is_usable] @ speed[is_usable])
+        self._squares += float(speed[is_usable] @ speed[is_usable])
 
     def forget(self) -> None:
-        """Begin anew after a pause; λ stays."""
+        """Discard the last length after a pause; λ is kept."""
         self._length, self._since = None, 0.0

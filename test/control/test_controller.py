@@ -347,8 +347,8 @@ def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_th
     bench.configure(method='float')
     sent = bench.step(200)
     assert {command.kind for command in sent} == {TENSION}
-    assert not bench.core.supervisor.explores and bench.report().message == 'floating'
-    with pytest.raises(MessageError, match='floating'):
+    assert not bench.core.supervisor.explores and bench.report().message == 'gravity compensation'
+    with pytest.raises(MessageError, match='method float'):
         bench.target(OTHER)
     assert 'float' in bench.core.explore(True)
     for share in np.linspace(0.0, 1.0, 100):

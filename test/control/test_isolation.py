@@ -139,7 +139,7 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     way, whole = goal - THERE, NOT_THERE - THERE
     np.testing.assert_allclose(way, whole * (way @ whole) / (whole @ whole), atol=1e-9)
     bench.step()
-    assert 'nearest approached' in bench.report().message
+    assert 'nearest holdable posture' in bench.report().message
     bench.isolate([])
     bench.target(NOT_THERE)
     np.testing.assert_array_equal(bench.core.target_state.theta, NOT_THERE)
@@ -154,7 +154,7 @@ def test_exploration_is_refused_without_muscles_and_the_report_names_the_remedy(
     bench.isolate(range(ROBOT.muscle_count - 1))
     assert bench.core.explore(True) == ''
     bench.step()
-    assert 'holds too few postures; estimator/restore' in bench.report().message
+    assert 'too few postures are holdable' in bench.report().message
     bench.isolate([])
     assert 'too few' not in bench.report().message
 
@@ -413,7 +413,7 @@ def test_a_trajectory_to_a_posture_that_cannot_be_held_is_refused():
     bench.step(5)
     still = np.zeros((1, 2))
     end = Points(np.array([0, 1]), np.array([3.0]), np.array([[-1.2, -0.2]]), still, still)
-    with pytest.raises(MessageError, match='nearest posture held'):
+    with pytest.raises(MessageError, match='nearest holdable posture'):
         bench.core.trajectory(end)
     assert not bench.core.is_following
 

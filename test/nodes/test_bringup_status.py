@@ -108,7 +108,7 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     situation.diagnosed(stopped(StopCause.ANOMALY))
     assert situation.trouble() == (
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
-        'call estimator/reset; call controller/reset; controller/explore explores again)'
+        'call estimator/reset; call controller/reset; call controller/explore to explore again)'
     )
     situation.diagnosed(said('/left/estimator', finding='none'))
     situation.diagnosed(said('/left/controller', mode='holding'))

@@ -91,7 +91,7 @@ def test_a_push_moves_an_arm_in_gravity_compensation_and_is_estimated(arm):
 
     graph.wait(still, 'rest')
     assert graph.set_parameter('controller', 'method', 'float')[0]
-    arm.says('floating')
+    arm.says('gravity compensation')
     before = arm.posture()
     for _ in range(30):
         left = arm.posture()
