@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements that are not part of the product: kills, soak, timings, calibration."""
+"""Benchmarks and long tests that are not part of the package: kills, soak, timings, calibration."""
 
 import sys
 from pathlib import Path
 
-# Before numpy: it sets one BLAS thread, as everywhere else.
+# Import this before numpy, because it limits BLAS to one thread.
 import musculoskeletal_ae  # noqa: F401
 
-# Hostile networks and robots are made by the tests' own support.
+# The tests' support code creates hostile networks and robots.
 sys.path.append(str(Path(__file__).resolve().parent.parent / 'test'))

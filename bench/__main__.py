@@ -2,7 +2,7 @@
 """`python -m bench` lists the benches; `python -m bench NAME [options]` runs one.
 
 A bench is a module of this folder with a `main(argv)` that returns an exit status, or None for 0.
-What the package refuses is one line and status 1, as of a tool.
+Errors of the package are reported in one line, with status 1, like those of a tool.
 """
 
 import ast
@@ -26,7 +26,7 @@ def benches() -> dict[str, str]:
 
 
 def main(argv: list[str]) -> int:
-    """List or run; exit status 2 for a bench that there is not."""
+    """List the benches or run one; return status 2 for an unknown name."""
     listed = benches()
     if not argv or argv[0] in ('-h', '--help'):
         print(
@@ -35,12 +35,12 @@ def main(argv: list[str]) -> int:
         print('\n'.join(f'{name:<20}{line}' for name, line in listed.items()))
         return 0
     if argv[0] not in listed:
-        print(f'error: no bench {argv[0]!r}; there are: {", ".join(listed)}', file=sys.stderr)
+        print(f'error: no bench {argv[0]!r}; legal: {", ".join(listed)}', file=sys.stderr)
         return 2
     return exit_status(lambda: importlib.import_module(f'bench.{argv[0]}').main(argv[1:]))
 
 
 if __name__ == '__main__':
     replace_unprintable()
-    STOP.install(Reaction.RAISE)  # SIGTERM ends a bench, and what it started, as Ctrl-C does
+    STOP.install(Reaction.RAISE)  # SIGTERM ends a bench and its processes like Ctrl-C
     sys.exit(main(sys.argv[1:]))

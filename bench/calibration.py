@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the emulated arms are from their model: the calibration of `Spread`.
+"""Measures the deviation of emulated arms from their model: the calibration of `Spread`.
 
     python -m bench calibration [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 5]
 
-The constants of `emulator.individual.Spread` were set once, over seeds 0–9 of musashi_left_arm, so
-that on the held-out motion (5 minutes at 100 Hz, mean of ‖θ_est − θ_true‖ over all samples)
+The constants of `emulator.individual.Spread` were set once, with seeds 0–9 of musashi_left_arm, and
+are never changed to improve a result. They meet two targets on the held-out motion (5 minutes at
+100 Hz; mean of ‖θ_est − θ_true‖ over all samples):
 
-- preset `paper` before learning has an error of 0.32–0.42 rad, the paper's own starting point,
-- the oracle, least squares on the true body, is left with 0.04–0.06 rad in motion,
+- Preset `paper` before learning has an error of 0.32–0.42 rad, as at the beginning in the paper.
+- The oracle, least squares on the true body, has an error of 0.04–0.06 rad in motion.
 
-and are not touched to improve a result. Joint friction was a share of the arm's largest load, so
-that the far joints of a large body stuck; it is now a share of each joint's own, set so that its
-sum over the joints of this arm is what it was (2 % of 5.86 N·m at five joints: 0.586 N·m). The
-means were 0.043, 0.245, 0.257 and 0.402 rad before.
-
-Attachments that are 8.5 mm off in each coordinate give lengths about 5 mm off.
-It makes this table (least squares on the geometric model, without a network, and both presets
-before any learning, in rad):
+Joint friction is a share of each joint's own load. Its sum over the joints of this arm is 0.586 N·m
+(2 % of 5.86 N·m at five joints). Attachment errors of 8.5 mm in each coordinate give length errors
+of about 5 mm. The bench prints this table, with errors in rad: least squares on the geometric
+model, without a network, and both presets before any learning.
 
     seed  lengths off [mm]  oracle [rad]  least squares  default  paper
        0               4.4         0.045          0.183    0.293  0.409
@@ -53,7 +50,7 @@ EVERY = 10  # samples
 
 
 class Row(NamedTuple):
-    """Errors of one individual [rad], and how far its lengths are off [mm]."""
+    """Estimation errors [rad] and length error [mm] of one individual."""
 
     seed: int
     mismatch_mm: float
@@ -72,7 +69,7 @@ def calibration(
         robot: The geometric model.
         default: Initial network of preset `default`, which also makes the motion.
         paper: Initial network of preset `paper`.
-        seeds: Individuals.
+        seeds: Seeds of the individuals.
         minutes: Length of the motion.
     """
     rows = []
@@ -113,7 +110,7 @@ def _line(name: str, values: Sequence[float]) -> str:
 
 def main(argv: list[str]) -> None:
     """Train both presets, record the motion on every individual and print the errors."""
-    parser = Parser('calibration', 'Prints how far the emulated arms are from their model.')
+    parser = Parser('calibration', 'Prints the deviation of emulated arms from their model.')
     parser.add_robot()
     parser.add_seeds(tuple(range(10)))
     parser.add_minutes('duration of the held-out motion', 5.0)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether arms without joint sensors know how wrong they are, over many individuals.
+"""Tests the estimated covariance of arms without joint sensors, over many individuals.
 
 python -m bench covariance [--robot …] [--seeds 20,…,31] [--minutes 10] [--folder DIR]
 
-Each individual explores as the geometric model's network drives it; what its rests tell without a
-joint angle is learned at the end, in a few long updates. Printed are the error [rad] on a minute of
-motion never learned from and the share of its messages whose true angles lie in the ellipsoid of
-95 % that the network tells. Most of an error is one offset that an individual has everywhere, so
-that nearly all of a motion lies inside or outside: only the mean over individuals says something.
+Each individual explores, driven by the network of the geometric model. At the end the network
+learns from its rest samples without joint angles, in a few long updates. The bench prints the error
+[rad] on a held-out minute of motion, and the share of messages whose true angles lie in the 95 %
+confidence ellipsoid. Most of an individual's error is one constant offset, so nearly all of its
+motion lies inside or outside. Only the mean over individuals is meaningful.
 """
 
 from pathlib import Path
@@ -40,13 +40,13 @@ UPDATES, STEPS = 3, 1500
 
 
 class Never(Trainer):
-    """Training that waits."""
+    """A trainer that never updates."""
 
     ready = False
 
 
-def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: float) -> Mae:
-    """Return what an individual's rests tell without a joint angle."""
+def learned(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: float) -> Mae:
+    """Return the network learned from an individual's rest samples without joint angles."""
     learner = Learner(robot, driver, seed=seed, trainer=Never, joint_source=NONE)
     exploring = record(arm, driver, EXPLORATION_STREAM + seed, 60.0 * minutes)
     teach(learner, zip(*exploring, strict=True), lambda *_: None)
@@ -60,11 +60,13 @@ def taught(robot: Robot, driver: Mae, arm: EmulatedArm, seed: int, minutes: floa
 
 def main(argv: list[str]) -> None:
     """Print a line for each individual, and the means."""
-    parser = Parser('covariance', 'Whether arms without joint sensors know how wrong they are.')
+    parser = Parser('covariance', 'Tests the estimated covariance of arms without joint sensors.')
     parser.add_robot()
     parser.add_seeds(tuple(range(20, 32)))
     parser.add_minutes('duration of the exploration', 10.0)
-    parser.add_argument('--folder', type=Path, help='keeps the initial network for the next run')
+    parser.add_argument(
+        '--folder', type=Path, help='folder that keeps the initial network for the next run'
+    )
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
 
@@ -75,7 +77,7 @@ def main(argv: list[str]) -> None:
         driver = initial(robot, folder)
     for seed in args.seeds:
         arm = EmulatedArm(robot, seed)
-        mae = taught(robot, driver, arm, seed, args.minutes)
+        mae = learned(robot, driver, arm, seed, args.minutes)
         held_out = record(arm, driver, HELD_OUT_STREAM, HELD_OUT)
         rows.append((estimation_error(mae, held_out), ellipsoid_share(mae, held_out)))
         print(f'individual {seed}: {rows[-1][0]:.3f} rad, {rows[-1][1]:.3f} inside', flush=True)

@@ -3,20 +3,20 @@
 
     python -m bench documents [PAGE …] [--keep DIR]
 
-The commands are those of the ```sh blocks, in their order, one shell for each page. What a page
-tells its readers, it also tells this bench:
+The commands are those of the ```sh blocks, in order, with one shell for each page. The bench
+understands these marks in a page:
 
-- `Ctrl-C ends it` in the comment of a command: it runs in the background until the next such
-  command of the same script, or the end of the page. The next command starts once `bringup.sh`
-  prints its first status line.
-- `<!-- bench: skip REASON -->` above a block: the block is listed and not run.
-- `<!-- bench: ros2 -->` above a block of doc/howto/install.md: it builds the command `ros2`, and
-  runs before the first command that needs it, if there is no `ros2`.
+- `Ctrl-C ends it` in the comment of a command: the command runs in the background until the next
+  such command of the same script, or the end of the page. The next command starts when `bringup.sh`
+  has printed its first status line.
+- `<!-- bench: skip REASON -->` above a block: the block is listed but not run.
+- `<!-- bench: ros2 -->` above a block of doc/howto/install.md: the block builds the command `ros2`.
+  It runs before the first command that needs `ros2`, if there is none.
 
-`REPOSITORY` stands for a clone of what is committed here. The shell has no ROS and a home of its
-own. A page ends at its first command that fails; exit status 1 if there was one. The first page
-installs about 2 GB of wheels; all pages take about half an hour on an idle machine. On a busy one,
-`check_driver` may find gaps in the messages of the driver, as it should.
+`REPOSITORY` stands for a clone of the committed state. The shell has no ROS and a separate home. A
+page ends at its first command that fails; the exit status is then 1. The first page installs about
+2 GB of wheels, and all pages take about half an hour on an idle machine. On a busy machine,
+`check_driver` correctly reports gaps in the messages of the driver.
 """
 
 import os
@@ -100,7 +100,7 @@ def commands(page: Path) -> list[Command]:
 
 
 def _blocks(page: Path) -> list[tuple[str, str]]:
-    """Return the marks for this bench ('' without one) and the texts of the blocks of a page."""
+    """Return the mark ('' if none) and the text of each block of a page."""
     pattern = r'(?:<!-- bench: (?P<mark>[^>]*?) -->\s*)?^ *```sh\n(?P<block>.*?)^ *```'
     text = page.read_text('utf-8')
     return [(m['mark'] or '', m['block']) for m in re.finditer(pattern, text, re.S | re.M)]
@@ -159,7 +159,7 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
     ) as shell:  # fmt: skip
         for line in shell.stdout or ():
             print(line.replace(str(clone), '…').replace(str(home), '~'), end='', flush=True)
-    # The next page finds a clean clone, with what is installed.
+    # Clean the clone for the next page, but keep what is installed.
     subprocess.run(['git', 'clean', '-fdq'], cwd=clone, check=True)
     return shell.returncode == 0
 
@@ -168,7 +168,7 @@ def _parse(argv: list[str]) -> Namespace:
     parser = Parser('documents', 'Runs every command of the documents in a fresh clone.')
     parser.add_argument('pages', nargs='*', metavar='PAGE', help='default: all of them')
     parser.add_argument('--list', action='store_true', help='list the commands and run none')
-    parser.add_argument('--keep', type=Path, metavar='DIR', help='work here, and leave it')
+    parser.add_argument('--keep', type=Path, metavar='DIR', help='work in this folder, and keep it')
     return parser.parse_args(argv)
 
 

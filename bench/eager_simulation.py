@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator's step of preset `default` in plain torch, as a user of torch would write it.
+"""The simulator's step of preset `default` in plain eager torch, for comparison.
 
-The same equations as `simulation.equilibrium`, which says what they mean, for N arms in single
-precision: the network with its gradient by autograd, and all mechanics as batched tensors.
+It solves the equations of `simulation.equilibrium`, which explains them, for N arms in single
+precision. Autograd computes the gradient of the network; the mechanics are batched tensors.
 """
 
 from itertools import combinations_with_replacement
@@ -34,7 +34,7 @@ class EagerSimulation:
     """N simulated arms in torch; `state` holds tensors."""
 
     def __init__(self, ours: Simulation) -> None:
-        """Begin as ours, of preset `default`, are now, and are commanded, pushed and held."""
+        """Copy state, commands, wrenches and fixed joints of `ours` (preset `default`)."""
         robot, own = ours.robot, QuasiStatics(ours.robot)
         own.use(ours.mae, robot)
         self.network = from_mae(ours.mae)
@@ -76,7 +76,7 @@ class EagerSimulation:
             self.limbs.append((*map(torch.as_tensor, (joints, muscles, pairs)), *tables))
 
     def step(self, h: float) -> ArmState:
-        """Let h [s] pass, at most `simulation.LONGEST_STEP`."""
+        """Simulate `h` [s], at most `simulation.LONGEST_STEP`."""
         body, (theta, tension, length, followed, _, slid) = self.body, self.state
         passed = torch.exp(-body.friction * slid)
         end = passed * tension
@@ -130,7 +130,7 @@ class EagerSimulation:
         return length.detach(), torch.autograd.grad(length, angles, tension)[0]
 
     def _hold(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `load.hold` fills: (N, D) and (N, D, D)."""
+        """Return the results of `load.hold`: (N, D) and (N, D, D)."""
         tree, (placement, first, second) = self.tree, self.poses
         poses = [placement.new_tensor(np.eye(4)).expand(len(theta), 4, 4)]
         for i in range(1, len(tree.parent)):
@@ -161,7 +161,7 @@ class EagerSimulation:
         return -torque @ self.onto, -self.onto.T @ both @ self.onto
 
     def _slopes(self, theta: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what `add_slopes` adds: G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D)."""
+        """Return the terms of `add_slopes`: G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D)."""
         count, joints = theta.shape
         jacobian = theta.new_zeros(count, tension.shape[1], joints)
         curvature = theta.new_zeros(count, joints, joints)
@@ -176,7 +176,7 @@ class EagerSimulation:
         return jacobian, curvature
 
     def _turn(self, theta: Tensor, push: Tensor, matrix: Tensor, h: float) -> tuple[Tensor, Tensor]:
-        """Return θ after a step, and which joints a stop or a hand holds."""
+        """Return θ after a step, and which joints a joint limit or a hand holds."""
         low, high, most, fixed = self.body.lower, self.body.upper, JOINT_SPEED * h, self.fixed
         forced = torch.isfinite(fixed)
         held = forced | ((theta <= low) & (push < 0.0)) | ((theta >= high) & (push > 0.0))

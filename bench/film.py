@@ -6,13 +6,13 @@
 It runs `./bringup.sh --view` with `on_anomaly: isolate` and takes screenshots of the page:
 
 1. The arm explores and learns; the estimate converges to the measured arm.
-2. A click on the button "Cut" ruptures the muscle that is chosen on the page.
+2. A click on the button "Cut" ruptures the muscle that is selected on the page.
 3. The estimator isolates the muscle, and the arm moves on.
 
-Everything that the film shows came over ROS topics from the nodes of a real run; nothing is drawn
-by this program. Needs Chromium and about three minutes; a busy machine takes fewer pictures. Writes
-`view.gif` and three of its pictures: `view.png` at the end of learning, `view_rupture.png` when the
-ruptured muscle is named, and `view_isolated.png` when the arm moves on.
+All data in the film come over ROS topics from the nodes of a real run. Needs Chromium and about
+three minutes; a busy machine takes fewer pictures. Writes `view.gif` and three of its pictures:
+`view.png` at the end of learning, `view_rupture.png` when the ruptured muscle is named, and
+`view_isolated.png` when the arm moves on.
 """
 
 import io
@@ -47,12 +47,12 @@ PATIENCE = 600.0  # [s] for the start, and for what the film waits for
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
-    """Return the pictures, and which of them are kept as files of their own."""
+    """Return the pictures, and the indices of those that become separate files."""
     frames: list[Image.Image] = []
     browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
 
     def take(seconds: float, every: float, until: Callable[[str], bool] = lambda _: False) -> bool:
-        """Take pictures for a time, or until the page's text fulfils a condition."""
+        """Take pictures for a time, or until a condition on the page's text holds."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             begun = time.monotonic()
@@ -64,7 +64,7 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
         return False
 
     try:
-        # Without a graphics card, every point that is drawn costs time.
+        # Without a graphics card, the drawing time depends on the number of points.
         browser.call(
             'Emulation.setDeviceMetricsOverride',
             width=SIZE[0], height=SIZE[1], deviceScaleFactor=SCALE, mobile=False,
@@ -88,7 +88,7 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
 
 
 def write(frames: list[Image.Image], kept: dict[str, int], out: Path) -> None:
-    """Write the film with one palette for all pictures, and the pictures that are kept."""
+    """Write the film, with one palette for all pictures, and the separate pictures."""
     several = frames[:: max(1, len(frames) // 8)]
     collage = Image.new('RGB', (SCALED[0], SCALED[1] * len(several)))
     for i, frame in enumerate(several):
@@ -125,7 +125,7 @@ def main(argv: list[str]) -> int:
                     break
             else:
                 raise MusculoskeletalError('bringup.sh ended before its first status line')
-            # A pipe that nobody reads would stop the status line.
+            # Read on, because a full pipe would block the process.
             Thread(target=system.communicate, daemon=True).start()
             frames, kept = record(options, Path(folder))
         finally:

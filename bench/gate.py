@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of trust: how far healthy networks and messages are from them; which attacks are refused.
+"""Checks checkpoint validation: margins of healthy networks, and rejection of bad ones.
 
     python -m bench gate [--robot NAME|DIR] [--reality kin|foreign] [--seeds 0,1,…] [--minutes 10]
 
-For each individual and preset a learner learns of an exploring arm that carries 3.6 kg every second
-minute; every checkpoint that it publishes passes a gate that sees the arm's messages as nodes do.
-Printed are the largest of every measure over all of them beside its limit, the same of the messages
-(`signals/limits.py`), what was refused (none may be), and how many of the initial and the last
-learned networks are refused under each attack.
+For each individual and preset, a learner learns from an exploring arm that carries 3.6 kg every
+second minute. Each published checkpoint is validated on the messages of the arm. The bench prints:
+
+- the largest value of each measure over all networks and its limit, and the same for messages
+  (`signals/limits.py`),
+- the networks that were refused (there should be none),
+- how many initial and final networks are refused after each attack on them.
 
 Exit status 1 if a healthy network was refused, or an attack was not.
 """
@@ -54,7 +56,7 @@ MESSAGES = {
 
 
 def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, float]:
-    """Return the largest of MESSAGES over a recording, θ_est by `mae`."""
+    """Return the largest value of each measure in MESSAGES over a recording; θ_est is by `mae`."""
     theta = mae.estimate(end_tensions(mae, stream), stream.length).theta
     values = (
         np.abs(np.diff(stream.length, axis=0)).max(),
@@ -65,15 +67,15 @@ def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, flo
 
 
 class Spread:
-    """The largest of every measure over networks, and what was refused of them."""
+    """The largest value of each measure over networks, and the refused networks."""
 
     def __init__(self) -> None:
-        """Nothing yet."""
+        """Begin without networks."""
         self.most: defaultdict[str, float] = defaultdict(float)
         self.least_cut, self.refused, self.count = np.inf, list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
-        """Measure a network, and try it."""
+        """Measure and validate a network."""
         self.count += 1
         values = {key: share.max() for key, share in filter(None, gate.posture_errors(mae))}
         left = gate.message_errors(mae)
@@ -93,7 +95,7 @@ class Spread:
 
 
 def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: Spread) -> Mae:
-    """Let a learner learn of one individual, each of its checkpoints through a gate; the last."""
+    """Learn one individual, validate each checkpoint, and return the last network."""
     robot, gate = arm.robot, CheckpointValidator(arm.robot)
 
     def script(arm: Arm, time: float) -> None:
@@ -123,7 +125,7 @@ def limit(name: str) -> float:
 
 
 def main(argv: list[str]) -> int:
-    """Measure, attack and print."""
+    """Run the bench; return the exit status."""
     parser = Parser(
         'gate', "Prints healthy networks' distance from the gate's limits, and attacks."
     )
@@ -146,7 +148,7 @@ def main(argv: list[str]) -> int:
     print(f'{spread.count} healthy networks: largest of each measure, limit')
     for name, value in spread.most.items():
         print(f'  {name:<45}{value:10.4g}{limit(name):10.4g}')
-    print(f'  {"d with a muscle cut (smallest)":<45}{spread.least_cut:10.4g}{LEAST_CUT:10.4g}')
+    print(f'  {"d with a ruptured muscle (smallest)":<45}{spread.least_cut:10.4g}{LEAST_CUT:10.4g}')
     print('\n'.join(['refused:', *(spread.refused or ['none'])]))
     failed = bool(spread.refused)
     for attack, change in ATTACKS.items():

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports other people's robots, says how far lengths are from the source's own, and learns them.
+"""Imports public robot models, compares muscle lengths with the source, and learns the robots.
 
     python -m bench importing FILE… [--out DIR] [--learn [--minutes 10]]
 
-The files are public models that you have fetched; nothing of them is part of this repository. For
-each it prints one row: joints, muscles, how many of them wrap, the largest and the median length
-error over 1000 postures (nan: it has no lengths of its own), the largest error of a moment arm over
-200, how many muscles have one of wrong sign there, and what `check_robot` says of 100.
-With --learn an individual of each is learned by the experiments `online_learning` and `control`,
-and the row goes on with the error of the estimate on the held-out motion before and after, beside
-the oracle's (mean norms over the joints), and how far `proposed` leaves the arm from its targets.
-An arm that holds itself in no posture has no targets: then the cell says why.
+The files are public models that you have downloaded; none is part of this repository. The bench
+prints one row for each file:
+
+- the numbers of joints, muscles, and wrapping muscles,
+- the largest and the median length error over 1000 postures (nan: the source has no lengths),
+- the largest moment arm error over 200 postures, and the number of muscles with a wrong sign there,
+- the verdict of `check_robot` over 100 postures.
+
+With --learn, the experiments `online_learning` and `control` learn an individual of each robot. The
+row then continues with the estimation error on the held-out motion before and after learning, that
+of the oracle (mean norms over the joints), and the target error of `proposed`. If the arm cannot
+hold any posture, it has no targets, and the cell gives the reason.
 """
 
 import tempfile
@@ -36,7 +40,7 @@ LEARNED = ('before [rad]', 'after', 'oracle', '`proposed`')
 
 
 def row(file: Path, out: Path, minutes: float | None) -> list[str]:
-    """Import one file, learn it if for minutes, and return the cells of its row."""
+    """Import one file, learn the robot if `minutes` is given, and return the cells of its row."""
     name = f'{file.parent.name}/{file.name}'
     try:
         robot, notes, comparison = import_robot(file, out)
@@ -54,7 +58,7 @@ def row(file: Path, out: Path, minutes: float | None) -> list[str]:
 
 
 def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
-    """Return the cells of what is learned of an individual."""
+    """Learn an individual, and return the cells of its results."""
     study = Study(robot, 'default', (INDIVIDUAL,), minutes, quick=False, folder=out)
     for preset in PRESETS:
         online_learning.train_initial(study, preset)
@@ -73,7 +77,7 @@ def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
 
 def main(argv: list[str]) -> None:
     """Print the table."""
-    parser = Parser('importing', 'Imports public models that you have fetched.')
+    parser = Parser('importing', 'Imports public models that you have downloaded.')
     parser.add_argument('files', nargs='+', type=Path, metavar='FILE')
     parser.add_argument('--out', type=Path, metavar='DIR', help='keep the robot directories here')
     parser.add_argument('--learn', action='store_true', help='learn an individual of each')

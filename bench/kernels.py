@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the tests with the arithmetic of other machines: every BLAS kernel, every torch kernel.
+"""Runs the tests with the arithmetic of other processors: all BLAS and torch kernels.
 
-Other processors pick other kernels, which sum in another order. No test may hang on the last bits:
-each combination that this processor can run must pass, whatever it picks by itself.
+Other processors select other kernels, which sum in another order. No test may depend on the last
+bits. Tests must therefore pass with each combination of kernels that this processor can run.
 """
 
 import itertools

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills a learner with SIGKILL at random moments and looks at what is on its disk afterwards.
+"""Kills a learner with SIGKILL at random moments, and checks its saved state.
 
 python -m bench kills [--kills 50] [--seed 0]
 
-A child process runs the `Learner` that the node runs, with its training process, on samples that a
-seed draws, and says when it has accepted a sample and published a network. After each kill the next
-child must have every sample that was accepted and a network no older than the last one published.
-Exit status 1 if something was lost.
+A child process runs the `Learner` of the node, with its training process, on random samples. It
+reports each accepted sample and each published network. After a kill, the next child must have all
+accepted samples, and a network that is not older than the last published one. Exit status 1 if
+anything was lost.
 """
 
 import argparse
@@ -30,14 +30,14 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-LONGEST = 6.0  # [s] until a child is killed: it starts, trains and saves within
+LONGEST = 6.0  # [s] latest kill; a child starts, trains and saves within this time
 SPACING = 0.02  # [s] between samples
-STEPS = 20  # of training per update: many updates, many moments to be killed in
-DEADLINE = 60.0  # [s] for a child to come up
+STEPS = 20  # of training per update; short updates give many states to be killed in
+DEADLINE = 60.0  # [s] for a child to start
 
 
 def samples(robot: Robot, life: int) -> Iterator[Sample]:
-    """Draw the samples of one child's life."""
+    """Draw the samples of one child process."""
     rng = np.random.default_rng([life, 0x51])
     while True:
         theta = robot.random_postures(1, rng)[0]
@@ -47,7 +47,7 @@ def samples(robot: Robot, life: int) -> Iterator[Sample]:
 
 
 def digest(store: SampleStore) -> int:
-    """Return a checksum of all that is stored, in order."""
+    """Return a checksum of all stored samples, in order."""
     sums = [zlib.crc32(np.concatenate(sample[:6]).tobytes()) for sample in store.samples]
     return zlib.crc32(np.array(sums, dtype=np.uint32).tobytes())
 
@@ -78,10 +78,10 @@ def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
 
 
 class Child:
-    """One life, and what it said."""
+    """One child process and its reports."""
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
-        """Start it."""
+        """Start the process."""
         words = [sys.executable, '-m', 'bench', 'kills', '--robot', str(robot)]
         words += ['--live', str(life), '--directory', str(directory), '--initial', str(initial)]
         self._process = subprocess.Popen(
@@ -95,37 +95,37 @@ class Child:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            # Without its end, a line was torn by the kill, and what it says was not said.
+            # A line without an end was interrupted by the kill and does not count.
             if line.endswith('\n'):
                 self.lines.append(line.split())
                 if line.startswith('found'):
                     self.up.set()
 
     def kill(self) -> None:
-        """End it as a power cut would."""
+        """End the process by SIGKILL."""
         self._process.kill()
         self._process.wait()
         self._reader.join()
 
     def trouble(self) -> str:
-        """Return what it wrote to stderr."""
+        """Return the process's stderr."""
         assert self._process.stderr is not None
         return self._process.stderr.read()
 
     def said(self, word: str) -> list[int]:
-        """Return the numbers that followed a word."""
+        """Return the numbers that were reported after a word."""
         return [int(line[1]) for line in self.lines if line[0] == word and len(line) > 1]
 
     @property
     def accepted(self) -> int:
-        """How many samples it accepted."""
+        """Number of samples that the process has accepted."""
         return sum(line[0] == 'accepted' for line in self.lines)
 
 
 def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> list[str]:
-    """Kill so many children one after another; returns what was lost."""
+    """Kill `kills` children one after another; return what was lost."""
     rng = np.random.default_rng(seed)
-    # What may be on disk: a sample can be there before the child could say so.
+    # States that may be on disk: a sample may be saved before the child can report it.
     possible = [SampleStore()]
     lost: list[str] = []
     newest, published = 0, 0
@@ -133,7 +133,7 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
         last = life == kills
         child = Child(robot.description.directory, directory, initial, life)
         begun, wanted = time.monotonic(), rng.uniform(0.0, LONGEST)
-        # Some are killed while they come up; the last has to.
+        # Earlier children may be killed while they start; the last one must start.
         if last or wanted > 0.5 * LONGEST:
             child.up.wait(DEADLINE)
         time.sleep(max(0.0, begun + wanted - time.monotonic()))
@@ -157,7 +157,7 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
 
 
 def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[SampleStore]:
-    """Return the store after a life, without and with one sample more than was said."""
+    """Return the store after one child, with the reported samples and with one more."""
     drawn = samples(robot, life)
     for _ in range(accepted):
         store.add(next(drawn))
@@ -167,12 +167,12 @@ def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[Sa
 
 
 def main(argv: list[str]) -> int:
-    """Kill, and say what was lost."""
+    """Run the bench; return the exit status."""
     parser = Parser('kills', 'Kills a learner at random moments: is anything lost?')
     parser.add_robot(default='arm26')
-    parser.add_argument('--kills', type=int, default=50, help='how many')
+    parser.add_argument('--kills', type=int, default=50, help='number of kills')
     parser.add_seed('of the moments')
-    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
+    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
     parser.add_argument('--live', type=int, help=argparse.SUPPRESS)
     parser.add_argument('--directory', type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Individuals that were learned, kept in a folder for the benches that start from one."""
+"""Learned individuals, cached in a folder for the benches that start from one."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -21,17 +21,17 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-SELDOM, STEPS = 20.0, 400  # [s] of news between updates, and their steps: as good, and cheaper
+SELDOM, STEPS = 20.0, 400  # [s] between updates, steps of each: as accurate as the node, and faster
 
 
 class Seldom(Trainer):
-    """Training that waits for more news than the node's."""
+    """A trainer that updates less often than that of the node."""
 
     _asked = 0
 
     @property
     def ready(self) -> bool:
-        """Whether there was news for long enough."""
+        """Whether enough new data have arrived."""
         self._asked += 1
         if self._asked < SELDOM / SAMPLE_TIME or not super().ready:
             return False
@@ -40,10 +40,10 @@ class Seldom(Trainer):
 
 
 class LearnedArm(NamedTuple):
-    """An individual's network, the one that drives it, and what it was learned from."""
+    """An individual's network, the network that drives it, and the data that it learned from."""
 
     mae: Mae
-    driver: Mae  # of the geometric model
+    driver: Mae  # network of the geometric model
     exploring: Recording
 
 

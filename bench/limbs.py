@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes bodies of several limbs out of musashi_left_arm: how config/musashi_upper_body was written.
+"""Builds bodies of several limbs from musashi_left_arm; config/musashi_upper_body is one of them.
 
     python -m bench limbs [BODY] DIR
 
-BODY is one of BODIES below. An arm is musashi_left_arm, mirrored on the right; it may have a wrist
-of two joints and a number of wires, and a neck of three joints and twelve wires stands on the
-torso. Every number is chosen. Pairs beyond the first hang below it, on the same torso.
+BODY is one of BODIES below. An arm is musashi_left_arm, mirrored on the right side. It may have a
+wrist of two joints with several tendons. A neck of three joints and twelve tendons stands on the
+torso. Further pairs of arms hang below the first, on the same torso. All numbers are chosen, not
+measured.
 """
 
 import csv
@@ -19,7 +20,7 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.description import refusal
 from musculoskeletal_ae.robot.directories import find_robot
 
-#: limbs of each body: wires of an arm's wrist (0: no wrist), 'neck', or 'held' (an arm of 4 joints)
+#: limbs: number of tendons of an arm's wrist (0: no wrist), 'neck', or 'held' (an arm of 4 joints)
 BODIES: dict[str, tuple[int | str, ...]] = {
     '5x10': (0,),
     '7x14': (4,),
@@ -38,7 +39,7 @@ WRIST = """<r>
   <joint name="wrist_deviation" type="revolute"><parent link="carpus"/><child link="hand"/>
     <origin xyz="0 0 0"/><axis xyz="0 1 0"/>
     <limit lower="-0.45" upper="0.45" effort="8" velocity="6"/></joint></r>"""
-#: wires: name, their angle round the forearm [degrees] from the front towards the left, by number
+#: by number of tendons: name, and angle round the forearm [degrees] from the front towards the left
 WRIST_WIRES = {
     4: {'extensor_carpi_radialis': 45, 'extensor_carpi_ulnaris': 135,
         'flexor_carpi_ulnaris': 225, 'flexor_carpi_radialis': 315},
@@ -65,7 +66,7 @@ NECK = """<r>
     <inertia ixx="0.010" ixy="0" ixz="0" iyy="0.010" iyz="0" izz="0.007"/></inertial>
     <visual><origin xyz="0.01 0 0.09"/><geometry><sphere radius="0.085"/></geometry></visual></link>
   </r>"""
-#: wire: (angle [degrees] from the front towards the left, radius [m], height [m]) on torso and head
+#: tendon: (angle [degrees] from front to left, radius [m], height [m]) on torso and head
 NECK_WIRES = {
     'sternocleidomastoid': ((4, 0.099, 0.032), (109, 0.070, 0.045)),
     'scalene': ((58, 0.077, 0.068), (25, 0.069, -0.020)),
@@ -74,25 +75,25 @@ NECK_WIRES = {
     'splenius': ((154, 0.072, 0.035), (95, 0.070, 0.019)),
     'semispinalis': ((143, 0.070, 0.031), (104, 0.060, 0.050)),
 }
-#: muscle, joint, sign: what the added wires are meant to do, as in moment_arms.csv
+#: muscle, joint, sign: intended effect of the added tendons, as in moment_arms.csv
 WRIST_SIGNS = [('extensor', 'wrist_flexion', '+'), ('flexor', 'wrist_flexion', '-')]
 Muscle = dict[str, Any]
 
 
 def mirrored(value: str) -> str:
-    """Return the text of a vector on the other side of the body."""
+    """Return the text of a vector, mirrored to the other side of the body."""
     x, y, z = map(float, value.split())
     return f'{x:g} {0.0 - y:g} {z:g}'
 
 
 def on_ring(angle: float, radius: float, height: float) -> list[float]:
-    """Return a point [m]; the angle [degrees] counts from the front towards the left."""
+    """Return a point [m] on a ring; the angle [degrees] is from the front towards the left."""
     at = radians(angle)
     return [round(radius * cos(at), 4), round(radius * sin(at), 4), height]
 
 
 class Body:
-    """A body that is put together limb by limb, and then written."""
+    """A body that is assembled limb by limb and then written."""
 
     def __init__(self, name: str, arm: Path) -> None:
         """Begin with the torso of a robot directory that describes a left arm."""
@@ -110,7 +111,7 @@ class Body:
         self.muscles, self.signs = list[Muscle](), list[tuple[str, ...]]()
 
     def add_arm(self, number: int, wires: int | str) -> None:
-        """Add an arm, an odd number on the right."""
+        """Add an arm; odd numbers are on the right."""
         right, pair = number % 2, number // 2
         prefix = ('left_', 'right_')[right] + (f'{pair + 1}_' if pair else '')
         held, wires = ('elbow_yaw' if wires == 'held' else ''), wires if wires != 'held' else 0
@@ -130,7 +131,7 @@ class Body:
                     element.set('xyz', mirrored(element.get('xyz', '')))
                     r, p, y = map(float, element.get('rpy', '0 0 0').split())
                     element.set('rpy', f'{-r:g} {p:g} {-y:g}')
-                if right and element.tag == 'axis':  # turns the other way in a mirror
+                if right and element.tag == 'axis':  # mirroring reverses the rotation
                     x, y, z = map(float, element.get('xyz', '').split())
                     element.set('xyz', f'{0.0 - x:g} {y:g} {0.0 - z:g}')
             base = part.find("parent[@link='torso']")

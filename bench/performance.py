@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes doc/performance.md: core steps, the running system, starts, memory and learning times.
+"""Writes doc/performance.md: core steps, the running system, start-up, memory and learning times.
 
     python -m bench performance [--seconds 20] [--late 600] [--flames] --out doc
 
-Times hold for the machine and the day that the page names, which should have nothing else to do.
-`--flames` draws, by py-spy, where each node spends its time at 200 Hz, as OUT/flames/NODE.svg.
+Times hold for the machine and the day that the page names; the machine should be idle otherwise.
+`--flames` draws a flame graph of each node at 200 Hz by py-spy, as OUT/flames/NODE.svg.
 """
 
 import os
@@ -33,10 +33,10 @@ from musculoskeletal_ae.robot.robot import Robot
 ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
-EXPLORING = 60.0  # [s] that samples of an update come from
+EXPLORING = 60.0  # [s] of exploration for the samples of an update
 FLAME_RATE, STARTING, SETTLING = 200.0, 60.0, 15.0  # [Hz], [s], [s]
 
-#: what the first version that was measured (commit be0daee) took on an idle machine of two cores
+#: times of the first measured version (commit be0daee) on an idle machine with two cores
 BEFORE_CORE = {
     'estimate: θ, T, l from ②': 19.0, 'control solve: proposed, default': 380.0,
     'control solve: proposed, paper': 530.0, 'simulation step': 150.0,
@@ -110,7 +110,7 @@ def rows(head: str, lines: Iterable[Iterable[object]]) -> str:
 
 
 def core(measured: Iterable[timings.Timed]) -> str:
-    """Return the table of the core's steps."""
+    """Return the table of core steps."""
     said = []
     for row in measured:
         ratio = f'{row.torch_eager / row.ours:.1f}' if row.torch_eager else ''
@@ -121,7 +121,7 @@ def core(measured: Iterable[timings.Timed]) -> str:
 
 
 def wire(seconds: float) -> dict[tuple[str, float, str], Wire]:
-    """Measure the running system; return what it did, by robot, rate and kind of nodes."""
+    """Measure the running system; return the results by robot, rate and kind of nodes."""
     return {
         (robot, rate, kind): found
         for robot in SIZES
@@ -136,7 +136,7 @@ def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
     said = []
     for (robot, rate, kind), found in measured.items():
         latency = ' / '.join(f'{value:.1f}' for value in found.latency)
-        # Those were measured with the learner, at 500 Hz without.
+        # The earlier values were measured with the learner, except those at 500 Hz.
         same = 'nodes' if rate == max(RATES) else 'with learner'
         known = BEFORE_WIRE[rate] if (robot, kind) == (ARM, same) else ('', '')
         lost = f'{found.late:.1f}', f'{found.missed:.1f}'
@@ -150,7 +150,7 @@ def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
 
 
 def goals(numbers: dict[str, tuple[float, str, float]]) -> str:
-    """Return the table of goals: what is measured of each, ≤ or ≥ what."""
+    """Return the table of goals: measured value, ≤ or ≥, and limit of each."""
     said = []
     for name, (value, sign, limit) in numbers.items():
         met = value <= limit if sign == '≤' else value >= limit
@@ -159,7 +159,7 @@ def goals(numbers: dict[str, tuple[float, str, float]]) -> str:
 
 
 def resident(pid: int) -> tuple[float, float]:
-    """Return the resident memory of a process, and how much of it is files [MB]."""
+    """Return the resident memory of a process, and its file-backed part [MB]."""
     text = Path(f'/proc/{pid}/status').read_text('ascii')
     sizes = dict(line.split(':', 1) for line in text.splitlines())
     whole, files = (int(sizes[key].split()[0]) * 1024 / 1e6 for key in ('VmRSS', 'RssFile'))
@@ -167,7 +167,7 @@ def resident(pid: int) -> tuple[float, float]:
 
 
 def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Return the CPU of each node until the first command [s], and what is resident later."""
+    """Return the CPU time of each node until the first command [s], and its memory later."""
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
         deadline = time.monotonic() + STARTING
@@ -183,7 +183,7 @@ def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, flo
 
 
 def starting(used: dict[str, float], held: dict[str, tuple[float, float]], network: Path) -> str:
-    """Return the table of starts and memory."""
+    """Return the table of start-up times and memory."""
     said = (
         (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
     )
@@ -198,7 +198,7 @@ def starting(used: dict[str, float], held: dict[str, tuple[float, float]], netwo
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:
-    """Draw a flame graph of each node, and return the page's words of them."""
+    """Draw a flame graph of each node, and return the text for the page."""
     out.mkdir(parents=True, exist_ok=True)
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
@@ -213,7 +213,7 @@ def flames(network: Path, seconds: float, out: Path) -> str:
 
 
 def learning(name: str, folder: Path) -> tuple[float, float, Path]:
-    """Return the time of initial training and of an update [s], and the network."""
+    """Return the times of initial training and of an update [s], and the network file."""
     robot, network = Robot.load(name), folder / f'{name}.safetensors'
     begun = time.process_time()
     mae = initial_mae(robot).mae
@@ -224,7 +224,7 @@ def learning(name: str, folder: Path) -> tuple[float, float, Path]:
 
 
 def machine() -> str:
-    """Name the machine."""
+    """Return a description of the machine."""
     text = Path('/proc/cpuinfo').read_text('utf-8')
     names = {line.partition(':')[2].strip() for line in text.splitlines() if 'model name' in line}
     return f'{os.cpu_count()} cores of {", ".join(sorted(names)) or platform.machine()}'
@@ -233,7 +233,9 @@ def machine() -> str:
 def main(argv: list[str]) -> None:
     """Measure everything and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
-    parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='a system runs')
+    parser.add_argument(
+        '--seconds', type=number(1.0, 3600.0), default=20.0, help='[s] for which each system runs'
+    )
     parser.add_argument(
         '--late',
         type=number(1.0, 3600.0),
@@ -249,7 +251,7 @@ def main(argv: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         training, update, network = learning(ARM, Path(folder))
         _, large_update, _ = learning(LARGE, Path(folder))
-        started(network)  # this may compile, and is not counted
+        started(network)  # not counted, because it may compile
         used, held = started(network)
         steps = timings.measure(Robot.load(ARM), DEFAULT)
         moved = wire(args.seconds)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One node on the interpreter at hand: the estimator answers over ROS what the core computes.
+"""Runs one node on the present interpreter: the estimator must publish what the core computes.
 
 `python -m bench.platform_node CHECKPOINT`, from the root of the repository. It needs neither torch
 nor the built package: `python -m bench platforms` and the tests run it with other interpreters.
@@ -29,10 +29,10 @@ START = 'from musculoskeletal_ae.executables import estimator; raise SystemExit(
 
 
 def check(file: Path) -> str:
-    """Return one line about what was checked.
+    """Check the node, and return one line about the result.
 
     Raises:
-        RuntimeError: If the node does not answer, answers something else, or does not end well.
+        RuntimeError: If the node publishes no estimate or a wrong one, or fails to end cleanly.
     """
     robot = Robot.load(ROBOT)
     mae = checkpoint.load(file)

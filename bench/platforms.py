@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The platforms of doc/howto/install.md: makes each one, brings the system up there, runs tests.
+"""Creates each platform of doc/howto/install.md, starts the system there, and runs tests.
 
 python -m bench platforms                          # all of them
 python -m bench platforms wheels-3.13 sourced      # some
 python -m bench platforms --node wheels-3.12       # without torch: the core and one node
 
-Each platform is a clean clone in a folder of its own, in which ./bringup.sh installs what is
-missing. Only what is committed is cloned. The clone is deleted when its platform has passed.
+Each platform has a clean clone of the committed state in a separate folder, where ./bringup.sh
+installs the dependencies. The clone is deleted when its platform has passed.
 """
 
 import argparse
@@ -29,9 +29,9 @@ ROOT = Path(__file__).resolve().parents[1]
 ROS_REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt'
 #: what the core and the estimator import, without which --node does
 NODE_REQUIREMENTS = ('numpy', 'pin', 'safetensors', 'msgspec', 'PyYAML')
-#: versions of Ubuntu 24.04
+#: package versions of Ubuntu 24.04
 UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1', 'lark==1.1.9')
-#: a pinocchio that is compiled for NumPy 1, as that of apt is
+#: a pinocchio compiled for NumPy 1, like the one of apt
 APT_PINOCCHIO = ('pin==2.7.0', 'numpy==1.26.4')
 DEBIAN_PACKAGES = 'python3,ca-certificates,procps,util-linux'
 BRINGUP = ('--robot', 'arm26', '--duration', '10')
@@ -56,12 +56,12 @@ KEPT_PREFIXES = ('PIP_', 'SSL_', 'http', 'https', 'no_proxy', 'GIT_CONFIG')
 
 @dataclass
 class Site:
-    """Where one platform is made: a clone, a log, and what its commands begin with."""
+    """One platform: its clone, its log, and the commands that enter it."""
 
     folder: Path
     setup: list[str] = field(default_factory=list)  # shell lines before every command
     inside: list[str] = field(default_factory=list)  # command that runs a shell on the platform
-    clone_inside: str = ''  # path of the clone there, if it is another one
+    clone_inside: str = ''  # path of the clone on the platform, if different
 
     @property
     def clone(self) -> Path:
@@ -70,14 +70,14 @@ class Site:
 
     @property
     def log(self) -> Path:
-        """Everything that the commands have printed."""
+        """Log file with the output of all commands."""
         return self.folder / 'log.txt'
 
     def run(self, title: str, *lines: str, on_platform: bool = False) -> str:
-        """Run shell lines, on the platform itself or beside it; return what they print.
+        """Run shell lines, on the platform or on the host; return their output.
 
         Raises:
-            MusculoskeletalError: If they fail; with the end of the output.
+            MusculoskeletalError: If they fail, with the end of the output.
         """
         print(f'   {title}', flush=True)
         script, command = ['set -e', *lines], ['bash', '-c']
@@ -109,17 +109,17 @@ def _environment(home: Path) -> dict[str, str]:
     }
     paths = kept.get('PATH', '').split(os.pathsep)
     kept['PATH'] = os.pathsep.join(path for path in paths if not path.startswith(sys.prefix))
-    # What pip has downloaded once is used again.
+    # Reuse the download cache of pip.
     kept.setdefault('PIP_CACHE_DIR', str(Path.home() / '.cache' / 'pip'))
     return {**kept, 'HOME': str(home)}
 
 
 def interpreter(version: str) -> Path | None:
-    """Return the Python of a version, such as 3.12, of PATH or of pyenv."""
+    """Return the Python of a version, such as 3.12, from PATH or pyenv."""
     pyenv = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv')) / 'versions'
     candidates = [shutil.which(f'python{version}'), *sorted(pyenv.glob(f'{version}.*/bin/python'))]
     for candidate in filter(None, candidates):
-        # Those that pyenv puts on PATH may only say that no version is chosen.
+        # The shims of pyenv on PATH may only report that no version is selected.
         script = 'import sys, venv; print("%d.%d" % sys.version_info[:2])'
         run = subprocess.run([candidate, '-c', script], capture_output=True, text=True)
         if run.stdout.strip() == version:
@@ -171,7 +171,7 @@ def _sourced(site: Site) -> None:
         'the prefix of ROS',
         f'{system_python} -m venv {jazzy}',
         f'{jazzy}/bin/python -m pip install --no-compile -r {ROS_REQUIREMENTS}',
-        # What is the system's there.
+        # Packages of the system on Ubuntu.
         f'{jazzy}/bin/python -m pip uninstall -y numpy PyYAML lark-parser empy setuptools',
         f'rm {jazzy}/bin/python* {jazzy}/pyvenv.cfg',
     )
@@ -206,7 +206,7 @@ def _sourced_with_pinocchio(site: Site) -> None:
 
 
 def _debian_13(site: Site) -> None:
-    """Make a minimal Debian 13 (Python 3.13, no compiler, no libgomp, no venv) and move into it."""
+    """Create a minimal Debian 13 (Python 3.13, no compiler, no libgomp, no venv), and enter it."""
     root = site.folder / 'debian'
     if os.getuid() != 0 or shutil.which('debootstrap') is None:
         raise MusculoskeletalError('a Debian 13 is made by root, with debootstrap')
@@ -214,7 +214,7 @@ def _debian_13(site: Site) -> None:
         'Debian 13',
         f'debootstrap --variant=minbase --include={DEBIAN_PACKAGES} trixie {root}',
         f'cp /etc/resolv.conf {root}/etc/',
-        # Where registries are reached through a certificate of one's own.
+        # For networks that reach registries through a custom certificate.
         f'[ -z "${{PIP_CERT-}}" ] || cp -L "$PIP_CERT" {root}/"$PIP_CERT"',
         f'[ ! -e /etc/pip.conf ] || cp /etc/pip.conf {root}/etc/',
         f'cp -a {site.clone} {root}/root/clone',
@@ -236,11 +236,11 @@ PLATFORMS: dict[str, Callable[[Site], None]] = {
 CHROOTS = ('debian-13',)
 
 
-# --- what is checked there -----------------------------------------------------------------------
+# --- checks --------------------------------------------------------------------------------------
 
 
 def check_system(name: str, folder: Path, tests: tuple[str, ...] = TESTS) -> str:
-    """Make a platform in an empty folder; return one line about bring-up and tests there."""
+    """Create a platform in an empty folder; return one line about bring-up and tests."""
     site = Site(folder)
     site.run('cloning', f'git clone -q {shlex.quote(str(ROOT))} clone')
     PLATFORMS[name](site)
@@ -262,7 +262,7 @@ def check_system(name: str, folder: Path, tests: tuple[str, ...] = TESTS) -> str
 
 
 def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
-    """Return the lines of a requirements file that hold for a Python; of these names, if any."""
+    """Return the lines of a requirements file for a Python version; only of `names`, if any."""
     lines = []
     for line in file.read_text('utf-8').splitlines():
         requirement, _, condition = line.partition(';')
@@ -300,14 +300,16 @@ def check_node(name: str, folder: Path, checkpoint: Path) -> str:
 
 
 def _options(argv: list[str]) -> argparse.Namespace:
-    parser = Parser('platforms', 'Make platforms, bring the system up there, and run tests.')
+    parser = Parser('platforms', 'Creates platforms, starts the system there, and runs tests.')
     parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(PLATFORMS))
     parser.add_argument(
         '--node', type=Path, metavar='CHECKPOINT',
         help='check only the core and one node with this checkpoint of arm26, without torch',
     )  # fmt: skip
-    parser.add_argument('--folder', type=Path, help='where, instead of a temporary folder')
-    parser.add_argument('--tests', nargs='+', default=TESTS, metavar='TEST', help='of pytest')
+    parser.add_argument('--folder', type=Path, help='working folder (default: a temporary one)')
+    parser.add_argument(
+        '--tests', nargs='+', default=TESTS, metavar='TEST', help='tests for pytest'
+    )
     options = parser.parse_args(argv)
     for name in options.names:
         if name not in PLATFORMS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process takes of the machine, as Linux counts it, and its end."""
+"""CPU time and memory of processes on Linux, and ending processes."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ PATIENCE = 20.0  # [s]
 
 
 def cpu(pid: int) -> float:
-    """Return the processor time of a process and of its children, alive or gone [s]."""
+    """Return the CPU time of a process and its children, running or ended [s]."""
     total = 0.0
     for child in Path(f'/proc/{pid}/task/{pid}/children').read_text('ascii').split():
         total += cpu(int(child))
@@ -22,12 +22,12 @@ def cpu(pid: int) -> float:
 
 
 def memory(pid: int) -> float:
-    """Return what a process holds now [MB]."""
+    """Return the resident memory of a process [MB]."""
     return int(Path(f'/proc/{pid}/statm').read_text('ascii').split()[1]) * PAGE / 1e6
 
 
 def end_processes(processes: Collection[subprocess.Popen[Any]], asked: signal.Signals) -> None:
-    """Ask processes to end by a signal, and kill what goes on."""
+    """Send processes the signal `asked`, and kill those that do not end in time."""
     for process in processes:
         process.send_signal(asked)
     for process in processes:

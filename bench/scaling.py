@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy, time and memory from 2 joints and 6 muscles to 39 and 74, as a table and a plot.
+"""Measures accuracy, time and memory from 2 joints, 6 muscles to 39 joints, 74 muscles.
 
     python -m bench scaling [--bodies 2x6,5x10,…] [--minutes 10] --out DIR
 
-The bodies are arm26 and those of `bench limbs`. Of each, in a process of its own: the initial
-training and its error of ② on the geometric model per joint; the core's steps; ten minutes of
-individual 0, learned in updates of 400 steps every 20 s, and the error of ② on the held-out motion
-before and after, beside the oracle; one update of the learner as it ships, with a full store; and
-the largest memory. Times are of one core. DIR keeps networks and rows, and goes on from them.
+The bodies are arm26 and those of `bench limbs`. For each, a separate process measures:
+
+- the time of initial training, and the resulting error of ② per joint on the geometric model,
+- the times of the core's steps,
+- the error of ② on the held-out motion before and after learning ten minutes of individual 0, in
+  updates of 400 steps every 20 s, and the error of the oracle,
+- the time of one update of the learner with default settings and a full store,
+- the largest memory.
+
+Times are those of one core. The results are a table and a plot. DIR keeps networks and rows; a
+later run continues from them.
 """
 
 import json
@@ -63,10 +69,12 @@ Row = dict[str, float]
 
 
 def measure(body: str, folder: Path, minutes: float) -> Row:
-    """Return the numbers of a body; errors are divided by √D."""
+    """Return the results of a body; errors are divided by √D."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
-    (folder / 'initial.safetensors').unlink(missing_ok=True)  # of a run that was ended; it is timed
+    (folder / 'initial.safetensors').unlink(
+        missing_ok=True
+    )  # of an interrupted run; training is timed
     begun = time.process_time()
     nominal = initial(robot, folder)
     row = {'training': time.process_time() - begun}
@@ -96,15 +104,15 @@ def _solve(robot: Robot, mae: Mae) -> Array:
 
 
 def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
-    """Return the time of an update from a store that is full [s], the median of five."""
+    """Return the time of an update from a full store [s], as the median of five."""
     columns = exploring.tension, exploring.length, np.zeros_like(exploring.length)
     messages = np.concatenate(columns, axis=1)[::10].astype(np.float32)
     updater, count = BodyUpdater(robot, mae), len(exploring.theta)
     kept, rng = np.linspace(0, count - 1, CAPACITY, dtype=int), np.random.default_rng(0)
     times = []
-    with one_thread():  # as the training process
+    with one_thread():  # like the training process
         for _ in range(6):
-            kept = np.append(kept[1:], rng.integers(count))  # each update is for something new
+            kept = np.append(kept[1:], rng.integers(count))  # each update has a new sample
             part = exploring.part(kept)
             none = np.zeros_like(part.tension)
             seen = Observations(part.theta_sensor, part.tension, part.length, none, none == 0.0)
@@ -148,7 +156,7 @@ def draw(rows: dict[str, Row], file: Path) -> None:
 
 
 def run(bodies: list[str], minutes: float, out: Path) -> None:
-    """Measure what is not there yet, print the table and draw the plot."""
+    """Measure the missing bodies, print the table and draw the plot."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / 'rows.json'
     rows: dict[str, Row] = json.loads(file.read_text()) if file.exists() else {}
@@ -164,7 +172,7 @@ def run(bodies: list[str], minutes: float, out: Path) -> None:
 
 
 def main(argv: list[str]) -> None:
-    """Measure bodies."""
+    """Run the bench."""
     parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
     text = f'of {", ".join((SMALLEST, *BODIES))}'
     parser.add_argument('--bodies', type=names, default=[SMALLEST, *BODIES], help=text)

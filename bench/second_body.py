@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second body beside what the paper prints of Musashi: the calibration of `Effects`.
+"""Compares emulator model `foreign` with the paper's Musashi: the calibration of `Effects`.
 
     python -m bench second_body [--quick] [--seeds 200,…,209] [--off EFFECT,…]
 
-The sizes in `emulator/effects.py` were set once, on individuals 200–209 of musashi_left_arm,
-which no table shows, and before the learner was changed for this body (it was as of commit
-86c8dfc), so that, without the error of the network itself,
+The sizes in `emulator/effects.py` were set once, on individuals 200–209 of musashi_left_arm, which
+no table shows, and with the learner of commit 86c8dfc. They are never changed to improve a result.
+The targets, without the error of the network itself, were:
 
-- least squares on the nominal geometry has 0.32–0.41 rad on the held-out motion,
-- l(θ_S-p) over the paper's −120…30° at no tension is off by up to 40 mm,
-- preset `paper` is left with 0.15–0.19 rad after ten minutes of learning,
-- and its simulator with about 90 N,
+- Least squares on the nominal geometry has an error of 0.32–0.41 rad on the held-out motion.
+- l(θ_S-p) without tension has an error of up to 40 mm over the paper's −120…30°.
+- Preset `paper` has an error of 0.15–0.19 rad after ten minutes of learning.
+- Its simulator has a tension error of about 90 N.
 
-and are not touched to improve a result. The third is not reached within the ranges that the effects
-may have, so that they are at the upper ends of theirs. What was measured (refused: by the gate,
-which preset `paper` as printed does not have; `after` is of the network that was learned last):
+The third target cannot be reached within plausible ranges of the effects, which are therefore at
+their upper ends. The table shows the results. `refused` is the share of networks that fail
+checkpoint validation, which the paper does not have; `after` is the error of the last network:
 
     seed  least squares [rad]  l off [mm]  paper [rad]: before  after  simulator [N]  refused
      200                0.396          29                0.620  0.135            100     0.38
@@ -22,7 +22,7 @@ which preset `paper` as printed does not have; `after` is of the network that wa
      205                0.483          31                0.534  0.105             88     0.95
     mean                0.378          31                0.528  0.106             98     0.76
 
-With the middles of the ranges, and half of the wires without kinks, eight of the ten:
+Eight of the ten, with the middles of the ranges, and half of the tendons without kinks:
     mean                0.372          33                0.680  0.111             83     0.77
 """
 
@@ -60,20 +60,23 @@ PAPER = 'Musashi      0.32–0.41        up to 40            0.41  0.15–0.19  
 
 
 class Row(NamedTuple):
-    """What is measured of one individual."""
+    """Results of one individual."""
 
     least_squares: float  # on the nominal geometry [rad]
     off: float  # largest |l − f_geo| over the shoulder's sweep, l as the sensor reads it [mm]
     before: float  # preset `paper` [rad]
-    after: float  # of its last network, whether the gate let it through or not
+    after: float  # of its last network, accepted or not
     simulated: float  # tension error of its simulator after learning [N]
-    refused: float  # share of the networks that the gate did not let through
+    refused: float  # share of the networks that failed validation
 
 
 def measured(
     robot: Robot, default: Mae, paper: Mae, seed: int, effects: Effects, share: float
 ) -> Row:
-    """Record an individual, let preset `paper` learn of it, and judge it; `share` of the time."""
+    """Record an individual, learn it with preset `paper`, and measure it.
+
+    `share` scales all durations.
+    """
 
     def arm() -> ForeignArm:
         return ForeignArm(robot, seed, effects)
@@ -98,7 +101,7 @@ def measured(
 
 
 def true_lengths(arm: ForeignArm, theta: Array) -> Array:
-    """Return what the length sensors read at no tension [m] (N, M), at θ [rad] (N, D)."""
+    """Return the readings of the length sensors without tension [m] (N, M), at θ [rad] (N, D)."""
     body = arm.individual
     lengths = body.absolute_lengths(theta) - body.length_at_zero
     return np.array(
@@ -108,11 +111,13 @@ def true_lengths(arm: ForeignArm, theta: Array) -> Array:
 
 def main(argv: list[str]) -> None:
     """Train both presets, measure every individual and print the table."""
-    parser = Parser('second_body', 'Prints how the second body compares with Musashi.')
+    parser = Parser('second_body', 'Compares emulator model foreign with the Musashi of the paper.')
     parser.add_robot()
     parser.add_seeds(SEEDS)
     parser.add_quick('a tenth of the time')
-    parser.add_argument('--off', type=names, default=[], metavar='EFFECT,…', help='without these')
+    parser.add_argument(
+        '--off', type=names, default=[], metavar='EFFECT,…', help='effects to switch off'
+    )
     args = parser.parse_args(argv)
 
     robot = Robot.load(args.robot)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the simulated arm: at rest, and with a weight in the hand.
+"""Draws the simulated arm at rest, and with a weight in the hand.
 
     python -m bench sim_pictures --checkpoint FILE [--out doc]
 
-writes sim_at_rest.png and sim_loaded.png. Of a running simulator, `render --topic sim/markers`
-makes the same picture.
+Writes sim_at_rest.png and sim_loaded.png. `render --topic sim/markers` draws a running simulator in
+the same way.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ LOAD = -50.0  # [N] in z, as in the paper's simulation
 
 
 def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
-    """Hold the middle of the joint range, then load the hand; return the files written."""
+    """Draw the arm in its middle posture, then with a loaded hand; return the two files."""
     simulated = Simulation(robot, mae)
     theta = 0.5 * (robot.lower + robot.upper)
     tension, _ = least_tension(

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A day of learning in an hour or two: does the error stay down, do memory and time stay flat?
+"""Learns for an emulated day, and checks that error, memory and update time stay bounded.
 
 python -m bench soak [--hours 24] [--creep 1] [--moving 60] [--quick]
 
-The emulated arm explores on and on; every message goes through the learner. To fit a day into an
-hour or two it updates after every `--every`-th sample only (the first ones after each), where the
-node updates after each: so many fewer updates are judged than a day would bring. With --moving it
-moves for less of every five minutes, with --creep all wires get longer meanwhile. One line per
-report: robot time, samples, held-out error, d's threshold, memory, time of an update.
+The emulated arm explores continuously, and every message goes through the learner. To fit a day
+into one or two hours, the learner updates only after every `--every`-th sample, except for the
+first ones; the node updates after each. The bench therefore covers fewer updates than a day has.
+With --moving the arm moves for only a part of every five minutes. With --creep all tendons lengthen
+over time. Each report is one line: robot time, samples, held-out error, threshold of d, memory,
+time of an update.
 
-Exit status 1 if the error ever rose by more than a fifth over its least, memory by more than a
-fifth over what it was after two hours, or the median time of an update in the last quarter to more
-than one and a half of that in the first.
+Exit status 1 in any of these cases:
+
+- The error rose by more than a fifth over its earlier minimum.
+- The memory rose by more than a fifth over its value after two hours.
+- The median time of an update rose by more than half from the first to the last quarter.
 """
 
 import os
@@ -39,52 +42,52 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PART = 300.0  # [s] of robot time that is recorded and learned at once
+PART = 300.0  # [s] of robot time per recording
 REPORT = 1800.0  # [s] of robot time
-#: the network is still finding the body out until then [s]
+#: [s] until which the error may still vary, because the network has just begun to learn
 SETTLED = 1800.0
 TOLERATED = 1.2
-#: memory is compared with what it was then [s]: imports, the store and the reservoir fill it before
+#: [s] from which memory is compared; before, imports, the store and the reservoir fill it
 FILLED = 7200.0
-SLOWER = 1.5  # the last quarter's updates against the first's
+SLOWER = 1.5  # largest legal ratio of update times, last quarter to first
 
 
 class RareTrainer(Trainer):
-    """Takes a job after every so many samples only; the first ones after fewer.
+    """A trainer that updates only after several samples; the first updates come earlier.
 
     Attributes:
-        every: So many.
-        samples: That have come since the last job.
-        seconds: CPU time of every update [s].
+        every: Number of samples between updates.
+        samples: Number of samples since the last update.
+        seconds: CPU times of all updates [s].
     """
 
     every, samples = 1, 0
 
     def begin(self, mae: Mae) -> None:
-        """Go on from a network."""
+        """Continue from a network."""
         super().begin(mae)
         self.seconds: list[float] = []
 
     def submit(self, job: Job) -> None:
-        """Learn."""
+        """Run an update."""
         begun, self.samples = time.process_time(), 0
         super().submit(job)
         self.seconds.append(time.process_time() - begun)
 
     @property
     def ready(self) -> bool:
-        """Whether so many samples have come."""
+        """Whether enough samples have arrived."""
         return self.samples >= min(self.every, 1 + len(self.seconds) // 4)
 
 
 def judged(worst: float, filled: float, most: float, times: list[float]) -> list[str]:
-    """Return what was not tolerable, in words.
+    """Return descriptions of the violated limits.
 
     Args:
-        worst: Highest error over the least before it.
-        filled: Memory after two hours [MB]; 0 in a shorter run, which does not judge it.
-        most: Highest memory since [MB].
-        times: Time of every update, in order [s].
+        worst: Largest ratio of the error to its earlier minimum.
+        filled: Memory after two hours [MB]; 0 in a shorter run, which does not check it.
+        most: Largest memory since then [MB].
+        times: Times of all updates, in order [s].
     """
     problems = []
     if worst > TOLERATED:
@@ -101,16 +104,20 @@ def judged(worst: float, filled: float, most: float, times: list[float]) -> list
 
 def main(argv: list[str]) -> int:
     """Run the soak."""
-    parser = Parser('soak', 'Learns for a day: do error, memory and time stay down?')
+    parser = Parser('soak', 'Learns for a day, and checks error, memory and update time.')
     parser.add_robot()
-    parser.add_argument('--hours', type=float, default=24.0, help='of robot time')
+    parser.add_argument('--hours', type=float, default=24.0, help='robot time [h]')
     parser.add_quick('two hours, to try things out')
     parser.add_argument('--every', type=int, default=20, help='samples between updates')
-    parser.add_argument('--creep', type=float, default=0.0, help='of every wire [mm/h]')
-    parser.add_argument('--moving', type=float, default=PART, help='of every five minutes [s]')
-    parser.add_argument('--steps', type=int, default=STEPS, help='of training per update')
+    parser.add_argument(
+        '--creep', type=float, default=0.0, help='lengthening of every tendon [mm/h]'
+    )
+    parser.add_argument(
+        '--moving', type=float, default=PART, help='motion in every five minutes [s]'
+    )
+    parser.add_argument('--steps', type=int, default=STEPS, help='training steps per update')
     parser.add_seed('of the individual')
-    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
+    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)
@@ -125,7 +132,7 @@ def main(argv: list[str]) -> int:
     reported = 0
     filled = most = 0.0
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
-        # A longer wire has to be wound in further, so that it reads as a shorter muscle.
+        # A longer tendon has to be wound in further, and the muscle then reads shorter.
         crept = np.full(robot.muscle_count, -1e-3 * args.creep * PART / 3600.0 * part)
         arm.set_length_offset(crept)
         stream = record(arm, learner.mae, part, args.moving)
@@ -158,5 +165,5 @@ def main(argv: list[str]) -> int:
             )
             reported = len(trainer.seconds)
     problems = judged(worst, filled, most, trainer.seconds)
-    print('; '.join(problems) or 'all within what is tolerated')
+    print('; '.join(problems) or 'all within the limits')
     return int(bool(problems))

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes that are stopped while they start: SIGINT and SIGTERM at random moments of the first 3 s.
+"""Stops nodes while they start, by SIGINT and SIGTERM at random moments of the first 3 s.
 
     python -m bench stops [--count 70] [--seed 0]
 
-Passes if every node ends with status 0 and without a traceback. A signal that comes before Python
-has reached the first line of the package (the first 0.1 s, on a busy machine more) is counted by
-itself: the process then ends by the signal, and Python may print a traceback.
+Passes if every node ends with status 0 and without a traceback. A signal may arrive before Python
+runs the first line of the package, which takes about 0.1 s or more on a busy machine. Such a signal
+ends the process, and Python may print a traceback; these cases are counted separately.
 """
 
 import os
@@ -28,7 +28,7 @@ SIGNS_OF_A_CRASH = ('Traceback', 'Exception ignored', 'error', 'Fatal')
 
 
 def stop(name: str, number: signal.Signals, moment: float, state: Path) -> tuple[int, float, str]:
-    """Start a node and stop it; return its exit status, how long it took [s], and its output."""
+    """Start a node and stop it; return its exit status, the time to end [s], and its output."""
     folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
     process = subprocess.Popen(
         [str(folder / name), '--ros-args', '-p', 'robot:=arm26'],
@@ -49,9 +49,9 @@ def stop(name: str, number: signal.Signals, moment: float, state: Path) -> tuple
 
 
 def main(argv: list[str]) -> int:
-    """Stop nodes, and print how they ended; exit status 1 if one ended otherwise."""
+    """Run the bench; return the exit status, 1 if a node ended wrongly."""
     parser = Parser('stops', (__doc__ or '').partition('\n')[0])
-    parser.add_argument('--count', type=whole(1, 10_000), default=70, help='of stops')
+    parser.add_argument('--count', type=whole(1, 10_000), default=70, help='number of stops')
     parser.add_seed('of nodes, signals and moments')
     args = parser.parse_args(argv)
     rng = random.Random(args.seed)  # noqa: S311 - must be repeatable

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives the supervisor through very many random events, and checks its invariants after each.
+"""Sends the supervisor many random events, and checks its invariants after each.
 
     python -m bench supervisor [--events 200000]
 
-It is the stateful property test of `test/control/test_supervisor.py`, run for longer. Exit status 1
-if an invariant was broken; hypothesis prints the shortest sequence of events that breaks it.
+It runs the stateful property test of `test/control/test_supervisor.py` for longer. Exit status 1 if
+an invariant was violated; hypothesis prints the shortest sequence of events that violates it.
 """
 
 from control.test_supervisor import Arm
@@ -19,7 +19,7 @@ STEPS = 100  # events in one sequence
 def main(argv: list[str]) -> int:
     """Run the bench; return the exit status."""
     parser = Parser('supervisor', 'Random events for the supervisor of control.')
-    parser.add_argument('--events', type=whole(1, 10**8), default=200_000, help='how many')
+    parser.add_argument('--events', type=whole(1, 10**8), default=200_000, help='number of events')
     options = parser.parse_args(argv)
     sequences = max(1, options.events // STEPS)
     long = settings(max_examples=sequences, stateful_step_count=STEPS, deadline=None, database=None)

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Healthy arms from their first second on: how long does a measured tension exceed its limit?
+"""Measures how long tensions of healthy arms exceed their limit, from the first second on.
 
     python -m bench tension [--robot musashi_left_arm] [--seeds 5,…,14] [--quick]
 
-Fresh individuals with the initial network, in closed loop with estimate, controller and learner as
-the nodes connect them, in one process. Each explores for a minute and learns meanwhile, then goes
-to random targets by every control method, with the network as it was at first, and holds them.
-Printed for each: the highest measured tension as a multiple of `tension.limit`, the longest time
-above `ALLOWED` times the limit without a break, the time above it and above the limit altogether,
-the stops, and of exploration the number of samples and the held-out error of the network.
+New individuals start with the initial network, in closed loop with estimator, controller and
+learner, in one process. Each explores for a minute and learns meanwhile. It then moves to random
+targets with every control method and the initial network, and holds them. The bench prints:
+
+- the highest measured tension as a multiple of `tension.limit`,
+- the longest uninterrupted time above `ALLOWED` times the limit,
+- the total times above `ALLOWED` times the limit, and above the limit,
+- the number of stops,
+- for exploration, the number of samples and the held-out error of the network.
 
 Exit status 1 if a tension was above `ALLOWED` times its limit for longer than `LONGEST`, or if a
 healthy arm stopped.
@@ -55,19 +58,19 @@ HEAD = (
 
 
 class Excess(NamedTuple):
-    """How measured tensions exceeded their limit."""
+    """Measures of how far and how long tensions exceeded their limit."""
 
     highest: float  # as a multiple of the limit
-    longest: float  # above ALLOWED times the limit, without a break [s]
-    allowed: float  # above ALLOWED times the limit, of the muscle with the most [s]
-    limit: float  # above the limit, of the muscle with the most [s]
+    longest: float  # longest uninterrupted time above ALLOWED times the limit [s]
+    allowed: float  # largest total time of a muscle above ALLOWED times the limit [s]
+    limit: float  # largest total time of a muscle above the limit [s]
 
 
 def excess(share: Array, dt: float) -> Excess:
-    """Judge measured tensions.
+    """Return the excess of measured tensions.
 
     Args:
-        share: As multiples of the limit, (N, M).
+        share: Tensions as multiples of the limit, (N, M).
         dt: Time between two rows [s].
     """
     longest, run = 0.0, np.zeros(share.shape[1])
@@ -79,21 +82,21 @@ def excess(share: Array, dt: float) -> Excess:
 
 
 class Observed:
-    """A loop whose measured tensions are kept."""
+    """A control loop that records measured tensions."""
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
         self.loop = ClosedLoop(arm, mae, settings, EXPLORATION_STREAM + seed)
         self.shares: list[Array] = []
 
     def run(self, step: Callable[[], tuple[Array, ...]], seconds: float) -> None:
-        """Let time pass [s]."""
+        """Run the loop for a time [s]."""
         limit = self.loop.arm.robot.tension.limit
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.shares.append(step()[3] / limit)
 
     @property
     def excess(self) -> Excess:
-        """How tensions exceeded their limit so far."""
+        """Return the excess of the recorded tensions."""
         return excess(np.array(self.shares), SAMPLE_TIME)
 
 
@@ -120,7 +123,7 @@ def explore(
 
 
 def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Excess, int]:
-    """Go to random targets by one method and hold them; return excess and stops."""
+    """Move to random targets with one method and hold them; return excess and stops."""
     observed = Observed(arm, initial, Settings(method=method), seed)
     robot, loop = arm.robot, observed.loop
     rng = np.random.default_rng([seed, 0x7E])
@@ -152,9 +155,11 @@ def main(argv: list[str]) -> int:
     parser.add_seeds(tuple(range(5, 15)))
     parser.add_quick('a quarter of the time')
     parser.add_argument('--reality', default=KIN, help='emulator model: kin, foreign, MJCF file')
-    parser.add_argument('--methods', type=names, default=METHODS, help='of control; none: -')
-    parser.add_argument('--seconds', type=positive, default=EXPLORED, help='of exploration')
-    parser.add_argument('--initial', type=Path, help='checkpoint, instead of training one')
+    parser.add_argument('--methods', type=names, default=METHODS, help='control methods; none: -')
+    parser.add_argument(
+        '--seconds', type=positive, default=EXPLORED, help='time of exploration [s]'
+    )
+    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
     options = parser.parse_args(argv)
     share = 0.25 if options.quick else 1.0
     robot = Robot.load(options.robot)

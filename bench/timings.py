@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time of each step of the core beside the same step in plain torch, in one run.
+"""Times each step of the core, and the same step in plain torch.
 
     python -m bench timings [--robot NAME|DIR] [--preset NAME] [--device cuda]
 
-The torch side is the same algorithm with the same numbers going in; only the network runs in torch,
-and its gradients come from autograd. Of the simulator there are also rows with mechanics in torch,
-too (`eager_simulation`), as a user of torch would write it. The bound is what the network's
-multiply-adds alone take, at the rate of this machine's products of matrices of that size: one row
-for a single call, a batch for many arms.
+The torch side runs the same algorithm on the same input. Its network runs in torch, and autograd
+computes the gradients. Further rows of the simulator also have the mechanics in torch
+(`eager_simulation`). The bound is the time of the network's multiply-adds alone, at the rate of
+matrix products of that size on this machine: one row for a single call, a batch for many arms.
 """
 
 import time
@@ -42,20 +41,20 @@ ALL_TORCH = 'beside all of it in torch'
 
 
 class Row(NamedTuple):
-    """One line of the table; without a torch side where there is nothing to compare.
+    """One line of the table; the torch side is optional.
 
-    A call that does the work of several counts as so many.
+    A call that processes a batch counts as several calls.
     """
 
     name: str
     ours: Callable[[], object]
     torch_eager: Callable[[], object] | None = None
     several: int = 1
-    products: int = 0  # multiply-adds of the network; 0 where how many depends on the numbers
+    products: int = 0  # multiply-adds of the network; 0 if they depend on the input
 
 
 class Timed(NamedTuple):
-    """What one call takes [µs]; 0 where there is nothing to say."""
+    """Times of one call [µs]; 0 if there is none."""
 
     name: str
     ours: float
@@ -64,7 +63,7 @@ class Timed(NamedTuple):
 
 
 def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
-    """Return the multiply-adds of an encoder with a mask, if any, and of the decoder, or of l."""
+    """Return the multiply-adds of the encoder, if there is a mask, and of the decoder or of l."""
     depth, total = len(mae.encoder) // len(mae.groups), sum(w.size for w, _ in mae.decoder)
     for g, group in enumerate(mae.groups):
         muscles = len(group.muscles)
@@ -78,13 +77,13 @@ def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
 
 
 def gemm_rate(rows: int) -> float:
-    """Return the multiply-adds a microsecond of products of (rows, 200) with (200, 100)."""
+    """Return the multiply-adds per microsecond of products of (rows, 200) with (200, 100)."""
     left, right = np.ones((rows, 200), np.float32), np.ones((200, 100), np.float32)
     return rows * right.size / microseconds(lambda: left @ right)
 
 
 def microseconds(function: Callable[[], object], calls: int = 100, rounds: int = 20) -> float:
-    """Return the time of one call [µs]: of the process, the median of rounds, shorter if slow."""
+    """Return the CPU time of one call [µs], as the median of rounds; slow functions have fewer."""
     function()
     start = time.process_time()
     function()
@@ -104,7 +103,7 @@ def row_time(row: Row, function: Callable[[], object]) -> float:
 
 
 def mae_rows(robot: Robot, preset: str) -> list[Row]:
-    """Return the steps of the network itself; weights do not matter for time."""
+    """Return rows for the steps of the network; the weights do not affect time."""
     mae = initial_mae(robot, preset, steps=1).mae
     eager = from_mae(mae)
     states = random_states(robot, 1, np.random.default_rng(0), robot.tension.limit)
@@ -140,7 +139,7 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
 
 
 def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
-    """Return the solves of the methods at one posture; weights do not matter for time."""
+    """Return rows for the control methods at one posture; the weights do not affect time."""
     theta = 0.5 * (robot.lower + robot.upper)
     torque = robot.kinematics.holding_torque(theta)
     tension = np.full(robot.muscle_count, robot.tension.bias)
@@ -233,7 +232,7 @@ def eager_proposed_paper(
 
 
 def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
-    """Return a step of the simulator (preset default), one arm and many, and a new network."""
+    """Return rows for a simulator step (preset default), one arm and many, and a new network."""
     mae = initial_mae(robot, preset, steps=200).mae
     rng = np.random.default_rng(0)
 
@@ -246,7 +245,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         return simulated
 
     def step(simulated: Any) -> Callable[[], object]:
-        # The last one's angles are there when all of them are.
+        # Reading the last arm's angles waits for all of them.
         return lambda: simulated.step(0.01).theta[-1].tolist()
 
     network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
@@ -267,7 +266,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
 
 
 def emulation_rows(robot: Robot) -> list[Row]:
-    """Return a millisecond of the emulated bodies."""
+    """Return rows for one millisecond of the emulator models."""
     steps = 10
     return [
         Row(
@@ -285,7 +284,7 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
 
 
 def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]:
-    """Return what each step takes."""
+    """Return the times of all steps."""
     torch.set_num_threads(1)
     one, many = gemm_rate(1), gemm_rate(256)
     every = mae_rows(robot, preset) + simulation_rows(robot, preset, device)
@@ -314,9 +313,11 @@ def show(robot: Robot, preset: str, device: str | None = None) -> None:
 
 def main(argv: list[str]) -> None:
     """Measure on one robot with one preset."""
-    parser = Parser('timings', 'Times each step of the core beside the same in plain torch.')
+    parser = Parser('timings', 'Times each step of the core, and the same step in plain torch.')
     parser.add_robot()
     parser.add_preset()
-    parser.add_argument('--device', help='of torch, such as cuda: time batches there, too')
+    parser.add_argument(
+        '--device', help='torch device on which to time batches as well, such as cuda'
+    )
     args = parser.parse_args(argv)
     show(Robot.load(args.robot), args.preset, args.device)

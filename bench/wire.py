@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The running system at the wire: how late a command is, and what each node costs.
+"""Measures the running system over ROS: latency of commands, and CPU time of each node.
 
     python -m bench wire [--robots arm26,musashi_left_arm] [--rates 100,200,500] [--seconds 20]
 
-Emulator, estimator, sim, controller and, where it says so, learner, as `bringup.sh` starts them,
-each in a process of its own, with the arm exploring. A message and the command that answers it are
-told by their numbers at the source: latency is from the publishing of muscle_states to that of the
-first muscle_length_command after it. Beside it estimator and controller in one process; what a user
-would write: one plain rclpy node in which torch eager estimates and a tension is turned into a
-length, no safety, no control; and the floor: as many nodes that exchange the same messages, by the
-same executor, and compute nothing, so that no node in Python on this machine can do with less.
+Emulator, estimator, sim, controller and, in some rows, learner run as `bringup.sh` starts them,
+each in a separate process, with the arm exploring. Latency is the time from the publishing of
+muscle_states to that of the next muscle_length_command. Other rows are for comparison:
 
-    late      no command within two periods, or at all
-    missed    messages that the emulator should have sent, and that did not come
+- estimator and controller in one process,
+- one plain rclpy node with an estimate in eager torch that converts a tension to a length, without
+  safety or control,
+- a lower bound: as many nodes that exchange the same messages with the same executor, and compute
+  nothing.
+
+    late      messages without a command within two periods
+    missed    messages of the emulator that did not arrive
 """
 
 import os
@@ -75,7 +77,7 @@ rclpy.init()
 with contextlib.suppress(KeyboardInterrupt):
     rclpy.spin(Plain())
 """
-#: node: when it publishes (at a message, or at its rate), what, and what else it hears
+#: node: trigger of publishing (a message, or its rate), published topic, other subscriptions
 BARE = {
     'bare_hardware_emulator': ('', 'muscle_states joint_states', 'muscle_length_command'),
     'bare_estimator': (
@@ -124,10 +126,10 @@ with make_executor() as executor, suppress(KeyboardInterrupt):
 
 
 class System:
-    """Nodes in processes of their own."""
+    """Nodes in separate processes."""
 
     def __init__(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
-        """Start them; a stop signal meanwhile ends them again."""
+        """Start the nodes; a stop signal during the start ends them."""
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
         with STOP.reacting(Reaction.REMEMBER):
             self._start(robot, network, rate, names)
@@ -149,7 +151,7 @@ class System:
             if name != 'hardware_emulator':
                 given[name].append(f'checkpoint:={network}')
             if name in ('controller', 'combined'):
-                # A pause of a busy machine is no fault of an emulated arm.
+                # A pause of a busy machine must not stop the emulated arm.
                 given[name] += ['explore:=true', 'max_age:=1.0']
             if name == 'learner':
                 given[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
@@ -162,18 +164,18 @@ class System:
             if name in BARE:
                 command = [sys.executable, '-c', ALONE, name, robot, str(rate), *BARE[name]]
             self.nodes[name] = subprocess.Popen(command, **quiet)
-        # Without rclpy's signal handlers: SIGTERM is to end the bench, not only its context.
+        # Without rclpy's signal handlers, because SIGTERM has to end the whole bench.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._rclpy, self._node = rclpy, rclpy.create_node('wire')
         executor = make_executor()
         executor.add_node(self._node)
         self.stamps: dict[str, list[int]] = defaultdict(list)
         for topic in ('muscle_states', 'muscle_length_command'):
-            # rclpy looks at the signature: a partial has none that it understands.
+            # rclpy inspects the signature and cannot handle that of a partial.
             def take(_: Any, info: dict[str, Any], topic: str = topic) -> None:
                 self.stamps[topic].append(info['source_timestamp'])
 
-            # As bytes: whoever listens should take little of what is measured.
+            # Raw messages keep the CPU time of this observer low.
             self._node.create_subscription(
                 Float64MultiArray, topic, take, qos_profile_sensor_data, raw=True
             )
@@ -195,12 +197,12 @@ class System:
 
 
 class Wire(NamedTuple):
-    """What a system of nodes did."""
+    """Results of a system of nodes."""
 
-    latency: tuple[float, ...]  # 50 %, 99 %, largest [ms]
+    latency: tuple[float, ...]  # median, 99th percentile, largest [ms]
     late: float  # [%]
     missed: float  # [%]
-    cpu: dict[str, float]  # of each node [% of a core]
+    cpu: dict[str, float]  # CPU time of each node [% of a core]
 
     def __str__(self) -> str:
         """Return one line of the table."""
@@ -213,7 +215,7 @@ class Wire(NamedTuple):
 
 
 def measure(system: System, rate: float, seconds: float) -> Wire:
-    """Listen to a system of nodes that starts."""
+    """Measure a system of nodes after its start."""
     deadline = time.monotonic() + 60.0
     while not system.stamps['muscle_length_command'] and time.monotonic() < deadline:
         time.sleep(0.5)
@@ -242,7 +244,7 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
 def systems(
     robot: str, rates: Iterable[float], kinds: Iterable[str], seconds: float
 ) -> Iterator[tuple[float, str, Wire]]:
-    """Measure one robot at rates [Hz] with kinds of nodes; yield the rate, the kind, and what."""
+    """Measure one robot at all rates [Hz] and kinds; yield rate, kind and results."""
     with tempfile.TemporaryDirectory() as folder:
         network = Path(folder) / 'network.safetensors'
         checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
@@ -260,9 +262,13 @@ def main(argv: list[str]) -> None:
     parser = Parser('wire', (__doc__ or '').partition('\n')[0])
     robots = 'arm26,musashi_left_arm'
     parser.add_argument('--robots', type=names, default=robots, help='names or directories')
-    parser.add_argument('--rates', type=numbers, default='100,200,500', help='of messages [Hz]')
-    parser.add_argument('--seconds', type=number(1.0, 3600.0), default=20.0, help='each takes')
-    parser.add_argument('--repeat', type=whole(1, 100), default=1, help='so many times')
+    parser.add_argument(
+        '--rates', type=numbers, default='100,200,500', help='rates of messages [Hz]'
+    )
+    parser.add_argument(
+        '--seconds', type=number(1.0, 3600.0), default=20.0, help='time of each measurement [s]'
+    )
+    parser.add_argument('--repeat', type=whole(1, 100), default=1, help='number of repetitions')
     args = parser.parse_args(argv)
     print('latency [ms]: 50 %, 99 %, largest; late and missed messages [%]; CPU [% of a core]')
     for robot in args.robots:

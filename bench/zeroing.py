@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Length offsets found after power-on: with joint sensors, without, and in a stated posture.
+"""Tests length calibration after power-on: with joint sensors, without, and in a stated posture.
 
 python -m bench zeroing [--robot …] [--seeds 0,1,2,3,4] [--folder DIR] [--out FILE]
 
-An individual that learned for ten minutes is switched off and on: it hangs, and every length sensor
-reads 50–130 mm too much or too little. Estimator and controller run as their nodes do. Printed is
-the held-out error [rad] with the zeros that were found over the one before, after how much time,
-the largest error of a zero, alarms meanwhile and in half a minute of exploration after it, and the
-fastest muscle and highest tension meanwhile. Zeroing reads the network and the learner's samples
-stay untouched, so that nothing else learned can be lost.
+An individual that has learned for ten minutes is switched off and on. It hangs, and every length
+sensor has an offset of 50–130 mm. Estimator and controller run as in their nodes. The bench prints:
+
+- the ratio of the held-out errors [rad] after and before the calibration,
+- the time that it took, and the largest error of an offset,
+- the alarms meanwhile, and in half a minute of exploration afterwards,
+- the fastest muscle and the highest tension meanwhile.
+
+Calibration does not change the network or the learner's samples.
 """
 
 import json
@@ -38,15 +41,15 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LEAST, MOST = 0.05, 0.13  # [m]
 MINUTES, HELD_OUT, AFTER = 10.0, 300.0, 30.0  # [s] but for the first
-LONGEST = 120.0  # [s] until it is given up
-SETTLING = 20.0  # [s] until it hangs still
-#: by how much a stated posture is off: adds to the error of each joint as it is [rad]
+LONGEST = 120.0  # [s] time limit of a calibration
+SETTLING = 20.0  # [s] until the arm hangs still
+#: error of the stated posture [rad], added to the angle of each joint
 STATED = 0.0
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 
 
 class Loop:
-    """Emulated arm, estimator and controller, as their nodes connect them."""
+    """Emulated arm, estimator and controller, connected as in their nodes."""
 
     def __init__(self, robot: Robot, mae: Mae, arm: EmulatedArm, seed: int) -> None:
         self.arm, self.time, self.alarms = arm, 0.0, 0
@@ -56,7 +59,7 @@ class Loop:
         self._zeros = self.estimator.body.offsets
 
     def step(self, joints: bool) -> MuscleSample | None:
-        """Let a hundredth of a second pass; return what the modules read."""
+        """Simulate 10 ms; return the readings of the muscle modules."""
         self.time += SAMPLE_TIME
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
@@ -81,7 +84,7 @@ class Loop:
 
 
 def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[str, Any]:
-    """Return what zeroing one individual brought."""
+    """Calibrate one individual; return the results."""
     rng = np.random.default_rng([seed, 0x0F])
     offset = rng.uniform(LEAST, MOST, robot.muscle_count)
     offset *= rng.choice([-1.0, 1.0], robot.muscle_count)
@@ -133,13 +136,13 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 def main(argv: list[str]) -> int:
     """Print the table; exit status 0 if every individual meets the goals."""
-    parser = Parser('zeroing', 'Length zeros found after power-on.')
+    parser = Parser('zeroing', 'Tests length calibration after power-on.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_argument(
-        '--folder', type=Path, default=Path('bench_zeroing'), help='what was learned'
+        '--folder', type=Path, default=Path('bench_zeroing'), help='cache of learned networks'
     )
-    parser.add_argument('--out', type=Path, help='JSON file of the numbers')
+    parser.add_argument('--out', type=Path, help='JSON file for the results')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, numbers, passed = Robot.load(args.robot), dict[str, Any](), True
