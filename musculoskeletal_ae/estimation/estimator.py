@@ -317,9 +317,11 @@ class Estimator:
         self.stream.use_body(body)
 
     def _measured_theta(self, now: float) -> Array | None:
-        """Return θ [rad] (D,) by joint sensors, if they have reported it with this message."""
+        """Return θ [rad] (D,) by joint sensors, if all have reported it with this message."""
         came, theta = self._measured
-        return theta if now - came < JOINTS_AGE else None
+        if theta is None or now - came >= JOINTS_AGE or not np.isfinite(theta).all():
+            return None
+        return theta
 
     def _handle_jump(self, now: float) -> None:
         """Take that lengths have jumped, where detectors do not see it."""

@@ -153,3 +153,11 @@ def test_a_healthy_arm_with_joint_sensors_is_healthy(robot, mae):
     arm = Wandering(robot, mae)
     arm.go(20.0)
     assert arm.kind is None
+
+
+def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
+    arm = Wandering(robot, mae)
+    arm.joint_off = np.full(2, np.nan)
+    arm.go(6.0)
+    assert arm.kind is None
+    assert arm.core.health.joints.gap is None
