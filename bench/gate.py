@@ -108,7 +108,7 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
     gate.take(mae, 0.0)
     for n, row in enumerate(zip(stream.theta_sensor, stream.tension, stream.length, strict=True)):
         now = n * SAMPLE_TIME
-        gate.message(*row[1:], now)
+        gate.message(*row[1:], now, row[0])
         if learner.step(now, *row) is not None:
             spread.take(gate, learner.mae, f'individual {seed}, {mae.preset}, {now:.0f} s')
             gate.take(learner.mae, now)

@@ -90,5 +90,38 @@ ATTACKS: Mapping[str, Attack] = {
     'one length 0.2 m off': _shifted(2, 2.0),
     'standardisation × 2': _scaled_std(2.0, slice(None)),
 }
+SCALED = 10.0  # scaled units of a length of a metre
 #: what only the arm's own messages tell
 ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
+
+
+def _other_lengths(times: float = 1.0, more: float = 0.0, part: slice = slice(None)) -> Attack:
+    """Let a network believe, consistently, that lengths are others, `more` in [m]."""
+
+    def attack(mae: Mae) -> Mae:
+        std, mean = mae.std.copy(), mae.mean.copy()
+        rows = np.arange(len(std))[len(mae.joints) + len(mae.muscles) :][part]
+        std[rows] *= times
+        mean[rows] = mean[rows] * times + SCALED * more * np.where(
+            np.arange(len(rows)) % 2, 1.0, -1.0
+        )
+        return replace(mae, std=std, mean=mean)
+
+    return attack
+
+
+def _other_joint(mae: Mae) -> Mae:
+    """Let a joint turn the other way, in all that a network says and hears."""
+    std = mae.std.copy()
+    std[0] *= -1.0
+    return replace(mae, std=std)
+
+
+#: networks that agree with themselves, but not with the arm
+CONSISTENT: Mapping[str, Attack] = {
+    'all lengths × 0.5': _other_lengths(0.5),
+    'all lengths × 1.5': _other_lengths(1.5),
+    'lengths ± 80 mm': _other_lengths(more=0.08),
+    'flexors the other way': _other_lengths(-1.0, part=slice(0, None, 2)),
+    'a joint the other way for all': _other_joint,
+}

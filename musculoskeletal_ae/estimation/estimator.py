@@ -88,6 +88,7 @@ class Estimator:
         sample: The last one that was read; None before the first.
         output: Of the last message with an estimate; None before the first, and when a length
             calibration begins.
+        measured: θ by joint sensors [rad] (D,) of that message; None where not all reported.
         stepped_at: When the last message with an estimate came, by the steady clock [s].
     """
 
@@ -104,6 +105,7 @@ class Estimator:
         self.contact = ContactEstimator(robot)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
+        self.measured: Array | None = None
         self.stepped_at = -math.inf
         self._stated_posture: tuple[float, ...] = ()  # of the last length calibration
         self._jumps = 0  # of lengths, that were handled
@@ -296,8 +298,8 @@ class Estimator:
             self._verify(sample, estimate, dt, now)
         demand = self._commands.demand(self.robot, sample.length, now)
         known = self.body.offsets.known
-        measured = self._measured_theta(now)
-        finding = self.health.step(Observation(sample, estimate, demand, dt, known, measured))
+        self.measured = self._measured_theta(now)
+        finding = self.health.step(Observation(sample, estimate, demand, dt, known, self.measured))
         detected = self._handle(finding, now)
         contact = None
         if known:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.exceptions import GateError, StateError
@@ -97,10 +98,12 @@ class CheckpointKeeper:
 
     # -- messages and events --------------------------------------------------------------------
 
-    def observe(self, message: MuscleSample, dt: float, is_anomaly: bool) -> None:
-        """Process a plausible message, `dt` [s] after the previous one."""
+    def observe(
+        self, message: MuscleSample, dt: float, is_anomaly: bool, theta: Array | None = None
+    ) -> None:
+        """Process a plausible message, `dt` [s] after the previous one, and measured θ (D,)."""
         self._time += dt
-        self.validation.message(message.motor_tension, message.length, self._time)
+        self.validation.message(message.motor_tension, message.length, self._time, theta)
         if self.mae is not None and not is_anomaly:
             self._torque.step(message.motor_tension, message.length, dt)
 
@@ -129,19 +132,19 @@ class CheckpointKeeper:
     # -- networks -------------------------------------------------------------------------------
 
     def check(self, mae: Mae) -> None:
-        """Validate a network on recent messages of the arm.
+        """Validate a network that a user has chosen on recent messages of the arm.
 
         Raises:
             GateError: If the validation rejects the network.
         """
-        self.validation.check(mae)
+        self.validation.check(mae, is_chosen=True)
 
     def is_accepted(self, mae: Mae) -> bool:
         """Return whether a learned network passes the validation, and count rejections."""
         if not self._is_validating:
             return True
         try:
-            self.check(mae)
+            self.validation.check(mae)
         except GateError as error:
             self.rejected, self.last_rejected = self.rejected + 1, str(error)
             return False

@@ -159,7 +159,8 @@ class Learner:
             return
         if not self._believes_offsets(paired):
             return
-        self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly)
+        measured = None if paired.theta is None else paired.theta[: self.robot.joint_count]
+        self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly, measured)
         for _ in self.collector.collect(paired):
             self.offset_history.accepted(time)
             self._note_new_samples()

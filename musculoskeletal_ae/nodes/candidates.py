@@ -67,11 +67,12 @@ class Candidates:
         mae = checkpoint.from_bytes(bytes(message.data), self._node.robot)
         yield
         yield from self.validator.trial(mae)
-        self._accept(mae, message)
+        complete = self.validator.with_detector(mae, time.monotonic())
+        self._accept(complete, message if complete is mae else None)
         self._on_candidate()
 
     def _use_file(self, mae: Mae) -> None:
-        self.validator.check(mae)
+        self.validator.check(mae, is_chosen=True)
         self._accept(mae)
         self.queue.give_up()
         self._node.stop_waiting_for(CANDIDATES)

@@ -151,11 +151,13 @@ class Estimator(Shell):
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
         restored = self.muscles_to_isolate or isolated  # if none is named, all
+        self.candidates.validator.declare_healthy(time.monotonic())
         return self._isolate(set(isolated) - set(restored))
 
     def _reset(self, _: Trigger.Request) -> str:
         cause = self.core.cause
         self.core.reset()
+        self.candidates.validator.declare_healthy(time.monotonic())
         self._publish_offsets()
         self.published_anomaly = False
         self.candidates.on_anomaly(False)
@@ -214,7 +216,9 @@ class Estimator(Shell):
         if self.frames is not None and self.tf_source == 'estimate':
             self.frames.publish(state.theta)
         if self.core.body.offsets.known:
-            self.candidates.validator.message(sample.motor_tension, sample.length, now)
+            self.candidates.validator.message(
+                sample.motor_tension, sample.length, now, self.core.measured
+            )
         self.joints.publish(joint_message(self.robot.joints, state.theta, stamp))
         if output.covariance is not None and is_heard(self.covariance):
             self.covariance.publish(array_message(output.covariance, 'joint', 'joint'))

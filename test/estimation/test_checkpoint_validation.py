@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from network_attacks import ATTACKS, ON_MESSAGES
+from network_attacks import ATTACKS, CONSISTENT, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.estimation.checkpoint_validation import (
@@ -199,3 +199,68 @@ def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
     for _ in range(3 * MOST_USED):  # no message comes meanwhile
         gate.take(trained['default'], 0.0)
     assert gate.anomaly(True, 0.0) is first
+
+
+def moving(gate, measures):
+    """Let a gate see an arm that is like its model, with joint sensors or without."""
+    rng = np.random.default_rng(0)
+    theta = ROBOT.random_postures(60, rng)
+    tension = rng.uniform(30.0, 150.0, (60, ROBOT.muscle_count))
+    length = ROBOT.muscle_lengths(theta, tension)
+    for k in range(60):
+        gate.message(tension[k], length[k], 0.1 * k, theta[k] if measures else None)
+    return theta, tension, length
+
+
+@pytest.mark.parametrize('attack', CONSISTENT)
+@pytest.mark.parametrize('measures', [True, False])
+def test_a_consistent_but_wrong_network_is_refused(trained, attack, measures):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    gate.take(mae, 0.0)
+    moving(gate, measures)
+    with pytest.raises(GateError, match='limit'):
+        gate.check(CONSISTENT[attack](mae))
+
+
+@pytest.mark.parametrize('measures', [True, False])
+def test_a_network_that_moves_the_posture_by_as_much_as_learning_does_is_accepted(
+    trained, measures
+):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    gate.take(_turned(mae, 0.3), 0.0)  # bad by 0.3 rad
+    moving(gate, measures)
+    gate.check(mae)
+
+
+def test_joint_sensors_decide_how_far_a_network_may_move_the_posture(trained):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    learned = replace(_turned(mae, 0.6), covariance=np.eye(ROBOT.joint_count))
+    for measures in (True, False):
+        gate.start()
+        gate.take(learned, 0.0)
+        moving(gate, measures)
+        compared = gate.agreement(mae)[0]
+        assert ((compared.error <= compared.limit).all()) == measures
+    gate.check(mae, is_chosen=True)
+
+
+def test_a_network_without_a_calibrated_detector_takes_over_with_that_in_use(trained):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    gate.take(calibrated(mae), 0.0)
+    end = seeing(gate)
+    kept = gate.with_detector(mae, end)
+    assert kept.anomaly.calibrated
+    healthy, *cut = gate.detector(kept)
+    assert healthy < 1.0
+    assert max(cut) > 1.0
+    own = calibrated(trained['paper'])
+    assert gate.with_detector(own, end) is own
+    gate.declare_healthy(end)
+    assert gate.with_detector(mae, end) is mae
+
+
+def _turned(mae, angle):
+    """Return a network that reads every joint too high by an angle [rad]."""
+    mean = mae.mean.copy()
+    mean[: len(mae.joints)] += angle
+    return replace(mae, mean=mean)

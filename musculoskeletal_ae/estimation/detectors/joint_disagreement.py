@@ -41,9 +41,9 @@ class Largest(NamedTuple):
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
 
-# Healthy arms of Musashi, half of them `foreign`, exploring, some with 3.6 kg and pushed: networks of
-# the geometric model changed by 0.036 m and 0.019 m from posture to posture, and were 0.051 m and
-# 0.029 m off; those that had learned for 20 to 60 s changed by 0.032 m and 0.013 m.
+# Healthy arms of Musashi, half of them `foreign`, exploring, some with 3.6 kg and pushed: networks
+# of the geometric model changed by 0.036 m and 0.019 m from posture to posture, and were 0.051 m
+# and 0.029 m off; those that had learned for 20 to 60 s changed by 0.032 m and 0.013 m.
 CHANGE_YOUNG, GAP_YOUNG = Largest(0.06, 0.028), Largest(0.08, 0.045)
 # By networks that have learned the arm for long enough to calibrate the detector of the residual:
 # both were 0.013 m and 0.006 m at most. One muscle that is 0.05 m off is found in every posture.
