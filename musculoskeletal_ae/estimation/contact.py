@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate what acts on the arm from outside: joint torques, the force at the hand, and contact.
+"""Estimates the external load of the arm: joint torques, the force at the hand, and contact.
 
     τ_ext = M(θ) θ̈ + h(θ, θ̇) + Gᵀ T_end,   T_end = T e^{−μ s}
     F     = argmin Σ_j ((JᵀF − τ_ext)_j / σ_j)² + ‖F‖²/F₀²,   without a moment at the hand
     d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > CONTACT in IN_A_ROW consecutive messages
 
-θ and Gᵀ T_end pass the same low pass of second order, whose states are θ, θ̇ and θ̈. What is left
-is the residual of the momentum observer (De Luca 2005), without numerical differences of noise.
-Tendon friction μ has to be known: unknown friction hides a push of 10 N. σ is the torque that a
-healthy moving arm leaves (`estimation/healthy_torque.py`). F₀ keeps those components of the force
-small that the joints do not feel, as along a stretched arm.
+θ and Gᵀ T_end pass through the same second-order low-pass filter, which also gives θ̇ and θ̈. The
+result is the residual of the momentum observer (De Luca 2005) without numerical differentiation of
+noise. Tendon friction μ has to be known: unknown friction hides a contact force of 10 N. σ is the
+residual torque of a healthy moving arm (`estimation/healthy_torque.py`). F₀ keeps components of the
+force small that produce no joint torque, such as those along a stretched arm.
 
-At its stop, a joint shows nothing of torques that press it against the stop, since the stop carries
-them. A torque away from the stop is at least as large as what is measured.
+Torques that press a joint against its stop cannot be measured, because the stop carries them. A
+torque away from the stop is at least as large as the measured one.
 """
 
 import math
@@ -26,26 +26,27 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: [1/s] of the low pass. Its damping ratio is 0.5: critically damped, it would rise a third slower.
+#: bandwidth of the filter [1/s]; damping ratio 0.5 (critical damping would be a third slower)
 BANDWIDTH = 25.0
 LARGEST_USUAL = 20.0  # F₀ [N]
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-#: [rad], or times RACK [m], from a joint limit: the error of the estimate
+# For prismatic joints, [rad] below are times RACK [m].
+#: A joint closer to its limit counts as at its stop [rad]; this is the error of the estimate.
 AT_STOP = 0.06
-TURNED = 0.02  # [rad], or times RACK [m], by which joints turn until G is evaluated again
+TURNED = 0.02  # motion of a joint after which G is evaluated again [rad]
 #: d of five healthy arms that explored for ten minutes each reached 8.6
 CONTACT, IN_A_ROW = 10.0, 2
 
 
 class Contact(NamedTuple):
-    """What one message shows of the surroundings.
+    """External load estimated from one message.
 
     Attributes:
         torque: τ_ext [N·m], (D,); 0 where a stop carries it.
-        force: Returns F on the origin of the end effector, in the axes of the root link [N], (3,).
-            It is computed when it is called, since few callers need it.
+        force: Computes F on the origin of the end effector, in the axes of the root link [N], (3,).
+            It is a function, because few callers need the force.
         distance: d; NaN without statistics of the healthy arm.
-        is_contact: Whether something touches the arm.
+        is_contact: Whether there is contact.
     """
 
     torque: Array
@@ -55,7 +56,7 @@ class Contact(NamedTuple):
 
 
 class LowPass:
-    """A low pass of second order, which also returns the derivatives of its output.
+    """A second-order low-pass filter that also returns the derivatives of its output.
 
     ÿ = ω (ω (u − y) − ẏ)
     """
@@ -66,11 +67,11 @@ class LowPass:
         self._rate: Array = np.zeros(0)
 
     def reset(self) -> None:
-        """Begin again, at rest at the next input."""
+        """Restart the filter at rest at the next input."""
         self._value = None
 
     def step(self, value: Array, dt: float) -> tuple[Array, Array, Array]:
-        """Take an input u, dt [s] after the one before; return y, ẏ and ÿ.
+        """Take an input u, dt [s] after the previous one; return y, ẏ and ÿ.
 
         The implicit Euler method is stable at any dt.
         """
@@ -89,8 +90,8 @@ class ContactEstimator:
 
     Attributes:
         velocity: Filtered θ̇ [rad/s], (D,).
-        is_calibrated: Whether the healthy torque of this arm is known, so that contact is decided.
-        count: How many contacts have begun.
+        is_calibrated: Whether the healthy torque of this arm is known, which detection requires.
+        count: Number of contacts so far.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -104,7 +105,7 @@ class ContactEstimator:
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Use this network, with its tendon friction and the healthy torque that it knows."""
+        """Use another network, with its tendon friction and healthy torque."""
         joint_count, healthy = self._robot.joint_count, mae.touch
         self._mae = mae
         self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated
@@ -114,22 +115,22 @@ class ContactEstimator:
             self._weight = 1.0 / healthy.spread**2
 
     def reset(self) -> None:
-        """Forget the past, as after a jump of the clock."""
+        """Restart the filter, for example after a jump of the clock."""
         self._filter.reset()
         self.velocity: Array = np.zeros(self._robot.joint_count)
         self._beyond = 0  # consecutive messages with d > CONTACT
 
     def step(self, theta: Array, end_tension: Array, dt: float) -> Contact:
-        """Take an estimate.
+        """Take an estimate and return the external load.
 
         Args:
             theta: θ [rad], (D,).
             end_tension: T_end [N], (M,).
-            dt: Time since the message before [s].
+            dt: Time since the previous message [s].
         """
         kinematics, joint_count = self._robot.kinematics, len(theta)
         near = np.abs(theta - self._evaluated_at) <= self._near
-        if np.count_nonzero(near) < joint_count:  # also where θ is not a number
+        if np.count_nonzero(near) < joint_count:  # also if θ is NaN
             self._jacobian = self._mae.muscle_jacobian(theta, end_tension)
             self._evaluated_at = theta
         moments = end_tension @ self._jacobian  # Gᵀ T_end

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watch whether the body is healthy: the list of detectors.
+"""Monitors the health of the body with a list of detectors.
 
 A new detector is one file in `estimation/detectors/` and one entry in the list below. The
 estimator, offline learning (`train --from-bag`) and the experiments use the same list.
@@ -22,12 +22,12 @@ from musculoskeletal_ae.signals.heat import Heat
 
 
 class HealthMonitor:
-    """Shows every message to all detectors. The first finding of the list counts.
+    """Passes every message to all detectors, and returns the first finding in their order.
 
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
         joints: The detector of lengths that disagree with joint sensors.
-        settings: What the user may choose.
+        settings: Settings of the detectors.
     """
 
     def __init__(
@@ -37,13 +37,13 @@ class HealthMonitor:
         settings: Detection | None = None,
         heat: Heat | None = None,
     ) -> None:
-        """Begin without a network.
+        """Start without a network.
 
         Args:
             robot: The nominal body.
-            preset: Chooses what decides by the residual, and by physics.
-            settings: What the user may choose.
-            heat: Thermal models of the modules, which the caller steps.
+            preset: Preset that provides the detectors by residual and by physics.
+            settings: Settings of the detectors.
+            heat: Thermal models of the muscle modules, which the caller updates.
         """
         self.settings = settings or Detection()
         chosen = preset_named(preset)
@@ -60,7 +60,7 @@ class HealthMonitor:
         ]
 
     def use(self, mae: Mae) -> None:
-        """Use this network, without the muscles that are isolated in it."""
+        """Use another network; its isolated muscles are ignored."""
         for detector in self._detectors:
             detector.use(mae)
 
@@ -71,22 +71,22 @@ class HealthMonitor:
             detector.configure(settings)
 
     def reset(self) -> None:
-        """Forget what came before, as after a jump of the clock or a reset by the user."""
+        """Reset all detectors, for example after a jump of the clock or a reset by the user."""
         for detector in self._detectors:
             detector.reset()
 
     def accept(self, muscles: Iterable[int]) -> None:
-        """Consider muscles healthy as they are now."""
+        """Consider muscles healthy in their present state."""
         muscles = tuple(muscles)
         for detector in self._detectors:
             detector.accept(muscles)
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Take the readings of every message, also of one that was rejected; see `Detector`."""
+        """Take the readings of every message, even of a rejected one; see `Detector`."""
         findings = [detector.read(states, usable, now) for detector in self._detectors]
         return next(filter(None, findings), None)
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message of which there is an estimate."""
+        """Take a message for which there is an estimate."""
         findings = [detector.step(observation) for detector in self._detectors]
         return next(filter(None, findings), None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the external torque that a healthy arm in motion seems to have.
+"""Measures the apparent external torque of a healthy arm in motion.
 
     σ_j² ← σ_j² + (dt / t) (τ_ext,j² − σ_j²),   t: time of motion so far, MEMORY at most
 
@@ -17,11 +17,12 @@ from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-MEMORY = 180.0  # [s] of motion whose torques count
-MOVING = 0.05  # [rad/s], or times RACK [m/s], of all joints together, below which an arm rests
-#: A torque counts as at most this many times σ: a larger one means that somebody touched the arm.
+MEMORY = 180.0  # time constant of the average in time of motion [s]
+#: speed of all joints together above which an arm moves [rad/s]; prismatic joints times RACK [m/s]
+MOVING = 0.05
+#: Torques are clipped to this many times σ, because larger ones indicate contact.
 OUTLIER = 5.0
-LEAST_SPREAD = 1e-3  # [N·m]
+LEAST_SPREAD = 1e-3  # smallest σ [N·m]
 
 
 class HealthyTorque:
@@ -33,11 +34,11 @@ class HealthyTorque:
         self.start()
 
     def start(self) -> None:
-        """Begin again, as for another arm."""
+        """Restart the measurement, for example for another arm."""
         self._square, self._time = np.zeros_like(self._radian), 0.0
 
     def use(self, mae: Mae) -> Mae:
-        """Use this network; return it with σ, if it has a calibrated body model."""
+        """Use another network; return it with σ if it has a calibrated body model."""
         if (known := mae.touch) is None:
             self._mae = mae
         else:
@@ -49,12 +50,12 @@ class HealthyTorque:
         return self._mae
 
     def reset(self) -> None:
-        """Forget the motion so far, as after a jump of the clock; σ stays."""
+        """Restart the filters, for example after a jump of the clock; σ is kept."""
         self._contact.reset()
         self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Take T [N] and l [m] (M,) of a healthy arm, dt [s] after those before."""
+        """Take T [N] and l [m] (M,) of a healthy arm, dt [s] after the previous ones."""
         end = self._direction.end_tension(self._mae.friction, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._contact.step(theta, end, dt).torque
@@ -64,5 +65,6 @@ class HealthyTorque:
         if self._time > LEAST_MOTION:
             square = np.minimum(square, OUTLIER**2 * self._square)
         self._time = min(self._time + dt, MEMORY)
-        change = np.where(torque == 0.0, 0.0, square - self._square)  # 0: its joint is at its stop
+        # A torque of exactly 0 means that the joint is at its stop.
+        change = np.where(torque == 0.0, 0.0, square - self._square)
         self._square = self._square + dt / self._time * change

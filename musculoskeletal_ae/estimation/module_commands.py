@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Know what the muscle modules are commanded, as long as the command is fresh."""
+"""Stores the newest command to the muscle modules while it is up to date."""
 
 import math
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-COMMAND_AGE = 0.5  # [s] beyond which a command no longer says what the modules do
+COMMAND_AGE = 0.5  # age above which a command is out of date [s]
 
 
 class ModuleCommands:
-    """The newest command: either target lengths or target tensions."""
+    """Stores the newest command: target lengths or target tensions."""
 
     def __init__(self) -> None:
         self._length: Array | None = None  # l_target [m], (M,)
@@ -18,7 +18,7 @@ class ModuleCommands:
         self._time = -math.inf  # [s]
 
     def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
-        """Note target lengths [m] or tensions [N], (M,)."""
+        """Store target lengths [m] or target tensions [N], (M,)."""
         self._length, self._tension, self._time = length, tension, now
 
     def length(self, now: float) -> Array | None:

@@ -14,16 +14,20 @@ class Detection:
 
     anomaly_threshold: float = settable(
         0.0,
-        'A above it in 5 messages running is an anomaly (0: the calibrated detector)',
+        'value of A above which 5 consecutive messages are an anomaly (0: calibrated detector)',
         'scaled units',
         0.0,
         1e6,
     )
-    slack_length: float = settable(0.06, 'longest slack that a module may wind in', 'm', 0.0, 1.0)
-    slack_speed: float = settable(0.005, 'a module that winds in slower stands', 'm/s', 1e-4, 1.0)
+    slack_length: float = settable(
+        0.06, 'longest slack that a muscle module may wind in', 'm', 0.0, 1.0
+    )
+    slack_speed: float = settable(
+        0.005, 'winding speed below which a muscle module is stationary', 'm/s', 1e-4, 1.0
+    )
     on_anomaly: str = settable(
         'stop',
-        'the arm stops until estimator/reset; or the suspect is wound in a little, isolated if it '
-        'is broken, and the arm goes on',
+        'stop: the arm stops until estimator/reset; isolate: the suspect is verified, isolated if '
+        'it is faulty, and the arm resumes',
         legal=ON_ANOMALY,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate the joint angles from one sample of muscle length and tension.
+"""Estimates the joint angles from one sample of muscle length and tension.
 
 (T_end, l) ─② of the MAE→ θ, T_est, l_est      (paper, §III-D)
 e = (T_est − T, l_est − l),   A = ‖T_est − T‖₂ + ‖l_est − l‖₂          scaled units
@@ -17,13 +17,13 @@ from musculoskeletal_ae.mae.units import State
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the network makes of one sample.
+    """The network's estimate for one sample.
 
     Attributes:
         state: θ [rad] (D,), and T [N] and l [m] (M,) as the network restores them.
         residual: e, 0 for isolated muscles, (2M,).
         anomaly: A.
-        covariance: Of θ [rad²], (D, D); None if the network has none.
+        covariance: Covariance of θ [rad²], (D, D); None if the network has none.
     """
 
     state: State
@@ -33,7 +33,7 @@ class Estimate:
 
 
 class StateEstimator:
-    """Estimates with one network, from the muscles that are not isolated.
+    """Estimates the state from the muscles that are not isolated.
 
     Attributes:
         mae: The network in use, without the isolated muscles; None before the first.
@@ -45,19 +45,19 @@ class StateEstimator:
         self.complete_mae: Mae | None = None
 
     def use(self, mae: Mae, isolated: Iterable[int]) -> None:
-        """Use this network, without these muscles (positions in T and l)."""
+        """Use another network without the isolated muscles (indices)."""
         self.complete_mae, self.mae = mae, mae.without(isolated)
 
     def step(self, bone_tension: Array, length: Array) -> Estimate:
-        """Estimate from T_end [N] and l [m], (M,). A network is needed first."""
+        """Return the estimate from T_end [N] and l [m], (M,); call `use` first."""
         assert self.mae is not None
         state = self.mae.estimate(bone_tension, length)
         return estimate_of(self.mae, state, bone_tension, length)
 
 
 def estimate_of(mae: Mae, state: State, bone_tension: Array, length: Array) -> Estimate:
-    """Return the estimate whose state a network has restored from T_end [N] and l [m], (M,)."""
+    """Return the estimate for a state that a network restored from T_end [N] and l [m], (M,)."""
     error = residuals(state, bone_tension, length, mae.isolated)
-    pull, shift = error[: len(length)], error[len(length) :]
-    anomaly = math.sqrt(pull @ pull) + math.sqrt(shift @ shift)
+    tension_error, length_error = error[: len(length)], error[len(length) :]
+    anomaly = math.sqrt(tension_error @ tension_error) + math.sqrt(length_error @ length_error)
     return Estimate(state, error, anomaly, mae.covariance)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the estimator reports of itself in /diagnostics."""
+"""The estimator's status on /diagnostics."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-SILENCE = 1.0  # [s] without a message, beyond which there is nothing to estimate from
+SILENCE = 1.0  # time without a message after which the status is a warning [s]
 
 
 def report(core: Estimator, now: float) -> Report:
-    """Return level, message and values of a core; `now` is on a steady clock [s].
+    """Return the status of an estimator; `now` is the time of a steady clock [s].
 
     The values `state`, `finding` and `verification` are identifiers for programs, and `last
     outcome` is one of `verification.Outcome`.

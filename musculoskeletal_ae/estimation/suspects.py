@@ -1,27 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a rupture to moving on: what happens with a muscle that a detector has found.
+"""Handles the suspect of a finding, from its detection to the end of the anomaly.
 
 The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
 
- 1. Rupture. The muscle has no tension, and its readings do not agree with those of the others.
+ 1. Rupture. The muscle has no tension, and its readings disagree with those of the others.
  2. Finding. A detector of `health.py` names the muscle, within half a second. The finding is
     latched: the estimator publishes `anomaly_detected`, and the controller stops the arm.
- 3. Isolation. The suspect is isolated at once: estimate and control go on without it.
+ 3. Isolation. The suspect is isolated at once: estimation and control continue without it.
  4. Verification. The controller winds the suspect in by a few millimetres. `verification.py`
-    decides by its response: ruptured, jammed, a broken sensor, or healthy.
- 5. Moving on. A broken muscle stays isolated, a healthy one is restored. Either way the anomaly is
+    classifies its response: ruptured, jammed, sensor fault, or healthy.
+ 5. Resuming. A faulty muscle stays isolated, a healthy one is restored. Either way the anomaly is
     over, and the controller resumes after a verification (`control/stops.py`).
 
 With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
-`estimator/reset`. The same holds after ACQUITTALS suspects were healthy within WITHIN seconds:
-something is wrong that a verification does not show. Some kinds of findings differ:
+`estimator/reset`. The same applies after ACQUITTALS healthy suspects within WITHIN seconds, because
+there is a fault that a verification does not reveal. Some kinds of findings differ:
 
     values_missing          never latched; with `on_anomaly: isolate` the muscle is isolated without
-                            a verification, since a sensor without numbers is broken
-    lengths_jumped          of several muscles: none is isolated. The length offsets are revoked,
-    lengths_disagree        and the finding stays latched until they have been found anew. So it
-                            is with a `length_jump` whose muscle is not isolated.
-    joint_sensors_disagree  of no muscle: none is isolated
+                            a verification, because a sensor without numbers is faulty
+    lengths_jumped          of several muscles, none of which is isolated. The length offsets are
+    lengths_disagree        revoked, and the finding stays latched until the next length
+                            calibration. The same applies to a `length_jump` of a muscle that is
+                            not isolated.
+    joint_sensors_disagree  of no muscle; none is isolated
 """
 
 from collections.abc import Iterable
@@ -31,13 +32,13 @@ from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
 from musculoskeletal_ae.estimation.verification import Outcome, Verdict, Verification
 from musculoskeletal_ae.robot.robot import Robot
 
-ACQUITTALS, WITHIN = 2, 60.0  # suspects that were healthy, [s]
-#: findings of which no single muscle can be the cause
+ACQUITTALS, WITHIN = 2, 60.0  # number of healthy suspects, and the time in which they count [s]
+#: findings that no single muscle can cause
 OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
 
 
 FIND_OFFSETS = 'call estimator/zero, which finds the length offsets anew'
-#: what to do about findings that are not of one muscle, for people
+#: remedies for findings about length offsets and joint sensors, for users
 REMEDIES = {
     Kind.LENGTH_JUMP: FIND_OFFSETS,
     Kind.LENGTHS_JUMPED: FIND_OFFSETS,
@@ -49,13 +50,13 @@ REMEDIES = {
 
 
 class SuspectHandling:
-    """Latches a finding, and decides which muscles are isolated for it.
+    """Latches a finding, and decides which muscles are isolated because of it.
 
     Attributes:
-        settings: With `on_anomaly`.
+        settings: Settings with `on_anomaly`.
         finding: The latched finding, or None.
-        verification: Of the suspect, while it runs, or None.
-        last_verdict: The last suspect that was verified (its position in T and l), and the verdict.
+        verification: The running verification of the suspect, or None.
+        last_verdict: Index of the last verified suspect, and its verdict.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -64,11 +65,11 @@ class SuspectHandling:
         self.finding: Finding | None = None
         self.verification: Verification | None = None
         self.last_verdict: tuple[int, Verdict] | None = None
-        self._acquitted: list[float] = []  # when suspects were found healthy [s]
+        self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
 
     @property
     def cause(self) -> str:
-        """The latched finding, for people, or ''."""
+        """The latched finding as a text for users, or ''."""
         if self.finding is None:
             return ''
         remedy = REMEDIES.get(self.finding.kind, '')
@@ -77,7 +78,7 @@ class SuspectHandling:
 
     @property
     def last_verification(self) -> str:
-        """The last verdict, for people, or ''."""
+        """The last verdict as a text for users, or ''."""
         if self.last_verdict is None:
             return ''
         muscle, verdict = self.last_verdict
@@ -87,9 +88,9 @@ class SuspectHandling:
         """Take a finding; return the muscles that are isolated from now on.
 
         Args:
-            finding: Of a detector.
-            isolated: The muscles that are isolated so far.
-            now: On a steady clock [s].
+            finding: The finding of a detector.
+            isolated: The muscles isolated so far.
+            now: Time of a steady clock [s].
         """
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE
@@ -100,7 +101,7 @@ class SuspectHandling:
             return (*isolated, muscle)
         if self.finding is not None:
             if finding.kind in REVOKING and self.finding.kind not in REVOKING:
-                isolated = self.clear(isolated)  # whatever was found, it rests on wrong lengths
+                isolated = self.clear(isolated)  # the earlier finding is based on wrong lengths
                 self.finding = finding
             return isolated
         self.finding = finding
@@ -118,20 +119,19 @@ class SuspectHandling:
         if verdict.outcome is Outcome.HEALTHY:
             self._acquitted.append(now)
         else:
-            self.verification = None  # it stays isolated
+            self.verification = None  # the suspect stays isolated
         return self.clear(isolated)
 
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:
         """End the anomaly; return the muscles that are isolated from now on.
 
-        A suspect that is being verified is restored: whoever resets the anomaly declares it
-        healthy.
+        A suspect that is being verified is restored, because a reset declares it healthy.
         """
         suspect = None if self.verification is None else self.verification.muscle
         self.finding = self.verification = None
         return tuple(muscle for muscle in isolated if muscle != suspect)
 
     def on_isolated(self, isolated: Iterable[int]) -> None:
-        """Stop verifying a suspect that is no longer isolated; what was found stays latched."""
+        """Stop verifying a suspect that is no longer isolated; the finding stays latched."""
         if self.verification is not None and self.verification.muscle not in isolated:
             self.verification = None
