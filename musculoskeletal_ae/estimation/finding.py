@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a detector sees, what it may find, and the interface of all detectors."""
+"""Observations and findings of detectors, and the interface of all detectors."""
 
 from __future__ import annotations
 
@@ -33,19 +33,18 @@ class Kind(Enum):
     VALUES_MISSING = 'values_missing'
 
 
-#: findings of lengths that cannot be relied on: unless their muscle is isolated, the length offsets
-#: are not known any more
+#: findings of unreliable lengths; they revoke the length offsets unless their muscle is isolated
 REVOKING = frozenset({Kind.LENGTH_JUMP, Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE})
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One muscle is not as it should be.
+    """A fault of one muscle.
 
     Attributes:
-        muscle: Its position in T and l.
-        kind: Which rule applied.
-        evidence: The figures behind it, for people.
+        muscle: Index of the muscle.
+        kind: Kind of the fault.
+        evidence: The evidence as a text for users.
     """
 
     muscle: int
@@ -55,15 +54,15 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One message, as detectors see it.
+    """One message as the input of the detectors.
 
     Attributes:
-        sample: What was read.
-        estimate: What the network makes of it.
-        demand: T that the modules are commanded [N], (M,); None where nothing is commanded.
-        dt: Time since the message before [s], at most a short pause.
+        sample: The readings.
+        estimate: The network's estimate.
+        demand: T commanded to the muscle modules [N], (M,); None without a command.
+        dt: Time since the previous message [s], at most a short pause.
         lengths_known: Whether the length offsets are known.
-        measured: θ by joint sensors [rad], (D,); None where not all of them are measured.
+        measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
     """
 
     sample: MuscleSample
@@ -111,34 +110,34 @@ def observe(
 
 
 class Detector:
-    """Base class of the detectors. Each looks for one kind of fault, and latches nothing.
+    """Base class of the detectors, each of which detects one kind of fault and latches nothing.
 
-    A new detector overrides `step` or `read`, and what it needs of the rest. It is used once it
-    stands in the list of `HealthMonitor`.
+    A new detector overrides `step` or `read`, and other methods as needed. `HealthMonitor` uses it
+    once it is in its list.
     """
 
     def use(self, mae: Mae) -> None:
-        """Use this network, without the muscles that are isolated in it."""
+        """Use another network; its isolated muscles are ignored."""
 
     def configure(self, settings: Detection) -> None:
         """Use these settings."""
 
     def reset(self) -> None:
-        """Forget what came before, as after a jump of the clock or a reset by the user."""
+        """Reset the detector, for example after a jump of the clock or a reset by the user."""
 
     def accept(self, muscles: Iterable[int]) -> None:
-        """Consider muscles healthy as they are now."""
+        """Consider muscles healthy in their present state."""
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:  # noqa: ARG002
-        """Take the readings of every message, also of one that was rejected.
+        """Take the readings of every message, even of a rejected one.
 
         Args:
-            states: l [m], T [N] and temperature [°C] as they were read, (3, M).
-            usable: Which muscles count, (M,).
-            now: When it came, on a steady clock [s].
+            states: Raw l [m], T [N] and temperature [°C], (3, M).
+            usable: Whether each muscle is used, (M,).
+            now: Time of the message on a steady clock [s].
         """
         return None
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
-        """Take a message of which there is an estimate."""
+        """Take a message for which there is an estimate."""
         return None

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find out whether a suspect muscle is broken, by what it does while it is wound in a little.
+"""Verifies whether a suspect muscle is faulty, by its response to being wound in slightly.
 
-The arm has stopped, and the estimate is made without the suspect already. The controller lowers
-the length command of the suspect by a few millimetres. What the suspect then reads, T and l, is
-compared with the tension that muscle stiffness control demands of it, and with the length l' that
-the other muscles make likely:
+The arm has stopped, and the estimate does not use the suspect. The controller lowers the length
+command of the suspect by a few millimetres. Its readings T and l are compared with the tension that
+muscle stiffness control demands, and with the length l' estimated from the other muscles:
 
     T_ref = T_bias + K (l − l_target)
 
@@ -32,21 +31,21 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.signals.limits import LIMITS
 
-BEGUN = 0.001  # [m] by which the command has fallen when the suspect counts as being wound in
-JUDGED = 0.8  # [s] of being wound in, after which it is judged
-PATIENCE = 8.0  # [s] without an answer
-FAR = 0.025  # [m] between l and l' that noise and the network's error do not explain
-FOLLOWED = 0.005  # [m] by which l − l' falls while the rest of a ruptured tendon is wound in
-USUAL_BIAS = 30.0  # [N] T_bias of the arms that the tensions below hold for; others scale them
-CLOSE = 8.0  # [N] by which T may differ from T_ref
-SHARE = 0.35  # of the demand beyond T_bias, the same
-TIGHT = 20.0  # [N] beyond T_ref: the tendon is pulled although nobody wound it in
-STANDS = 0.0005  # [m] by which a jammed winch moves at most while it is wound in
-FROZEN = 1e-6  # [m], [N] range of the readings of a frozen sensor
+BEGUN = 0.001  # decrease of the command from which on the suspect counts as being wound in [m]
+JUDGED = 0.8  # time of being wound in after which the suspect is classified [s]
+PATIENCE = 8.0  # longest time without being wound in [s]
+FAR = 0.025  # smallest |l − l'| that noise and network errors do not explain [m]
+FOLLOWED = 0.005  # decrease of l − l' that shows the rest of a ruptured tendon being wound in [m]
+USUAL_BIAS = 30.0  # T_bias for which the tensions below apply; for other arms they are scaled [N]
+CLOSE = 8.0  # absolute tolerance of T relative to T_ref [N]
+SHARE = 0.35  # relative tolerance, as a share of T_ref − T_bias
+TIGHT = 20.0  # excess over T_ref that shows a jam although the suspect was not wound in [N]
+STANDS = 0.0005  # largest motion of a jammed muscle module [m]
+FROZEN = 1e-6  # largest range of the readings of a frozen sensor [m], [N]
 
 
 class Outcome(Enum):
-    """What a suspect muscle turned out to be. The values are published in /diagnostics."""
+    """Outcomes of a verification. The values are published in /diagnostics."""
 
     HEALTHY = 'healthy'
     RUPTURED = 'ruptured'
@@ -71,7 +70,7 @@ _TEXTS = {
 
 
 class Verdict(NamedTuple):
-    """The outcome of a verification, and the figures behind it."""
+    """The outcome of a verification, with its evidence."""
 
     outcome: Outcome
     evidence: str = ''  # such as 'by 50 mm'
@@ -82,7 +81,7 @@ class Verdict(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """What the suspect read at one moment while it was wound in."""
+    """Readings of the suspect at one moment while it was wound in."""
 
     tension: float  # T [N]
     length: float  # l [m]
@@ -91,13 +90,13 @@ class _Row(NamedTuple):
 
 
 class Verification:
-    """Watches one suspect muscle, beginning with the message after the one that made it suspect."""
+    """Verifies one suspect muscle, starting with the message after its finding."""
 
     def __init__(self, muscle: int, bias: float, stiffness: float) -> None:
-        """Begin.
+        """Start the verification.
 
         Args:
-            muscle: The position of the suspect in T and l.
+            muscle: Index of the suspect.
             bias: Its T_bias [N].
             stiffness: Its K of muscle stiffness control [N/m].
         """
@@ -105,9 +104,9 @@ class Verification:
         self._scale = min(1.0, bias / USUAL_BIAS)
         self._time = 0.0
         self._highest_command = -math.inf
-        self._before = bias, bias  # T and T_ref where it was not wound in yet
+        self._before = bias, bias  # T and T_ref before it was wound in
         self._rows: list[_Row] = []
-        self._watched = 0.0  # [s] of being wound in
+        self._watched = 0.0  # time of being wound in [s]
 
     def step(
         self, tension: float, length: float, command: float | None, likely: float, dt: float
@@ -117,12 +116,12 @@ class Verification:
         Args:
             tension: T [N].
             length: l [m].
-            command: l_target [m]; None where no length is commanded.
+            command: l_target [m]; None if no length is commanded.
             likely: l' [m].
-            dt: Time since the message before [s].
+            dt: Time since the previous message [s].
 
         Returns:
-            The verdict once there is one.
+            The verdict once the verification is complete, else None.
         """
         self._time += dt
         demand = math.inf
@@ -139,7 +138,7 @@ class Verification:
         if self._time < PATIENCE:
             return None
         if tension > demand + TIGHT * self._scale:
-            return Verdict(Outcome.JAMMED)  # it pulls as if it were wound in already
+            return Verdict(Outcome.JAMMED)  # its tension is high although it was not wound in
         return Verdict(Outcome.NOT_WOUND_IN)
 
     def _judge(self) -> Verdict:
