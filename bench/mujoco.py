@@ -34,7 +34,7 @@ from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import motion, online_learning
-from musculoskeletal_ae.experiments.detection import GraspAndCut, detection, watch
+from musculoskeletal_ae.experiments.detection import GraspAndRupture, detection, run_detector
 from musculoskeletal_ae.experiments.recording import estimation_error, record
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.exporting.mjcf import export
@@ -98,7 +98,7 @@ def measured(study: Study, name: str, seed: int, training: float) -> list[str]:
     cells = [name, str(seed), str(robot.joint_count), str(robot.muscle_count)]
     cells.append(f'{estimation_error(study.network(None), held_out):.4f}')
     for preset in (AS_PRINTED, study.preset):
-        learner, loop = online_learning.beginner(study, study.arm(seed), seed, preset)
+        learner, loop = online_learning.new_learner_and_loop(study, study.arm(seed), seed, preset)
         online_learning.teach(learner, online_learning.explore(loop, learner, 60.0 * study.minutes))
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         cells.append(f'{estimation_error(learner.mae, held_out):.4f}')
@@ -112,11 +112,12 @@ def measured(study: Study, name: str, seed: int, training: float) -> list[str]:
 def detected(study: Study, seed: int) -> list[str]:
     """Return how many ruptures of muscles that carried tension were detected, and rightly named."""
     robot, mae = study.robot, study.network(seed)
-    plan = GraspAndCut(robot, study.held_out_time, seed)
+    plan = GraspAndRupture(robot, study.held_out_time, seed)
+    plan.grasp = -1.0  # never: the printed dumbbell weighs more than some of these arms
     driven = study.network(None)
     cut = record(study.arm(seed), driven, 0xC0 + seed, plan.duration, plan)
     well = record(study.arm(seed), driven, 0xD0 + seed, study.held_out_time)
-    seen, healthy = watch(robot, mae, cut), watch(robot, mae, well)
+    seen, healthy = run_detector(robot, mae, cut), run_detector(robot, mae, well)
     found = detection(robot, plan, seen, healthy, mae)
     count = found['counted_cuts']
     return [f'{round(found[k] * count)} of {count}' for k in ('detected_share', 'named_share')]
