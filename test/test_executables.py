@@ -115,7 +115,7 @@ def test_an_option_that_no_node_has_is_an_error(arguments):
         ('estimator --ros-args -p rate:=fast', 'rate'),
         ('estimator --ros-args -p rate:=', 'rate:='),
         ('estimator --ros-args -p robot:=nowhere', "'nowhere'"),
-        ('replay bag --ros-args -p out:=arm.png', 'options of replay stand before --ros-args'),
+        ('replay bag --ros-args -p out:=arm.png', 'put options of replay before --ros-args'),
     ],
 )
 def test_a_parameter_that_cannot_be_used_is_one_line(command, expected):

@@ -44,7 +44,7 @@ BUTTONS = {
     'call controller/reset': RESET,
     'call estimator/restore': RESTORE,
     'call estimator/zero': CALIBRATE,
-    'controller/explore explores again': EXPLORE,
+    'call controller/explore to explore again': EXPLORE,
 }
 PUSH_STIFFNESS = 200.0  # [N/m] force per distance that the mouse drags
 MOST_PUSH = 60.0  # [N]

@@ -77,8 +77,12 @@ def test_bad_messages_of_a_recording_are_left_out_and_reported(robot, capsys):
         (['--from-bag', '/no/such/bag'], 1, '/no/such/bag'),
         (['--from-bag', str(BAGS / 'rupture'), '--robot', 'arm26'], 1, 'missing joint'),
         (['--hold-out', str(BAGS / 'rupture')], 2, '--from-bag'),
-        (['--from-bag', 'a', '--checkpoint', 'b'], 2, 'not with --checkpoint'),
-        (['--from-bag', str(BAGS / 'rupture'), '--out', str(BAGS / 'rupture/a')], 2, 'replace it'),
+        (['--from-bag', 'a', '--checkpoint', 'b'], 2, 'do not use it with --checkpoint'),
+        (
+            ['--from-bag', str(BAGS / 'rupture'), '--out', str(BAGS / 'rupture/a')],
+            2,
+            'would overwrite a recording',
+        ),
     ],
 )
 def test_wrong_bags_and_options_end_with_one_clear_error(

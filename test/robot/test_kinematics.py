@@ -25,9 +25,9 @@ def test_batched_points_are_where_pinocchio_puts_them(robot):
     for row, placed in zip(theta, points, strict=True):
         pin.framesForwardKinematics(model, data, full_configuration(robot, row))
         expected = [
-            data.oMf[model.getFrameId(link, pin.FrameType.BODY)].act(xyz)
+            data.oMf[model.getFrameId(point.link, pin.FrameType.BODY)].act(point.xyz)
             for route in robot.description.routes
-            for link, xyz in route
+            for point in route
         ]
         np.testing.assert_allclose(placed, expected, atol=1e-12)
 
