@@ -114,7 +114,7 @@ class Scene:
             attack.wait(lambda node=node: node in attack.levels, 'the advice helps', node)
         for steps in [
             *re.findall(r'\(to go on: ([^)]*)\)', said),
-            *re.findall(r'end [^,;]*', said),
+            *re.findall(r'(?:end|stop the) [^,;]*', said),
         ]:
             for step in steps.split('; '):
                 self._do(step)
@@ -122,7 +122,7 @@ class Scene:
     def _do(self, step: str) -> None:
         attack = self.attack
         service = re.search(r'(controller|estimator|learner)/(\w+)', step)
-        if step.startswith('end '):
+        if step.startswith(('end ', 'stop the node')):
             attack.end_strangers()
         elif step.startswith(('repair', 'free', 'check the sensor')):
             attack.set_faults([])
