@@ -5,11 +5,11 @@ It is checked beside the network in use:
 
     postures   Through ①, on a fixed set of postures of the geometric model: what it restores of
                (θ, T, l), and of G. Through ② and ③, the same with the lengths of ①. The root mean
-               square error of each joint or muscle, as a share of what there is to explain, is at
-               most LIMITS. The lengths of a real arm differ from those of the model by centimetres,
-               but ② and ③ have to agree with ①.
-    messages   On the last seconds of the healthy messages of this node: what it leaves of T and l
-               through ②, and of l through ① at the θ of ②. The median of each muscle is at most
+               square error of each joint or muscle is divided by the spread of the true values.
+               This ratio is at most LIMITS. The lengths of a real arm differ from those of the
+               model by centimetres, but ② and ③ have to agree with ①.
+    messages   On the last seconds of healthy messages of this node: the error of T and l through
+               ②, and of l through ① at the θ of ②. The median of each muscle is at most
                WORSE times that of the network in use, or FLOOR. The first network is not checked.
     agreement  On the same messages, θ, and the lengths of ① at the posture. Where joint sensors
                measured it, the median error of each joint and muscle is at most ANGLE_WORSE times

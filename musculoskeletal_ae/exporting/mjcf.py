@@ -106,8 +106,8 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
         spec.compile()
         text = spec.to_xml()
     except (ValueError, mujoco.FatalError) as error:
-        told = f'MuJoCo does not take the exported model: {" ".join(str(error).split())}'
-        raise MusculoskeletalError(f'{out}: {told}') from error
+        message = f'MuJoCo does not take the exported model: {" ".join(str(error).split())}'
+        raise MusculoskeletalError(f'{out}: {message}') from error
     out.mkdir(parents=True, exist_ok=True)
     file = out / 'model.xml'
     file.write_text(text, encoding='utf-8')

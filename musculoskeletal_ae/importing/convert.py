@@ -144,12 +144,12 @@ def play(robot: Robot, file: Path) -> int:
     start = time.process_time()
     arm.step(PLAYED)
     needed = (time.process_time() - start) / PLAYED
-    told = f'played: a second of the model takes {needed:.2g} s of a core'
+    message = f'played: a second of the model takes {needed:.2g} s of a core'
     if needed <= REAL_TIME:
-        print(f'{told}: it runs in real time')
+        print(f'{message}: it runs in real time')
         return 0
     slower = needed / REAL_TIME
-    print(f'{told}: about {slower:.2g} times slower than real time; the nodes run on its clock')
+    print(f'{message}: about {slower:.2g} times slower than real time; the nodes run on its clock')
     return SLOW
 
 
@@ -172,8 +172,8 @@ def arm_verdict(comparison: Comparison) -> str:
     verdict = f'largest moment arm error over {ARM_POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
     verdict += f'; worst [mm]: {named}' if named else ''
     wrong = {name: share for name, share in comparison.flips.items() if share > 0.0}
-    told = ', '.join(f'{name} in {100 * share:.0f} % of postures' for name, share in wrong.items())
-    return f'{verdict}; {f"wrong sign: {told}" if wrong else "all signs agree"}'
+    flips = ', '.join(f'{name} in {100 * share:.0f} % of postures' for name, share in wrong.items())
+    return f'{verdict}; {f"wrong sign: {flips}" if wrong else "all signs agree"}'
 
 
 def check_verdict(check: RobotCheck) -> str:

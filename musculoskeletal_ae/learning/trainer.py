@@ -211,7 +211,7 @@ class TrainerProcess(Trainer):
         self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
 
     def _end(self) -> None:
-        # Kill it at once: the process has no state that this object lacks.
+        # The process may be killed at once: everything that it knows is kept in this object, too.
         if self._process is not None:
             self._process.kill()
             self._process.join(ENDING)

@@ -76,14 +76,14 @@ def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
         seen, terms, master = {slave}, np.polynomial.Polynomial(coupling.terms), coupling.master
         while master in couplings:
             if master in seen:
-                told = f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}'
-                raise ValueError(told)
+                message = f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}'
+                raise ValueError(message)
             seen.add(master)
             terms = terms(np.polynomial.Polynomial(couplings[master].terms))
             master = couplings[master].master
         if len(terms.coef) > MOST_TERMS:
-            told = f'joint {slave!r} follows {master!r} by a polynomial of degree'
-            raise ValueError(f'{told} {len(terms.coef) - 1}; legal: at most {MOST_TERMS - 1}')
+            message = f'joint {slave!r} follows {master!r} by a polynomial of degree'
+            raise ValueError(f'{message} {len(terms.coef) - 1}; legal: at most {MOST_TERMS - 1}')
         result[slave] = Coupling.of_terms(master, terms.coef.tolist())
     return result
 
