@@ -130,7 +130,9 @@ class Planner:
         if not problem:
             return theta, ''
         isolated = robot.names(robot.isolated)
-        problem = f'{problem} without {isolated}; nearest holdable posture: {robot.told(held)}'
+        problem = (
+            f'{problem} without {isolated}; nearest holdable posture: {robot.posture_text(held)}'
+        )
         if not nearest:
             raise MessageError('out of reach', problem)
         return held, f'{problem}; going there'

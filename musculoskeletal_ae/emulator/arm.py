@@ -229,12 +229,12 @@ class EmulatedArm(modules.Arm):
         theta, gear = self.theta, kin.tree.transmission(self.theta)
         inertia = joint_space_inertia(model, data, joint.q)
         bias = pin.nonLinearEffects(model, data, joint.q, joint.velocity)
-        if kin.tree.is_bent:
+        if kin.tree.is_nonlinear:
             turning = self.velocity[kin.tree.theta_index[1:]] ** 2
             bias = bias + inertia @ (kin.tree.curvatures(theta) * turning)
         free = gear.T @ (joint.torque - bias)
         acceleration = np.linalg.solve(gear.T @ inertia @ gear, free)
-        if not kin.tree.is_bent:
+        if not kin.tree.is_nonlinear:
             return gear @ acceleration
         after = kin.tree.angles(theta + STEP * (self.velocity + STEP * acceleration))
         return ((after - joint.q) / STEP - joint.velocity) / STEP

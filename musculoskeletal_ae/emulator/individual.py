@@ -168,7 +168,8 @@ def _objects(
                 objects.side[s] *= scale  # a ring stays one
             continue
         between = (
-            kin.tree.hangs_on[routes.joint[ends[0]]] ^ kin.tree.hangs_on[routes.joint[ends[1]]]
+            kin.tree.descends_from[routes.joint[ends[0]]]
+            ^ kin.tree.descends_from[routes.joint[ends[1]]]
         )
         best = np.inf
         for joint in np.flatnonzero(between & ~kin.tree.prismatic):

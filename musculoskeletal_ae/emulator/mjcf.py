@@ -184,7 +184,7 @@ def _obstacle(
     The object lengthens the tendon by `kink` [m] in at least one posture, or by as much as
     possible. The tendon may slip over it to the other side.
     """
-    between = kin.tree.hangs_on[ends[0][0]] ^ kin.tree.hangs_on[ends[1][0]]
+    between = kin.tree.descends_from[ends[0][0]] ^ kin.tree.descends_from[ends[1][0]]
     joints = np.flatnonzero(between & ~kin.tree.prismatic)
     heads = [(int(joint), np.zeros(3), kin.tree.local_axis[joint]) for joint in joints]
     best, most = (0, np.zeros(3), np.zeros(3), 0.0), 0.0

@@ -52,7 +52,7 @@ from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import residuals
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.robot.jumps import told_of_jumps
+from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
 
@@ -149,7 +149,7 @@ class CheckpointValidator:
     @cached_property
     def _likely(self) -> str:
         """Why the robot description may be the reason and not the network, or ''."""
-        told = told_of_jumps(self._robot)
+        told = jump_warning(self._robot)
         return f' ({told})' if told else ''
 
     @property

@@ -29,4 +29,4 @@ def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
         raise MessageError(
             'out of reach', f'{posture.distance:.3f} m and {posture.angle:.2f} rad are left'
         )
-    return posture.seen
+    return posture.observed_theta

@@ -66,7 +66,7 @@ def _network(core: Estimator, mae: Mae) -> dict[str, str]:
     }
     if mae.covariance is not None:
         spread = np.sqrt(np.diag(mae.covariance))
-        values['joint uncertainty'] = core.robot.told(spread, 3)
+        values['joint uncertainty'] = core.robot.posture_text(spread, 3)
     return values
 
 

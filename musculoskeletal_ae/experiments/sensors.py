@@ -47,7 +47,7 @@ def measure(study: Study, seed: int) -> Measured:
             return None
         pose = camera_reading(robot.kinematics.end_effector_pose(theta), rng)
         guess = learner.mae.estimate(tension[n], length[n]).theta
-        return inverse_kinematics(robot, pose, guess).seen
+        return inverse_kinematics(robot, pose, guess).observed_theta
 
     def tilt(learner: Learner, n: int, theta: Array, _: Array) -> None:
         if n % CAMERA == 0:

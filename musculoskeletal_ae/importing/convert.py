@@ -75,7 +75,7 @@ def read_source(file: Path) -> Source:
         problem = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
         raise refuse(file, f'{problem}; an SDF is read beside its cardsflow.xml')
     if any('/xacro}' in element.tag for element in root.iter()):
-        raise refuse(file, 'it is a xacro: expand it first, by xacro FILE > arm.urdf')
+        raise refuse(file, 'this is a xacro, not a URDF: expand it first, by xacro FILE > arm.urdf')
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)

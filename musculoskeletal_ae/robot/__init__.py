@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the arm is: the nominal body of a robot directory.
+"""The geometric model of an arm, read from a robot directory.
 
-`description` reads it, `robot` puts together what follows from it: `kinematics` (poses, gravity),
+`description` reads the directory. `robot` builds the model from it: `kinematics` (poses, gravity),
 `routes` (muscle lengths and G), `series_elastic` and `stiffness`. `tension` solves for muscle
-tensions, `checks` judges whether the arm can be held.
+tensions, and `checks` tests whether the arm can be held.
 """

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check whether the muscles of an arm can hold it (`check_robot`).
 
-In postures drawn uniformly in the joint limits, the tension nearest to 0.3 T_limit within [bias,
-limit] that holds the arm's own weight; the joint stiffness under muscle stiffness control at that
-tension; and the moment arms
+For postures drawn uniformly within the joint limits, the check computes
 
-    r(θ) = −G(θ)    [m],
+- the tension nearest to 0.3 T_limit within [T_bias, T_limit] that holds the arm's own weight,
+- the joint stiffness under muscle stiffness control (MSC) at that tension, and
+- the moment arms r(θ) = −G(θ) [m], the joint torque for one newton of tension. A muscle with r > 0
+  moves the joint in its positive direction.
 
-the joint torque that one newton of tension makes: r > 0 turns the joint in its positive direction.
-So that all joints have one unit, one that slides is taken as if a pinion of radius RACK turned it:
-where a wire lies along it, r is RACK. doc/explanation/method.md ("An arm must be holdable")
-defines a sound arm. Beside it, not judged: the one-sided stiffness, in which muscles at the bias
-tension count as slack.
+To give all joints the same unit, a prismatic joint is treated as if a pinion of radius RACK moved
+it: a tendon parallel to its axis has r = RACK. doc/explanation/method.md ("An arm must be
+holdable") defines a sound arm. The report also shows the one-sided stiffness, in which muscles at
+the bias tension count as slack; it is not a criterion.
 """
 
 from __future__ import annotations
@@ -35,20 +35,22 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
 
-DESIRED_SHARE = 0.3  # of T_limit: 60 N where that is 200 N
-REQUIRED_SHARE = 0.95
-REQUIRED_STIFFNESS = 5.0  # [N·m/rad], and …
-REQUIRED_BY_LOAD = 2.0  # [1/rad] times the largest load of a joint, where that is less: a tenth
-# more or less of that load is to turn no joint by more than 0.05 rad
-LEAST_INERTIA = 1e-12  # [kg·m²]; less is rounding. Emulated modules add inertia of their own.
-SLACK_MARGIN = 1e-3  # [N] above bias; the solver meets a bound only to rounding
-MATTERS = 0.003  # [m]; a shorter moment arm makes less than 1 N·m with 300 N; or …
-MATTERS_SHARE, MATTERS_LEAST = 0.1, 1e-4  # … of the longest at its joint, if that is less; [m]
-SHORT = 0.015  # [m]; shorter moment arms are off by half of it or more in emulated individuals
+DESIRED_SHARE = 0.3  # of T_limit, for example 60 N of 200 N
+REQUIRED_SHARE = 0.95  # of the postures that must be held, and that must be stiff
+# The required stiffness is the smaller of REQUIRED_STIFFNESS [N·m/rad] and REQUIRED_BY_LOAD [1/rad]
+# times the largest load of a joint. With the latter, a change of that load by a tenth moves no
+# joint by more than 0.05 rad.
+REQUIRED_STIFFNESS, REQUIRED_BY_LOAD = 5.0, 2.0
+LEAST_INERTIA = 1e-12  # [kg·m²]; smaller values are rounding errors
+SLACK_MARGIN = 1e-3  # [N] above T_bias, because the solver meets a bound only to rounding
+# A moment arm counts if it is longer than the smaller of MATTERS [m] (which makes 1 N·m of 300 N)
+# and MATTERS_SHARE of the longest one at its joint, but at least MATTERS_LEAST [m].
+MATTERS, MATTERS_SHARE, MATTERS_LEAST = 0.003, 0.1, 1e-4
+SHORT = 0.015  # [m]; in emulated individuals, shorter moment arms deviate by half or more
 TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
-TOUCHED = 1e-6  # [m] by which what a wire wraps round makes it longer; less is rounding
-LONGEST_ARM = 1.0  # [m]; a longer moment arm is one in millimetres
-WIDEST = 4.0 * np.pi, 10.0  # limits further apart are degrees [rad] or millimetres [m]
+TOUCHED = 1e-6  # [m] added by wrapping; less is a rounding error
+LONGEST_ARM = 1.0  # [m]; a longer moment arm is taken to be in millimetres
+WIDEST = 4.0 * np.pi, 10.0  # wider joint limits are taken to be degrees [rad], millimetres [m]
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
 
@@ -60,17 +62,17 @@ class FindingTexts(Strict, frozen=True, array_like=True):
     remedy: str
 
 
-#: texts by kind; what stands after a comma distinguishes variants of one kind
+#: texts by kind; the part after a comma distinguishes variants of a kind
 FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
 
 
 class Finding(NamedTuple):
     """A fault or warning about a robot, with its remedy."""
 
-    kind: str  # one word, such as 'wrong_sign'
-    message: str  # names muscles and joints
-    remedy: str = ''  # '' for 'not_held' and 'not_stiff', whose remedies `remedies` finds
-    joint: int = -1  # for 'not_held' and 'not_stiff': the joint that is the weakest most often
+    kind: str  # an identifier, such as 'wrong_sign'
+    message: str  # names the muscles and joints
+    remedy: str = ''  # '' for 'not_held' and 'not_stiff': `remedies` computes theirs
+    joint: int = -1  # for 'not_held' and 'not_stiff': the joint that is weakest most often
 
 
 class Setting(NamedTuple):
@@ -106,8 +108,8 @@ class RobotCheck:
     one_sided: Array  # the same with muscles at the bias tension slack, (N,)
     required: float  # required stiffness [N·m/rad]
     matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
-    faults: tuple[Finding, ...]  # why the arm is not sound; empty if it is
-    warnings: tuple[Finding, ...]  # questionable points that do not make the arm unsound
+    faults: tuple[Finding, ...]  # reasons why the arm is not sound; empty if it is
+    warnings: tuple[Finding, ...]  # questionable properties that do not make the arm unsound
 
     @property
     def held(self) -> Bools:
@@ -121,7 +123,7 @@ class RobotCheck:
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
-    """Check a robot in random postures.
+    """Check a robot in random postures, and its description.
 
     Args:
         robot: The robot.
@@ -154,9 +156,9 @@ def judge(setting: Setting) -> RobotCheck:
     longest = np.abs(arms).max(axis=(0, 1))
     matters = np.clip(MATTERS_SHARE * longest, MATTERS_LEAST, MATTERS)
     for n, (at, weight) in enumerate(zip(jacobian, torque, strict=True)):
-        found = least_tension(at, weight, bias, limit, DESIRED_SHARE * limit)
-        missing[n] = found.missing_torque
-        tension[n] = np.nan if missing[n].any() else found.tension
+        exertion = least_tension(at, weight, bias, limit, DESIRED_SHARE * limit)
+        missing[n] = exertion.missing_torque
+        tension[n] = np.nan if missing[n].any() else exertion.tension
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
@@ -178,38 +180,49 @@ def judge(setting: Setting) -> RobotCheck:
     return RobotCheck(setting, arms, *measured, faults, warnings)
 
 
-class Words(NamedTuple):
-    """How a moment arm at a joint is told: where it slides, as a share of the tension."""
+class ArmTerms(NamedTuple):
+    """Unit and wording for moment arms at a joint.
 
-    scale: float
+    At a prismatic joint they are given as the share of the tension that acts along its axis.
+    """
+
+    scale: float  # [1/m]
     unit: str
     name: str
-    long: str  # what it is where it is large
-    other: str  # where a wire pulls the other way
-    better: str  # where it pulls more surely
+    other: str  # where to route a muscle that must act in the other direction
+    better: str  # where to route a muscle for a larger moment arm
 
     def decimals(self, longest: float) -> int:
-        """Return how many decimals tell moment arms beside the longest of them [m]."""
+        """Return the number of decimals for moment arms, the longest of which is given [m]."""
         return int(self.scale * longest < 10.0)
 
 
-def words(robot: Robot, joint: int) -> Words:
-    """Return how moment arms at a joint are told."""
+def arm_terms(robot: Robot, joint: int) -> ArmTerms:
+    """Return unit and wording for moment arms at a joint."""
     if robot.kinematics.slides[joint]:
-        return Words(100.0 / RACK, '%', 'pull', 'strong', 'towards the other end of', 'more along')
-    return Words(1e3, 'mm', 'moment arm', 'long', 'along the other side of', 'further from')
+        towards_other_end = 'towards the other end of'
+        return ArmTerms(100.0 / RACK, '%', 'force share', towards_other_end, 'more parallel to')
+    return ArmTerms(1e3, 'mm', 'moment arm', 'to the other side of', 'further from')
 
 
 def required_stiffness(robot: Robot, required: float) -> str:
-    """Say the least eigenvalue [N·m/rad], and what that is where a joint slides."""
-    sliding = f' (where it slides, {required / RACK**2:.0f} N/m)'
-    return f'{required:.2g} N·m/rad' + sliding * bool(robot.kinematics.slides.any())
+    """Return the required eigenvalue [N·m/rad], and its equivalent for prismatic joints."""
+    text = f'{required:.2g} N·m/rad'
+    if robot.kinematics.slides.any():
+        text += f' ({required / RACK**2:.0f} N/m for prismatic joints)'
+    return text
 
 
-def figure(value: float, least: int = 1, largest: float | None = None) -> str:
-    """Return a value with two digits of the largest told beside it (default: of itself).
+def rounded_text(value: float, least: int = 1, largest: float | None = None) -> str:
+    """Return a value with two significant digits of the largest value beside it.
 
-    It has `least` decimals or more, and no sign where it is told as zero.
+    Args:
+        value: The value.
+        least: Smallest number of decimals.
+        largest: The largest value that is shown beside it; None: the value itself.
+
+    Returns:
+        The number; without a sign if it rounds to zero.
     """
     size = abs(value if largest is None else largest)
     decimals = max(least, 1 - int(np.floor(np.log10(size)))) if size else least
@@ -217,10 +230,12 @@ def figure(value: float, least: int = 1, largest: float | None = None) -> str:
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
-    """Return (muscle, joint) → ±1 of `moment_arms.csv`; nothing if there is no such file.
+    """Return the signs that `moment_arms.csv` declares, as (muscle, joint) → ±1.
+
+    The result is empty if there is no such file.
 
     Raises:
-        RobotDescriptionError: Naming the file, the line and the legal values.
+        RobotDescriptionError: If the file is invalid; names the line and the legal values.
     """
     file = description.directory / DECLARATION_FILE
     legal = (description.muscles, description.joints, ('+', '-'))
@@ -244,31 +259,31 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     return actions
 
 
-def _finding(key: str, **seen: object) -> Finding:
-    """Return one of the FINDINGS, with what its texts name."""
+def _finding(key: str, **fields: object) -> Finding:
+    """Return the finding with this key in FINDINGS, with the fields of its texts filled in."""
     texts = FINDINGS[key]
     kind = key.partition(',')[0]
-    return Finding(kind, texts.message.format(**seen), texts.remedy.format(**seen))
+    return Finding(kind, texts.message.format(**fields), texts.remedy.format(**fields))
 
 
 def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Declared actions that too many postures contradict."""
+    """Yield declared signs that too many postures contradict."""
     for (muscle, joint), sign in read_declared_actions(robot.description).items():
-        arm, told = moment_arms[:, muscle, joint], words(robot, joint)
+        arm, terms = moment_arms[:, muscle, joint], arm_terms(robot, joint)
         against = np.mean(arm * sign <= 0.0)
         expected, actual = '+-' if sign > 0 else '-+'
         if not arm.any():
-            actual = '0, it does not cross the joint,'
+            actual = '0 (it does not cross the joint)'
         if against > TOLERATED_SHARE:
             yield _finding(
-                'wrong_sign', muscle=robot.muscles[muscle], joint=robot.joints[joint], told=told,
+                'wrong_sign', muscle=robot.muscles[muscle], joint=robot.joints[joint], terms=terms,
                 expected=expected, actual=actual, against=100 * against,
-                median=told.scale * np.median(arm), file=DECLARATION_FILE,
+                median=terms.scale * np.median(arm), file=DECLARATION_FILE,
             )  # fmt: skip
 
 
 def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
-    """Joints that too often have muscles on one side only."""
+    """Yield joints that have muscles on one side only in too many postures."""
     lacks = {
         '+': np.max(moment_arms, axis=1) <= matters,
         '-': np.min(moment_arms, axis=1) >= -matters,
@@ -281,29 +296,35 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
             for sign, lacking in lacks.items()
             if lacking[:, joint].any()
         )
-        told = words(robot, joint)
-        decimals = told.decimals(longest[:, joint].max())
+        terms = arm_terms(robot, joint)
+        decimals = terms.decimals(longest[:, joint].max())
         acting = ', '.join(
-            f'{robot.muscles[m]} ({told.scale * median[m, joint]:+.{decimals}f} {told.unit})'
+            f'{robot.muscles[m]} ({terms.scale * median[m, joint]:+.{decimals}f} {terms.unit})'
             for m in np.flatnonzero(longest[:, joint] > matters[joint])
         )
-        seen = {'joint': robot.joints[joint], 'missing': missing, 'acting': acting, 'told': told}
-        yield _finding('one_way_joint' if acting else 'one_way_joint, idle', **seen)
+        key = 'one_way_joint' if acting else 'one_way_joint, idle'
+        yield _finding(key, joint=robot.joints[joint], missing=missing, acting=acting, terms=terms)
 
 
 def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
-    along = ', along one that slides' * bool(robot.kinematics.slides.any())
+    """Yield muscles that have no effective moment arm at any joint."""
+    along = ', or parallel to that of a prismatic joint' * bool(robot.kinematics.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arms < matters).all():
-            told, least = words(robot, int(arms.argmax())), 1e3 * matters.max()
-            seen = {'arm': told.scale * arms.max(), 'least': least, 'along': along}
-            yield _finding('useless_muscle', muscle=muscle, told=told, **seen)
+            terms, least = arm_terms(robot, int(arms.argmax())), 1e3 * matters.max()
+            fields = {'arm': terms.scale * arms.max(), 'least': least, 'along': along}
+            yield _finding('useless_muscle', muscle=muscle, terms=terms, **fields)
 
 
 def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
-    """Return the joint that each muscle acts on most, and where it acts the other way, both (M,).
+    """Return the joint on which each muscle acts most, and how often it acts in reverse there.
 
-    That is a share of the postures; moment arms (N, M, D).
+    Args:
+        moment_arms: r [m] in N postures, (N, M, D).
+
+    Returns:
+        Index of the joint, (M,), and the share of postures with the sign opposite to the median,
+        (M,).
     """
     median, muscles = np.median(moment_arms, axis=0), np.arange(moment_arms.shape[1])
     main = np.abs(median).argmax(axis=1)
@@ -312,16 +333,16 @@ def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
 
 
 def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Muscles whose main action changes sign over the range."""
+    """Yield muscles whose main action changes its sign within the joint limits."""
     for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
         if against > TOLERATED_SHARE:
             names = {'muscle': robot.muscles[m], 'joint': robot.joints[joint]}
-            told = words(robot, joint)
-            yield _finding('flipping_muscle', **names, against=100 * against, told=told)
+            terms = arm_terms(robot, joint)
+            yield _finding('flipping_muscle', **names, against=100 * against, terms=terms)
 
 
 def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Numbers that look like millimetres or degrees."""
+    """Yield values that look like millimetres or degrees."""
     longest, slides = np.abs(moment_arms).max(axis=0), robot.kinematics.slides
     for m, j in np.argwhere((longest > LONGEST_ARM) & ~slides).tolist():
         names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
@@ -329,15 +350,13 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     for j, (low, high) in enumerate(zip(robot.lower, robot.upper)):
         if high - low > WIDEST[int(slides[j])]:
             wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
-            told = {'low': low, 'high': high, 'unit': robot.units[j].theta, 'wrong': wrong}
-            yield _finding('other_units, limits', joint=robot.joints[j], **told)
+            limits = {'low': low, 'high': high, 'unit': robot.units[j].theta}
+            yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
 
 
 def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Joints beside whose moment arms the errors that are emulated and learned are no small ones.
-
-    A joint on which no muscle acts is a fault of its own.
-    """
+    """Yield joints whose moment arms are short compared with the emulated and learned errors."""
+    # A joint without muscles is reported as a one-way joint.
     longest = np.abs(moment_arms).max(axis=(0, 1))
     small = np.flatnonzero((longest > MATTERS_LEAST) & (longest < SHORT)).tolist()
     if small:
@@ -346,15 +365,15 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
-    """Muscles whose wire slips to the other side of what it wraps round."""
+    """Yield muscles whose tendon slips over an object that it wraps around."""
     for m, size, theta in jumping_muscles(robot):
-        turns = np.flatnonzero(robot.routes.crossed[m])
-        place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in turns)
+        crossed = np.flatnonzero(robot.routes.crossed[m])
+        place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in crossed)
         yield _finding('jumping_muscle', muscle=robot.muscles[m], size=1e3 * size, place=place)
 
 
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
-    """What wires should wrap round, and touch in no posture."""
+    """Yield objects that a tendon should wrap around, but touches in no posture."""
     described = [
         f'{muscle} ({"sphere" if item.axis is None else "cylinder"} of '
         f'{round(1e3 * item.radius, 1):g} mm on {item.link})'
@@ -363,24 +382,30 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
         if isinstance(item, Wrap)
     ]
     touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > TOUCHED
-    if idle := [told for told, touches in zip(described, touched, strict=True) if not touches]:
+    if idle := [text for text, touches in zip(described, touched, strict=True) if not touches]:
         yield _finding('idle_object', objects=', '.join(idle))
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
+    """Yield joints that move no mass."""
     kin = robot.kinematics
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
     for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):
-        told = f'{least[j]:.2g} kg' if kin.slides[j] else f'inertia {least[j]:.2g} kg·m²'
-        yield _finding('no_inertia', joint=robot.joints[j], moved=told)
+        moved = f'{least[j]:.2g} kg' if kin.slides[j] else f'inertia {least[j]:.2g} kg·m²'
+        yield _finding('no_inertia', joint=robot.joints[j], moved=moved)
 
 
 def _holding_faults(
     robot: Robot, stiffness: Array, least: float, softest: Ints, missing: Array
 ) -> Iterator[Finding]:
-    """Shares that are too low, with the least stiffness eigenvalue [N·m/rad] that is enough.
+    """Yield the faults that too few postures are held, or stiff.
 
-    `softest` is of the postures that are held but not stiff.
+    Args:
+        robot: The robot.
+        stiffness: Smallest stiffness eigenvalue [N·m/rad], NaN where not held, (N,).
+        least: Required stiffness [N·m/rad].
+        softest: Softest joint of each posture that is held but not stiff.
+        missing: Missing torque [N·m], (N, D).
     """
     held, stiff = np.isfinite(stiffness), stiffness >= least
     required, worst = 100 * REQUIRED_SHARE, -1
@@ -389,7 +414,7 @@ def _holding_faults(
         most = lack.argmax(axis=1)
         counts = Counter(sorted(most.tolist())).most_common()
         own, units = lack / robot.kinematics.radian, robot.units
-        each = {k: figure(own[most == k, k].max(), 2) for k, _ in counts}
+        each = {k: rounded_text(own[most == k, k].max(), 2) for k, _ in counts}
         where = ', '.join(
             f'{robot.joints[k]} in {count} (up to {each[k]} {units[k].torque})'
             for k, count in counts
@@ -403,12 +428,14 @@ def _holding_faults(
     if stiff.mean() < REQUIRED_SHARE:
         counts = Counter(sorted(softest.tolist())).most_common()
         where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts) or 'none'
-        told = 'not stiff'
+        problem = 'not stiff'
         if (unstable := stiffness < 0.0).any():
-            told = f'unstable in {100 * unstable.mean():.1f} % of postures, with an eigenvalue of '
-            lowest = figure(stiffness[unstable].min())
-            told += f'its stiffness down to {lowest} N·m/rad, and not stiff'
+            lowest = rounded_text(stiffness[unstable].min())
+            problem = (
+                f'unstable in {100 * unstable.mean():.1f} % of postures, with a stiffness '
+                f'eigenvalue down to {lowest} N·m/rad, and not stiff'
+            )
         yield _finding(
-            'not_stiff', told=told, stiff=100 * stiff.mean(),
+            'not_stiff', problem=problem, stiff=100 * stiff.mean(),
             least=required_stiffness(robot, least), required=required, where=where,
         )._replace(joint=counts[0][0] if counts else worst)  # fmt: skip

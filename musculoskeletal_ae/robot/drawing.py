@@ -80,7 +80,7 @@ def _within(line: Line, middle: Array, reach: float) -> Line:
 
 
 def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool = True) -> None:
-    """Draw lines in true proportions, from the front and from the side, and save the picture.
+    """Draw lines in true proportions, seen from the front and from the side, and save them.
 
     Args:
         lines: The lines.

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tree of joints: how they hang on each other, and their poses for many postures at once.
+"""The tree of joints, and the poses of all joints for many postures at once.
 
-The pose of a joint in its parent is its fixed placement times, by Rodrigues,
+The pose of a revolute joint in its parent is its fixed placement times (Rodrigues' formula)
 
     exp([a]ₓ θ) = 1 + sin θ [a]ₓ + (1 − cos θ) [a]ₓ²
 
-or 1 + θ a for one that slides: a sum of constant matrices, the same operation for every joint.
+and that of a prismatic joint its fixed placement times the translation θ a. Both are sums of
+constant matrices, so that all joints are computed by the same operation.
 
-A coupled joint of the tree turns by a polynomial of the joint that it follows, q = Σ c_k θ_masterᵏ;
-most often that is a line. With A(θ) = ∂q/∂θ, what pinocchio says of all joints of the tree becomes
-Aᵀ g, Aᵀ M A and J A.
+The position of a coupled joint is a polynomial of its master, q = Σ c_k θ_masterᵏ, usually a linear
+one. With A(θ) = ∂q/∂θ, pinocchio's gravity g, inertia M and Jacobian J of all joints of the tree
+become Aᵀ g, Aᵀ M A and J A for θ.
 """
 
 from __future__ import annotations
@@ -34,20 +35,21 @@ class JointPoses(NamedTuple):
     axis: Array  # (N, J, 3); zero at index 0
 
 
-MOST_TERMS = 17  # of a coupling's polynomial: one of degree 4 that follows another of degree 4
+# Coefficients of a coupling's polynomial: degree 16, as two chained couplings of degree 4 need.
+MOST_TERMS = 17
 
 
 class Coupling(NamedTuple):
     """A joint that follows another: q = offset + ratio · θ_master + Σ higher_k · θ_masterᵏ⁺²."""
 
-    master: str  # a joint that follows none
+    master: str  # after `resolved`, a joint that is not coupled itself
     ratio: float
     offset: float  # [rad] or [m]
     higher: tuple[float, ...] = ()  # coefficients of the second power and those above
 
     @classmethod
     def of_terms(cls, master: str, terms: Sequence[float]) -> Coupling:
-        """Return a coupling by the coefficients of all powers, the constant first."""
+        """Return the coupling with these coefficients of all powers, the constant first."""
         offset, ratio, *higher = [*map(float, terms), 0.0, 0.0][: max(2, len(terms))]
         while higher and higher[-1] == 0.0:
             higher.pop()
@@ -59,26 +61,30 @@ class Coupling(NamedTuple):
         return self.offset, self.ratio, *self.higher
 
     def value(self, master: Array | float) -> Array:
-        """Return where the joint is when its master is somewhere [rad] or [m]."""
+        """Return the position q of the joint [rad] or [m] for the position of its master."""
         return polyval(np.asarray(master), np.array(self.terms))
 
     def __str__(self) -> str:
-        """Return the equation, as 'q = 0.5 · elbow +0.1'."""
+        """Return the right side of the equation, such as '0.5 · elbow +0.1'."""
         powers = [f'{c:+g} · {self.master}^{k}' for k, c in enumerate(self.higher, 2) if c]
         offset = [f'{self.offset:+g}'] if self.offset else []
         return ' '.join([f'{self.ratio:g} · {self.master}', *powers, *offset])
 
 
 def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
-    """Return couplings to joints that follow none; a ValueError names one that follows itself."""
+    """Return chained couplings as direct ones, whose masters are not coupled themselves.
+
+    Raises:
+        ValueError: If a joint follows itself, or by a polynomial with too many terms.
+    """
     result = {}
     for slave, coupling in couplings.items():
-        seen, terms, master = {slave}, np.polynomial.Polynomial(coupling.terms), coupling.master
+        chain, terms, master = {slave}, np.polynomial.Polynomial(coupling.terms), coupling.master
         while master in couplings:
-            if master in seen:
-                message = f'joint {slave!r} follows itself, over {", ".join(sorted(seen))}'
-                raise ValueError(message)
-            seen.add(master)
+            if master in chain:
+                joints = ', '.join(sorted(chain))
+                raise ValueError(f'joint {slave!r} follows itself; joints of the loop: {joints}')
+            chain.add(master)
             terms = terms(np.polynomial.Polynomial(couplings[master].terms))
             master = couplings[master].master
         if len(terms.coef) > MOST_TERMS:
@@ -89,7 +95,7 @@ def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
 
 
 def polyval(x: Array, terms: Array) -> Array:
-    """Return Σ c_k xᵏ by Horner's rule; the coefficients stand in the last axis, constant first."""
+    """Return Σ c_k xᵏ by Horner's rule; the last axis of `terms` holds c_k, the constant first."""
     result = np.broadcast_to(terms[..., -1], x.shape)
     for k in range(terms.shape[-1] - 2, -1, -1):
         result = result * x + terms[..., k]
@@ -97,7 +103,7 @@ def polyval(x: Array, terms: Array) -> Array:
 
 
 def derivative(terms: Array) -> Array:
-    """Return the coefficients of the derivatives of polynomials, (..., K) gives (..., K)."""
+    """Return the coefficients of the derivatives of polynomials; (..., K) maps to (..., K)."""
     result = np.zeros_like(terms)
     result[..., :-1] = terms[..., 1:] * np.arange(1, terms.shape[-1])
     return result
@@ -111,36 +117,36 @@ def joint_axis(joint: pin.JointModel) -> Array:
 
 
 class JointTree:
-    """The joints of a pinocchio model, by pinocchio's number; 0 is the root link.
+    """The joints of a pinocchio model, indexed as in pinocchio; index 0 is the root link.
 
     Attributes:
-        order: Position in pinocchio's q and v of each entry of θ, (D,).
-        parent: Of each joint, (J,).
-        placement_rotation: Fixed placement in the parent, (J, 3, 3).
-        placement_translation: The same [m], (J, 3).
-        prismatic: Whether a joint slides, (J,).
-        local_axis: In the joint's own frame, (J, 3).
+        order: Index in pinocchio's q and v of each entry of θ, (D,).
+        parent: Index of each joint's parent, (J,).
+        placement_rotation: Rotation of the fixed placement in the parent, (J, 3, 3).
+        placement_translation: Translation of the fixed placement [m], (J, 3).
+        prismatic: Whether each joint is prismatic, (J,).
+        local_axis: Axis in the joint's own frame, (J, 3).
         placements: Fixed placement in the parent, homogeneous, (J, 4, 4).
         first: The pose in the parent is placement + a(θ) · first + b(θ) · second, (J, 4, 4).
         second: See `first`.
-        theta_index: Position in θ of what moves a joint, -1 for the root link, (J,).
+        theta_index: Index in θ of the entry that moves each joint, -1 for the root link, (J,).
         terms: Coefficients of q = Σ terms_k θᵏ, the constant first, (J, K).
         is_coupled: Whether there are coupled joints.
-        is_bent: Whether some of them do not follow by a line.
-        moved_by: 1 where a joint of θ moves a joint of the tree, (J−1, D).
-        hangs_on: hangs_on[i, j]: joint i is joint j, or hangs on it, (J, J).
+        is_nonlinear: Whether a coupling is not linear.
+        moved_by: 1 where an entry of θ moves a joint of the tree, else 0, (J−1, D).
+        descends_from: Entry [i, j] is true if joint i is joint j or a descendant of it, (J, J).
     """
 
     def __init__(
         self, model: pin.Model, joints: Sequence[str], couplings: Mapping[str, Coupling]
     ) -> None:
-        """Take the tree of a model whose joints are those of θ and those coupled to them."""
+        """Read the tree of a model whose joints are those of θ and those coupled to them."""
         count, ids = model.njoints, [model.getJointId(name) for name in joints]
 
         self.order = np.array([model.joints[i].idx_q for i in ids])
         self.parent = np.array(model.parents)
-        #: joints whose parent is another one, with that
-        self._hanging = [(i, parent) for i, parent in enumerate(self.parent.tolist()) if parent > 0]
+        #: pairs (joint, parent) of the joints whose parent is not the root link
+        self._with_parent = [(i, up) for i, up in enumerate(self.parent.tolist()) if up > 0]
         self.placement_rotation = np.stack([m.rotation for m in model.jointPlacements])
         self.placement_translation = np.stack([m.translation for m in model.jointPlacements])
         self.prismatic = np.array([joint.shortname() in PRISMATIC for joint in model.joints])
@@ -163,11 +169,11 @@ class JointTree:
             i = model.getJointId(name)
             self.theta_index[i] = list(joints).index(coupling.master)
             self.terms[i] = [*coupling.terms, *[0.0] * (most - len(coupling.terms))]
-        self.is_coupled, self.is_bent = bool(couplings), most > 2
+        self.is_coupled, self.is_nonlinear = bool(couplings), most > 2
         self.moved_by: Array = 1.0 * np.eye(len(ids))[self.theta_index[1:]]
-        self.hangs_on = np.eye(count, dtype=bool)
+        self.descends_from = np.eye(count, dtype=bool)
         for i in range(1, count):
-            self.hangs_on[i] |= self.hangs_on[self.parent[i]]
+            self.descends_from[i] |= self.descends_from[self.parent[i]]
 
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
@@ -182,14 +188,14 @@ class JointTree:
         return self.placements + first * self.first + second * self.second
 
     def transforms(self, theta: Array) -> Array:
-        """Return homogeneous poses (N, J, 4, 4) in the root link's frame, index 0; θ (N, D)."""
+        """Return homogeneous poses (N, J, 4, 4) of joints in the root link's frame; θ (N, D)."""
         poses = self.in_parents(theta)
-        for i, parent in self._hanging:
+        for i, parent in self._with_parent:
             poses[:, i] = poses[:, parent] @ poses[:, i]
         return poses
 
     def joint_poses(self, theta: Array) -> JointPoses:
-        """Return the poses of all joints in parts, for θ of shape (N, D)."""
+        """Return the poses of all joints in the root link's frame, for θ of shape (N, D)."""
         poses = self.transforms(theta)
         rotation = poses[..., :3, :3]
         axis = np.einsum('njab,jb->nja', rotation, self.local_axis)
@@ -214,20 +220,20 @@ class JointTree:
         return self.ratios(theta)[:, None] * self.moved_by
 
     def of_theta(self, values: Array, theta: Array) -> Array:
-        """Return what belongs to θ of torques or derivatives for q.
+        """Return torques or derivatives with respect to θ, of those with respect to q.
 
-        At θ (*N, D), of values (*N, ..., J−1) that gives (*N, ..., D).
+        At θ (*N, D), values of shape (*N, ..., J−1) are mapped to (*N, ..., D).
         """
         if not self.is_coupled:
-            mine: Array = values[..., self.order]
-            return mine
+            of_joints: Array = values[..., self.order]
+            return of_joints
         ratios = self.ratios(theta)
         between = (1,) * (values.ndim - ratios.ndim)
         return (values * ratios.reshape(*ratios.shape[:-1], *between, -1)) @ self.moved_by
 
     def of_both(self, matrix: Array, theta: Array) -> Array:
-        """Return Aᵀ B A (D, D) of a matrix B (J−1, J−1), at θ (D,)."""
+        """Return Aᵀ B A (D, D) for a matrix B (J−1, J−1), at θ (D,)."""
         if not self.is_coupled:
             return self.of_theta(self.of_theta(matrix, theta).T, theta).T
-        gear = self.transmission(theta)
-        return gear.T @ matrix @ gear
+        transmission = self.transmission(theta)
+        return transmission.T @ matrix @ transmission

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find tendons whose length jumps while the arm moves smoothly.
 
-A tendon with a `side` can pass the end of the body that it wraps around. It then slips to the other
-side at once, as in MuJoCo, and its length jumps by centimetres. No network restores such a length.
+A tendon with a `side` can slip over the end of the object that it wraps around. As in MuJoCo, it
+then changes sides at once, and its length jumps by centimetres. No network can represent this.
 """
 
 from collections.abc import Callable
@@ -13,23 +13,26 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.robot import Robot
 
 LINES, STEPS = 60, 400  # lines between random postures, and steps along each
-JUMP = 0.001  # [m] second difference per step; that of smooth lengths is a hundred times smaller
-LEAST_RANGE = 0.3  # share of a joint's range that a limit against jumps has to keep
+JUMP = 0.001  # [m] second difference per step; smooth lengths stay a hundred times below it
+LEAST_RANGE = 0.3  # share of its range that a joint must keep if a limit is to avoid jumps
 RANGE_MARGIN = 0.03  # share of the range between such a limit and the jumps
-REDRAWN = 50  # times that a jumping wire's points are drawn again for an individual, at most
+REDRAWN = 50  # attempts to draw points of an emulated individual that make no tendon jump
 
 
 def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the largest jump of each length [m] (M,), and at which θ [rad] (M, D).
+    """Return the largest jump of each length [m] (M,), and its θ [rad] (M, D).
 
-    `lengths` gives (N, M) of θ (N, D); they are followed between postures within the limits (D,).
+    Args:
+        lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
+        lower: Lower joint limits [rad], (D,).
+        upper: Upper joint limits [rad], (D,).
     """
     bends, theta = _followed(lengths, lower, upper)
     return bends.max(axis=0), theta[bends.argmax(axis=0)]
 
 
 def _followed(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return how much lengths bend within a step [m] (N, M), and at which θ [rad] (N, D)."""
+    """Return second differences of lengths along lines [m] (N, M), and their θ [rad] (N, D)."""
     joints = len(lower)
     ends = np.random.default_rng(0).uniform(lower, upper, (2, LINES, 1, joints))
     theta = ends[0] + np.linspace(0.0, 1.0, STEPS)[:, None] * (ends[1] - ends[0])
@@ -39,7 +42,7 @@ def _followed(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> 
 
 
 def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
-    """Return which of such lengths jump within a robot's limits, (M,)."""
+    """Return which of M lengths, a function of θ, jump within a robot's joint limits, (M,)."""
     return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 
@@ -51,15 +54,19 @@ def jumping_muscles(robot: Robot) -> list[tuple[int, float, Array]]:
     return [(m, largest[m], where[m]) for m in np.flatnonzero(largest > JUMP).tolist()]
 
 
-def told_of_jumps(robot: Robot) -> str:
-    """Say which muscles no network restores, and by how much they jump; '' if there are none."""
+def jump_warning(robot: Robot) -> str:
+    """Return a warning that names the muscles whose lengths jump, or '' if there are none."""
     each = [f'{robot.muscles[m]} ({1e3 * size:.0f} mm)' for m, size, _ in jumping_muscles(robot)]
-    told = 'no network restores lengths that jump where a wire slips to the other side of what it '
-    return f'{told}wraps round: {", ".join(each)}; see check_robot' if each else ''
+    if not each:
+        return ''
+    problem = (
+        'no network can represent lengths that jump where a tendon slips over a wrapped object'
+    )
+    return f'{problem}: {", ".join(each)}; see check_robot'
 
 
 def jump_choices(robot: Robot) -> list[str]:
-    """Return lines that name jumping lengths, their postures, and what can be done about them."""
+    """Return lines that name jumping muscles and their postures, and the possible remedies."""
     if robot.routes.objects is None:
         return []
     bends, theta = _followed(robot.routes.absolute_lengths, robot.lower, robot.upper)
@@ -78,15 +85,15 @@ def jump_choices(robot: Robot) -> list[str]:
     if lines:
         together = ','.join(jumping_names)
         lines.append(
-            'no network restores lengths that jump. Limit a joint (in the source, or in '
+            'no network can represent lengths that jump. Limit a joint (in the source, or in '
             f'robot.urdf), leave the muscles out (--without {together}), or accept that estimates '
-            'are wrong near these postures, and that nodes may refuse the network'
+            'are wrong near these postures and that nodes may reject the network'
         )
     return lines
 
 
 def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Return the limit of a joint that keeps most of its range without jumps at θ (N, D), or ''."""
+    """Return the joint limit that excludes jumps at θ (N, D) and keeps most of the range, or ''."""
     best, text = LEAST_RANGE, ''
     for j in crossed:
         low, high = robot.lower[j], robot.upper[j]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body kinematics and dynamics of the arm by pinocchio, in the order of θ of muscles.yaml.
+"""Rigid-body kinematics and dynamics of the arm, with θ in the order of muscles.yaml.
 
-Pinocchio reads the URDF and answers for single postures: poses of links, gravity, inertia,
-Jacobians. Training, learning and the view ask for the poses of thousands of postures at once; those
-come from the same placements in `joint_tree.py` (a test holds the two together).
+Pinocchio reads the URDF and computes link poses, gravity, inertia and Jacobians of single postures.
+Training, learning and the view need the poses of thousands of postures at once; `joint_tree.py`
+computes these from the same placements. A test compares the two.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.joint_tree import Coupling, JointTree
 
-#: [m] that a joint slides count as one radian of one that turns, wherever both are judged alike:
-#: the radius of the pinion by which a joint module moves what slides; chosen
+#: [m] travel of a prismatic joint that counts as one radian of a revolute joint, wherever both are
+#: treated alike: the radius of an assumed rack's pinion
 RACK = 0.06
 
 
@@ -43,9 +43,10 @@ def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
 
 
 def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
-    """Return a model with joints locked; a link may have the name of a joint, or be 'universe'.
+    """Return a copy of the model with these joints locked at a configuration q.
 
-    Pinocchio looks frames up by name alone there, and refuses or mistakes those that share one.
+    A link may have the name of a joint, or be called 'universe'. `buildReducedModel` looks frames
+    up by name and would reject or confuse such frames, so all frames get unique names meanwhile.
     """
     named, names = model.copy(), dict[str, str]()
     for i, frame in enumerate(named.frames):
@@ -59,7 +60,8 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
 
 
 def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
-    """Return M [kg·m² or kg] (J−1, J−1); pinocchio fills its upper half only."""
+    """Return the joint-space inertia M of all joints of the tree [kg·m² or kg], (J−1, J−1)."""
+    # Pinocchio fills the upper triangle only.
     upper = np.triu(pin.crba(model, data, q))
     return upper + np.triu(upper, 1).T
 
@@ -74,9 +76,16 @@ class Kinematics:
         end_effector: str,
         couplings: Mapping[str, Coupling] | None = None,
     ) -> None:
-        """Keep D joints of a URDF's model, in the order of θ, and what follows them.
+        """Reduce a URDF's model to the joints of θ and the joints coupled to them.
 
-        All others are locked at zero, or where they are when their master is.
+        All other joints are locked at zero; a joint coupled to one of these is locked at its
+        offset.
+
+        Args:
+            full_model: Model of the whole URDF.
+            joints: The D joints of θ, in order.
+            end_effector: Link for poses and external wrenches.
+            couplings: Coupling of each coupled joint.
         """
         couplings = couplings or {}
         followers = [name for name, coupling in couplings.items() if coupling.master in joints]
@@ -94,11 +103,12 @@ class Kinematics:
         self._end_effector = end_effector
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
         self.tree = JointTree(self.model, joints, {name: couplings[name] for name in followers})
-        #: of each joint of θ, (D,): whether it slides, what counts as a radian of it, its units
+        #: for each joint of θ, (D,): whether it is prismatic, the travel that counts as one radian
+        #: ([rad] or [m]), and its units
         self.slides = self.tree.prismatic[ids]
         self.radian: Array = np.where(self.slides, RACK, 1.0)
         self.units = tuple(SLIDES if slides else TURNS for slides in self.slides)
-        #: what a distance between postures is measured in, for people
+        #: unit of a distance between postures, for messages
         self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
@@ -111,7 +121,7 @@ class Kinematics:
         return link_placement(self.model, link)
 
     def holding_torque(self, theta: Array) -> Array:
-        """Return g(θ), the joint torque that holds the arm's own weight [N·m], shape (..., D)."""
+        """Return g(θ), the joint torque that holds the arm's own weight [N·m], (..., D)."""
         if theta.ndim > 1:
             return np.stack([self.holding_torque(row) for row in theta])
         return self.tree.of_theta(self._gravity(theta), theta)
@@ -125,9 +135,9 @@ class Kinematics:
         """Return M(θ) θ̈ + h(θ, θ̇), the joint torque of a motion [N·m], shape (D,)."""
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
         if tree.is_coupled:
-            turning = rates[0] ** 2
+            squared_velocity = rates[0] ** 2
             rates = tree.ratios(theta) * rates
-            rates[1] += tree.curvatures(theta) * turning
+            rates[1] += tree.curvatures(theta) * squared_velocity
         torque = pin.rnea(self.model, self.data, tree.angles(theta), *rates)
         return tree.of_theta(torque, theta)
 
@@ -136,20 +146,21 @@ class Kinematics:
         tree, q = self.tree, self.tree.angles(theta)
         gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, q)
         result = tree.of_both(gradient, theta)
-        if tree.is_bent:
-            bent = self._gravity(theta) * tree.curvatures(theta)
-            result = result + np.diag(bent @ tree.moved_by)
+        if tree.is_nonlinear:
+            of_curvature = self._gravity(theta) * tree.curvatures(theta)
+            result = result + np.diag(of_curvature @ tree.moved_by)
         return result
 
     def joint_inertia(self, theta: Array) -> Array:
-        """Return what each joint moves, the others held [kg·m² or kg], shape (D,), at θ (D,)."""
+        """Return the inertia at each joint with the others held [kg·m² or kg], (D,), at θ (D,)."""
         inertia = joint_space_inertia(self.model, self.data, self.tree.angles(theta))
         return np.diag(self.tree.of_both(inertia, theta))
 
     def end_effector_jacobian(self, theta: Array) -> Array:
-        """Return J (6, D): rows linear [m/rad] then angular, at the end effector's origin.
+        """Return J (6, D) at the end effector's origin, in root-link axes.
 
-        Axes are those of the root link, so a wrench F there is the joint torque Jᵀ F.
+        The first three rows are linear [m/rad], the others angular [rad/rad]. A wrench F at that
+        point produces the joint torque Jᵀ F.
         """
         axes, tree = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, self.tree
         q, frame = tree.angles(theta), self.end_effector_frame

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The format of muscles.yaml (doc/reference/topics_and_services.md describes it for users).
 
-What depends on robot.urdf, or on values of all muscles, `description` checks afterwards.
+`description` then checks what depends on robot.urdf or on the values of several muscles.
 """
 
 from collections import Counter
@@ -18,7 +18,7 @@ from musculoskeletal_ae.schema import Strict
 
 LARGEST = 1e8  # [SI units] of any number
 LONGEST_LIST = 1000  # muscles, points of a route, joints
-SHORTEST_AXIS = 1e-6  # a shorter vector gives no direction
+SHORTEST_AXIS = 1e-6  # a shorter vector defines no direction
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
@@ -29,7 +29,7 @@ Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
 
 
 class ElasticEntry(Strict, frozen=True):
-    """Constants of a series elastic element; those left out are the default."""
+    """Constants of a series elastic element; omitted ones have their defaults."""
 
     force: Positive | UnsetType = UNSET
     rate: Positive | UnsetType = UNSET
@@ -37,7 +37,7 @@ class ElasticEntry(Strict, frozen=True):
 
 
 class TensionEntry(Strict, frozen=True):
-    """Tensions of a muscle [N]; those left out are the default."""
+    """Tensions of a muscle [N]; omitted ones have their defaults."""
 
     bias: Positive | UnsetType = UNSET
     limit: Positive | UnsetType = UNSET
@@ -53,11 +53,11 @@ class RouteEntry(Strict, frozen=True):
     axis: Vector | None = None
     radius: Positive | None = None
     side: Vector | None = None
-    side_link: Name | None = None  # in whose frame `side` is; default: `link`
-    divisor: Positive | None = None  # of a point at which another branch of the tendon begins
+    side_link: Name | None = None  # link in whose frame `side` is given; default: `link`
+    divisor: Positive | None = None  # set at a point where another branch of the tendon begins
 
     def __post_init__(self) -> None:
-        """Check which keys belong to which kind, and the geometry of a cylinder."""
+        """Check that the keys suit the kind of entry, and check the geometry of a cylinder."""
         if self.wrap is None:
             of_wraps = self.axis, self.radius, self.side, self.side_link
             if any(value is not None for value in of_wraps):
@@ -88,7 +88,7 @@ class RouteEntry(Strict, frozen=True):
 
 
 class MuscleEntry(Strict, frozen=True):
-    """A muscle; what is left out is that of all muscles."""
+    """A muscle; for omitted keys the values for all muscles apply."""
 
     name: Name
     route: Annotated[tuple[RouteEntry, ...], Meta(min_length=2, max_length=LONGEST_LIST)]
@@ -97,12 +97,13 @@ class MuscleEntry(Strict, frozen=True):
     tension: TensionEntry = TensionEntry()
 
     def __post_init__(self) -> None:
-        """Check the name, which lists of muscles must hold, and the order of the route."""
+        """Check the name and the order of the route."""
+        # Messages join the names of several muscles with commas.
         if self.name != self.name.strip() or ',' in self.name:
             problem = 'name: expected a name without a comma and without spaces around it'
             raise ValueError(f'{problem}, got {self.name!r}')
         if printable(self.name) != self.name:
-            raise ValueError('name: expected characters that can be printed')
+            raise ValueError('name: expected printable characters only')
         is_wrap = [entry.wrap is not None for entry in self.route]
         if is_wrap[0] or is_wrap[-1] or any(map(all, pairwise(is_wrap))):
             raise ValueError('route: expected a point before and after each wrap')
@@ -123,7 +124,7 @@ class CouplingEntry(Strict, frozen=True):
     )
 
     def __post_init__(self) -> None:
-        """Check that only one of the two ways is used."""
+        """Check that only one of the two forms is used."""
         if self.polynomial is not None and (self.ratio, self.offset) != (1.0, 0.0):
             raise ValueError('expected polynomial, or ratio and offset, got both')
 

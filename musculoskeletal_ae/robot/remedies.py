@@ -2,10 +2,10 @@
 """Find remedies for an arm that is not holdable or not stiff, by testing each of them.
 
 The postures of the check are evaluated again with other values in muscles.yaml, less mass, longer
-moment arms or narrower limits. If a change suffices alone, its smallest sufficient step is
-suggested. Otherwise all changes that help are suggested, and a combination. The search for the
-combination starts from all changes together. It sets each change in turn, the costliest first, to
-its best step, and then to the smallest step that is as good.
+moment arms or narrower limits. If a change is sufficient alone, its smallest sufficient step is
+suggested. Otherwise all changes that help are suggested, and then a combination. The search for the
+combination starts with all changes at their largest steps. It sets each change in turn, the
+costliest first, to its best step, and afterwards to the smallest step that is as good.
 """
 
 from copy import copy
@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck,
 from musculoskeletal_ae.robot.description import shown
 
 HELPS = 0.01  # share of postures that a change must gain to be suggested
-#: changes, the costliest first, with their factors, the smallest change first
+#: factors of each change, the smallest step first; the costliest change comes first
 TRIED = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),
@@ -35,18 +35,19 @@ TRIED = {
 
 
 def remedies(check: RobotCheck, fault: Finding) -> list[str]:
-    """Return remedies for a 'not_held' or 'not_stiff' fault, which raise its share of postures."""
+    """Return remedies for a 'not_held' or 'not_stiff' fault, as texts with the resulting share."""
     kind = fault.kind.removeprefix('not_')
 
     @cache
     def attempt(*steps: int) -> tuple[float, str]:
-        setting, words = check.setting, list[str]()
+        """Return the share of postures with these steps of the changes (0: none), and a text."""
+        setting, texts = check.setting, list[str]()
         for (what, factors), step in zip(TRIED.items(), steps, strict=True):
             if step:
                 setting, text = changed(setting, what, factors[step - 1], fault.joint)
-                words.insert(0, text)
+                texts.insert(0, text)
         share = float(getattr(judge(setting), kind).mean())
-        return share, f'{", ".join(words)} → {100 * share:.3g} % {kind}'
+        return share, f'{", ".join(texts)} → {100 * share:.3g} % {kind}'
 
     nothing, steps = [0] * len(TRIED), [len(factors) for factors in TRIED.values()]
     (before, _), alone = attempt(*nothing), list[tuple[float, str]]()
@@ -57,7 +58,7 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
         alone.insert(0, next(way for way in ways if way[0] >= wanted))
     if enough := [text for share, text in alone if share >= REQUIRED_SHARE]:
         return enough
-    told = [f'{text}, not enough alone' for share, text in alone if share >= before + HELPS]
+    texts = [f'{text}, not enough alone' for share, text in alone if share >= before + HELPS]
     for pick in (-1, 0):
         for i, most in enumerate(steps):
             ways = [attempt(*steps[:i], step, *steps[i + 1 :]) for step in range(most + 1)]
@@ -65,11 +66,11 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
             steps[i] = int(np.flatnonzero(shares == shares.max())[pick])
     share, text = attempt(*steps)
     if share >= REQUIRED_SHARE:
-        return [*told, f'together: {text}']
+        return [*texts, f'together: {text}']
     if share > max(alone)[0]:
-        told.append(f'not enough even together: {text}')
-    told = told or [f'none of these helps: {", ".join(TRIED)}']
-    return [*told, 'other routes may help: see --suggest']
+        texts.append(f'not enough even together: {text}')
+    texts = texts or [f'none of these helps: {", ".join(TRIED)}']
+    return [*texts, 'other routes may help: see --suggest']
 
 
 def rounded(values: Array) -> Array:
@@ -86,10 +87,10 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
     if what == 'moment arms':
         scale = np.where(np.arange(robot.joint_count) == joint, factor, 1.0)
         hessian = scale[:, None] * setting.hessian * scale
-        told = checks.words(robot, joint)
-        text = f'{told.name}s at {robot.joints[joint]} {factor:g} times as {told.long}'
+        terms = checks.arm_terms(robot, joint)
+        text = f'{terms.name}s at {robot.joints[joint]} {factor:g} times as large'
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
-    if what == 'limits':  # and the postures with them
+    if what == 'limits':  # the postures are scaled with the limits
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
         slides = robot.kinematics.slides[joint]
         low, high = (
@@ -102,7 +103,7 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'
     owner, _, part = what.rpartition('.')
     of: Any = getattr(robot, owner) if owner else robot
-    # Round to the number that a user would write into the file.
+    # Use the rounded number that a user would write into the file.
     values = rounded(factor * getattr(of, part))
     vars(robot).update({owner: replace(of, **{part: values})} if owner else {part: values})
     more = ' (and max)' if part == 'limit' and (values > robot.tension.max).any() else ''

@@ -30,7 +30,7 @@ class Robot:
         self.series_elastic = description.series_elastic
         self.tension = description.tension
         self.isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
-        self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # which are not isolated, (M,)
+        self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
         self.stiffness = description.stiffness
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
@@ -39,7 +39,7 @@ class Robot:
         )
         self.routes = Routes(self.kinematics, description.routes)
         self.groups = groups(self.routes.crossed)
-        #: joint limits [rad] (or [m] where they slide), (D,), and the units of each joint
+        #: joint limits [rad] ([m] of prismatic joints), (D,), and the units of each joint
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
         self.units = self.kinematics.units
 
@@ -125,13 +125,19 @@ class Robot:
         absolute = self.routes.absolute_lengths(theta)
         return muscle_stiffness(self.stiffness, self.series_elastic.compliance(absolute, tension))
 
-    def told(self, theta: Array, digits: int = 2) -> str:
-        """Return θ (D,) with names and units, for people to read."""
+    def posture_text(self, theta: Array, digits: int = 2) -> str:
+        """Return θ (D,) with the names and units of the joints, for messages."""
         each = zip(self.joints, theta, self.units, strict=True)
         return ', '.join(f'{name} {value:.{digits}f} {unit.theta}' for name, value, unit in each)
 
     def random_postures(self, count: int, rng: np.random.Generator, margin: float = 0.0) -> Array:
-        """Return θ [rad] (count, D), uniform up to `margin` of each joint's range beyond it."""
+        """Return uniformly random θ [rad], shape (count, D).
+
+        Args:
+            count: Number of postures.
+            rng: Random generator.
+            margin: Share of each joint's range by which θ may exceed its limits.
+        """
         beyond = margin * (self.upper - self.lower)
         shape = count, self.joint_count
         return rng.uniform(self.lower - beyond, self.upper + beyond, shape)

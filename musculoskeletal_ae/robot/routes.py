@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Muscle lengths and the muscle Jacobian of routes: straight lines, and wires that wrap.
+"""Muscle lengths and the muscle Jacobian of tendon routes, straight or wrapped around objects.
 
     f_geo,abs(θ) = Σ over the route of |p_{i+1}(θ) − p_i(θ)| / divisor
     f_geo(θ)     = f_geo,abs(θ) − f_geo,abs(0)
     G(θ)         = ∂f_geo/∂θ
 
-(paper, §III-B: start, relay and end points linearly connected.) G follows from
-the velocity of the points, ∂p/∂θ_k = a_k × (p − o_k), projected on the lines d between them. Of a
-segment that may wrap round a sphere or cylinder (`wrapping`) it is the velocity of the end points
-as seen from that object's link, projected on the directions in which the wire leaves them. A
-tendon may have several branches, which pulleys join: the length of each counts 1/divisor, and it
-pulls with that share of the tension.
+(paper, §III-B: start, relay and end points linearly connected.) For a straight segment, G is the
+velocity of its end points, ∂p/∂θ_k = a_k × (p − o_k), projected onto the line d between them. For a
+segment that may wrap around a sphere or cylinder (`wrapping`), G is the velocity of the end points
+relative to that object's link, projected onto the directions in which the tendon leaves them.
+A tendon may have several branches, joined by pulleys. The length of each branch counts 1/divisor,
+and each branch carries that share of the tension.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from musculoskeletal_ae.robot.kinematics import Kinematics
 if TYPE_CHECKING:
     from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-ARC = 9  # points of a wrapped wire's arc that are drawn
-# Bounds the memory of one batched evaluation to a few tens of megabytes.
+ARC = 9  # points drawn along the arc of a wrapped tendon
+# Rows of one batched evaluation; limits its memory to a few tens of megabytes.
 CHUNK = 4096
-THREADED = 4  # more chunks are computed two at a time
+THREADED = 4  # chunks above which two threads evaluate them
 
 
 def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Array], Array]:
-    """Let a method of θ (N, D) take θ (..., D), and evaluate it CHUNK rows at a time."""
+    """Make a method of θ (N, D) accept θ (..., D), and evaluate it CHUNK rows at a time."""
 
     @wraps(method)
     def chunked(self: Routes, theta: Array) -> Array:
         rows = theta.reshape(-1, theta.shape[-1])
         parts = [rows[i : i + CHUNK] for i in range(0, max(len(rows), 1), CHUNK)]
         if len(parts) > THREADED:
-            with ThreadPoolExecutor(2) as pool:  # numba and numpy let go of the interpreter
+            with ThreadPoolExecutor(2) as pool:  # numba and numpy release the GIL
                 values = np.concatenate(list(pool.map(partial(method, self), parts)))
         else:
             values = np.concatenate([method(self, part) for part in parts])
@@ -58,43 +58,48 @@ class Routes:
     """The routes of M muscles over D joints as functions of θ: P points, S segments."""
 
     def __init__(self, kinematics: Kinematics, routes: Sequence[Route]) -> None:
-        """Attach the routes of a description to the tree."""
+        """Attach the routes of a description to the joints of the tree."""
         self._kinematics = kinematics
         links = ([kinematics.placement(item.link)[0] for item in route] for route in routes)
-        hangs = [kinematics.tree.hangs_on[joints, 1:] for joints in links]
-        # Joints of the tree: where two that turn together carry all of a route, it still changes.
-        parted = np.array([some.any(axis=0) & ~some.all(axis=0) for some in hangs])
-        #: joints that each muscle crosses: they or what follows them move some of it, (M, D)
-        self.crossed: Bools = parted @ (kinematics.tree.moved_by > 0.0)
+        carried_by = [kinematics.tree.descends_from[joints, 1:] for joints in links]
+        # A joint of the tree changes a route's length only if it carries some of its points, but
+        # not all. Coupled joints are considered one by one: two of them may carry a whole route
+        # together and still change its length.
+        crossed = np.array([some.any(axis=0) & ~some.all(axis=0) for some in carried_by])
+        #: whether each muscle crosses each joint of θ or a joint coupled to it, (M, D)
+        self.crossed: Bools = crossed @ (kinematics.tree.moved_by > 0.0)
         pieces = [[item for item in route if isinstance(item, RoutePoint)] for route in routes]
         points = [point for points in pieces for point in points]
         attached = [kinematics.attach(point.link, point.xyz) for point in points]
-        #: joint of the tree that carries each point, (P,), and the point in its frame [m], (P, 3)
+        #: joint of the tree that carries each point, (P,)
         self.joint = np.array([joint for joint, _ in attached])
+        #: each point in the frame of that joint [m], (P, 3)
         self.point: Array = np.array([point for _, point in attached], dtype=float)
         owner = np.repeat(np.arange(len(pieces)), [len(points) for points in pieces])
         begins = np.array([point.divisor is not None for point in points])
         divisor = np.array([point.divisor or 1.0 for point in points])
         for p in np.flatnonzero(~begins & np.r_[False, owner[:-1] == owner[1:]]).tolist():
             divisor[p] = divisor[p - 1]
-        #: points where each segment starts and ends, and its muscle, (S,)
+        #: start point, end point and muscle of each segment, (S,)
         self.first = np.flatnonzero((owner[:-1] == owner[1:]) & ~begins[1:])
         self.second, self.muscle = self.first + 1, owner[self.first]
-        #: share of its length that counts, (S,)
+        #: 1/divisor of each segment, (S,)
         self.weight: Array = 1.0 / divisor[self.first]
         self._sum: Array = self.weight * (np.arange(len(routes))[:, None] == self.muscle)
-        #: segments that may wrap, and round what
+        #: segments that may wrap, and the objects around which they wrap
         self.wrapping, self.objects = self._attach_objects(routes)
-        #: pulls of wires: of each segment on both its ends, where it may wrap of either alone;
-        #: points where they act, (Q,), which of the tree's joints lengthen it and which muscle's
-        #: they are: (Q, J−1), (M, Q), and joints of the tree that move θ, (J−1, D)
+        # Forces of the tendons on the links, Q in total: one force pair for each segment, and
+        # one force at each end of a segment that may wrap.
         ends = self.first[self.wrapping], self.second[self.wrapping]
+        #: point at which each force acts, (Q,)
         self._pulled = np.concatenate([self.first, *ends])
-        carried, moved = 1.0 * kinematics.tree.hangs_on[:, 1:], self.joint
+        #: ±1 where a joint of the tree lengthens or shortens the force's segment, (Q, J−1)
+        carried, moved = 1.0 * kinematics.tree.descends_from[:, 1:], self.joint
         self._share = carried[moved[self.second]] - carried[moved[self.first]]
         if self.objects is not None:
             apart = [carried[self.objects.joint] - carried[moved[end]] for end in ends]
             self._share = np.concatenate([self._share, *apart])
+        #: sums the forces of each muscle, (M, Q)
         own = self._sum[:, self.wrapping]
         self._gather = np.concatenate([self._sum, own, own], axis=1)
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
@@ -102,40 +107,48 @@ class Routes:
     def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
         parts = [branch for route in routes for branch in branches(route)]
         steps = [step for branch in parts for step in pairwise(branch)]
-        # A segment is counted where it begins, at a point.
+        # Every segment begins at a point; a wrap lies within one.
         segment = np.cumsum([isinstance(item, RoutePoint) for item, _ in steps]) - 1
         wraps = {s: end for s, (_, end) in zip(segment, steps) if isinstance(end, Wrap)}
         if not wraps:
             return np.zeros(0, dtype=int), None
-        # Only here, so that an arm of straight lines does not wait for numba.
+        # Imported here so that arms without wraps do not wait for numba.
         from musculoskeletal_ae.robot.wrapping import place_objects
 
         return np.array([*wraps]), place_objects(self._kinematics, [*wraps.values()])
 
     def _wrapped(self, poses: JointPoses, points: Array) -> tuple[Array, Array, Array]:
-        """Return lengths (N, W) and pulls (N, W, 3) of the segments that may wrap."""
+        """Return lengths (N, W) of the segments that may wrap, and unit vectors at both ends.
+
+        The unit vectors (N, W, 3) point along the tendon, away from the start and from the end.
+        """
         from musculoskeletal_ae.robot.wrapping import wrapped_segments
 
-        assert self.objects is not None  # asked by all callers
+        assert self.objects is not None  # callers have checked
         start, end = points[:, self.first[self.wrapping]], points[:, self.second[self.wrapping]]
         turned, moved = (np.ascontiguousarray(part) for part in poses[:2])
         return wrapped_segments(self.objects, turned, moved, start, end)
 
     def drawn(self, theta: Array, points: Array | None = None) -> list[Array]:
-        """Return each branch of a muscle at θ (D,) as a polyline with its arcs, (K, 3) [m].
+        """Return the branches of all muscles at θ (D,) as polylines with arcs, each (K, 3) [m].
 
-        They stand in the order of `drawn_muscle`; see `points`.
+        Args:
+            theta: θ [rad], (D,).
+            points: Route points in the root link's frame [m], (P, 3); None: those at θ.
+
+        Returns:
+            One polyline for each entry of `drawn_muscle`.
         """
         poses = self._kinematics.tree.joint_poses(theta[None])
         points = self.placed(poses)[0] if points is None else points
         arcs = {}
         if self.objects is not None:
-            from musculoskeletal_ae.robot.wrapping import touched
+            from musculoskeletal_ae.robot.wrapping import arc_points
 
             at = np.ascontiguousarray(poses.rotation[0]), poses.translation[0].copy()
             for i, s in enumerate(self.wrapping.tolist()):
                 ends = points[self.first[s]], points[self.second[s]]
-                arcs[s] = touched(self.objects, i, ARC, *at, *ends)
+                arcs[s] = arc_points(self.objects, i, ARC, *at, *ends)
         lines = []
         for own in self._branches:
             parts = [points[self.first[own[:1]]]]
@@ -146,19 +159,19 @@ class Routes:
 
     @cached_property
     def _branches(self) -> list[Ints]:
-        """The segments of each branch."""
+        """Indices of the segments of each branch."""
         gaps = np.flatnonzero(self.second[:-1] != self.first[1:]) + 1
         return list(np.split(np.arange(len(self.first)), gaps))
 
     @property
     def pieces_drawn(self) -> Ints:
-        """How many straight pieces each polyline of `drawn` has at most."""
+        """Largest number of straight pieces of each polyline of `drawn`."""
         wraps = np.isin(np.arange(len(self.first)), self.wrapping)
         return np.array([len(own) + ARC * wraps[own].sum() for own in self._branches])
 
     @property
     def drawn_muscle(self) -> Ints:
-        """The muscle of each polyline of `drawn`."""
+        """Index of the muscle of each polyline of `drawn`."""
         return np.array([self.muscle[own[0]] for own in self._branches])
 
     def points(self, theta: Array) -> Array:
@@ -166,13 +179,18 @@ class Routes:
         return self.placed(self._kinematics.tree.joint_poses(theta))
 
     def placed(self, poses: JointPoses, point: Array | None = None) -> Array:
-        """Return route points, or other ones (P, 3) on the same links, for poses, (N, P, 3)."""
+        """Return route points in the root link's frame [m], (N, P, 3).
+
+        Args:
+            poses: Poses of the joints in N postures.
+            point: Points in the frames of their joints [m], (P, 3); None: those of the routes.
+        """
         rotation, translation = poses.rotation[:, self.joint], poses.translation[:, self.joint]
         point = self.point if point is None else point
         return np.einsum('npij,pj->npi', rotation, point) + translation
 
     def _segments(self, theta: Array) -> tuple[Array, Array]:
-        """Return lengths (N, S) of the segments, and of the straight lines between their ends."""
+        """Return lengths of the segments and straight distances of their ends [m], both (N, S)."""
         poses = self._kinematics.tree.joint_poses(theta)
         points = self.placed(poses)
         straight = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
@@ -184,28 +202,28 @@ class Routes:
 
     @_in_chunks
     def absolute_lengths(self, theta: Array) -> Array:
-        """Return f_geo,abs(θ) [m]: θ (..., D) gives (..., M)."""
+        """Return f_geo,abs(θ) [m], shape (..., M), for θ (..., D)."""
         return self._segments(theta)[0] @ self._sum.T
 
     @_in_chunks
     def detours(self, theta: Array) -> Array:
-        """Return what wrapping adds to straight lines [m]: θ (..., D) gives (..., M)."""
+        """Return the length that wrapping adds to each muscle [m], shape (..., M), θ (..., D)."""
         return self.wound(theta) @ self._sum[:, self.wrapping].T
 
     @_in_chunks
     def wound(self, theta: Array) -> Array:
-        """Return the same of each object, as described one after another: (..., W)."""
+        """Return the length that wrapping around each object adds [m], shape (..., W)."""
         if self.objects is None:
             return np.zeros((len(theta), 0))
         return np.subtract(*self._segments(theta))[:, self.wrapping]
 
     def relative_lengths(self, theta: Array) -> Array:
-        """Return f_geo(θ) [m], zero at θ = 0: θ (..., D) gives (..., M)."""
+        """Return f_geo(θ) [m], which is zero at θ = 0, shape (..., M), for θ (..., D)."""
         return self.absolute_lengths(theta) - self.length_at_zero
 
     @_in_chunks
     def muscle_jacobian(self, theta: Array) -> Array:
-        """Return G(θ) [m/rad]: θ (..., D) gives (..., M, D)."""
+        """Return G(θ) [m/rad], shape (..., M, D), for θ (..., D)."""
         kin = self._kinematics
         poses = kin.tree.joint_poses(theta)
         points = self.placed(poses)

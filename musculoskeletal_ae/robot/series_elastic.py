@@ -3,9 +3,9 @@
 
     L_e(l_abs, T) = ln(1 + T / force) / rate + wire_stretch · l_abs · T
 
-(paper, §III-B: estimated from a testbed of one muscle). The elastic unit is the
-exponential tendon T = force · (exp(rate · Δ) − 1); the wire is Dyneema, whose stretch grows with
-its length. The constants are chosen to be plausible for Musashi, which are not public.
+(paper, §III-B: estimated from a testbed of one muscle). The series elastic element follows
+T = force · (exp(rate · Δ) − 1). The tendon is Dyneema, whose stretch is proportional to its length.
+The default constants are plausible values for Musashi, whose own constants are not public.
 """
 
 from dataclasses import dataclass
@@ -33,8 +33,8 @@ class SeriesElastic:
 
     def compliance(self, absolute_length: Array, tension: Array) -> Array:
         """Return ∂L_e/∂T [m/N], shape (..., M)."""
-        unit = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
-        return unit + self.wire_stretch * absolute_length
+        element = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
+        return element + self.wire_stretch * absolute_length
 
     def length_slope(self, tension: Array) -> Array:
         """Return ∂L_e/∂l_abs [m/m], shape (..., M)."""

@@ -23,10 +23,12 @@ def muscle_stiffness(module: Array, compliance: Array) -> Array:
 def muscle_hessian(
     muscle_jacobian: Callable[[Array], Array], theta: Array, step: Array | float = 1e-5
 ) -> Array:
-    """Return ∂²l/∂θ² [m/rad²] (M, D, D) at θ (D,), by central differences over ±step [rad] of G.
+    """Return ∂²l/∂θ² [m/rad²], (..., M, D, D), by central differences of G.
 
-    The step is one for all joints, or of each (D,). The callable maps θ (N, D) to G [m/rad]
-    (N, M, D). With one of θ (..., D), θ may be (N, D).
+    Args:
+        muscle_jacobian: Function of θ [rad] (..., D) that returns G [m/rad], (..., M, D).
+        theta: θ [rad], (..., D).
+        step: Half width of the differences [rad], scalar or (D,).
     """
     offsets, middle = step * np.eye(theta.shape[-1]), theta[..., None, :]
     difference = muscle_jacobian(middle + offsets) - muscle_jacobian(middle - offsets)
@@ -35,9 +37,13 @@ def muscle_hessian(
 
 
 def joint_stiffness(jacobian: Array, hessian: Array, stiffness: Array, tension: Array) -> Array:
-    """Return K_θ [N·m/rad] (D, D) of G (M, D), ∂²l/∂θ² (M, D, D), k [N/m] (M,) and T [N] (M,).
+    """Return K_θ [N·m/rad], (..., D, D).
 
-    Or of N postures at once, all with N rows.
+    Args:
+        jacobian: G [m/rad], (..., M, D).
+        hessian: ∂²l/∂θ² [m/rad²], (..., M, D, D).
+        stiffness: k [N/m], (..., M).
+        tension: T [N], (..., M).
     """
     elastic = jacobian.swapaxes(-1, -2) @ (stiffness[..., None] * jacobian)
     return elastic + np.einsum('...m,...mij->...ij', tension, hessian)

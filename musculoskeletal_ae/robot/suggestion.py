@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The smallest change of via points that makes an arm sound, by CMA-ES.
+"""Find the smallest change of via points that makes an arm sound, by CMA-ES.
 
     min  mean_p |d_p| / r + penalty(d),    d_p = r · x_p / √(1 + |x_p|²)
 
-over x: each via point p is moved by d_p, less than the reach r. The penalty is zero where stiffness
-and moment arms are what the check requires in all but a few postures.
+over x. Each via point p moves by d_p, which is shorter than the reach r. The penalty is zero if
+stiffness and moment arms meet the requirements of the check in all but a few postures.
 """
 
 import shutil
@@ -22,78 +22,96 @@ from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 
-FORGIVEN = 0.02  # of the postures; the check, which draws others, tolerates 0.05
-PENALTY = 10.0  # where all is lacking; the size of a change is below 1
-START = 0.2  # spread of x at first
-TRIES = 40  # for each coordinate of a via point
-RESOLUTION = 1e-4  # [m]
-THIN = 0.003  # of a muscle in the picture [m]
+FORGIVEN = 0.02  # share of postures that may fail; the check, in other postures, tolerates 0.05
+PENALTY = 10.0  # weight of the requirements; the mean relative change is below 1
+START = 0.2  # initial standard deviation of x
+TRIES = 40  # evaluations for each coordinate of a via point
+RESOLUTION = 1e-4  # [m] to which via points are rounded
+THIN = 0.003  # width of a muscle in the picture [m]
 
 
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
-    """Return d [m] (P, 3), in the links' frames, and what is `lacking` without and with it.
+    """Search for a change of the via points that makes a robot sound.
 
-    Lacking is also that a muscle changes the sign of its main action which did not before. Arms are
-    tried in so many random postures, other ones than a check with this seed draws.
+    A muscle that changes the sign of its main action more often than before counts as a failed
+    requirement as well.
+
+    Args:
+        robot: The robot.
+        reach: Largest distance by which a via point may move [m].
+        postures: Number of random postures in which each candidate is evaluated.
+        seed: Random seed. The postures differ from those of a check with the same seed.
+
+    Returns:
+        The change d [m] (P, 3), in the frames of the links, and the measure of `lacking` before
+        and after it.
     """
     import cma
 
-    still = np.zeros((len(robot.routes.point), 3))
+    unchanged = np.zeros((len(robot.routes.point), 3))
     theta = robot.random_postures(postures, np.random.default_rng(seed + 1))
 
     def check(change: Array) -> checks.RobotCheck:
         return checks.judge(checks.Setting.of(moved(robot, change), theta))
 
-    flips = np.maximum(checks.main_actions(check(still).moment_arms)[1], FORGIVEN)
+    flips = np.maximum(checks.main_actions(check(unchanged).moment_arms)[1], FORGIVEN)
 
     def lacks(change: Array) -> float:
         result = check(change)
         more = checks.main_actions(result.moment_arms)[1] - flips
         return lacking(result) + float(np.maximum(more, 0.0).sum())
 
-    if not (before := lacks(still)):
-        return still, 0.0, 0.0
+    if not (before := lacks(unchanged)):
+        return unchanged, 0.0, 0.0
 
     def change_of(x: Array) -> Array:
-        x = x.reshape(still.shape)
+        x = x.reshape(unchanged.shape)
         change = reach * x / np.sqrt(1.0 + np.sum(x**2, axis=1, keepdims=True))
-        return np.trunc(change / RESOLUTION) * RESOLUTION  # never beyond the reach
+        return np.trunc(change / RESOLUTION) * RESOLUTION  # rounded towards zero: within reach
 
     def cost(x: Array) -> float:
         missing, size = lacks(change_of(x)), np.linalg.norm(change_of(x), axis=1).mean() / reach
         return float(size + (1.0 + PENALTY * missing) * (missing > 0.0))
 
     options = {'seed': seed % 2**32 + 1, 'verbose': -9, 'tolfun': 1e-3}
-    search = cma.CMAEvolutionStrategy(still.ravel(), START, options)
-    for _ in tqdm(range(TRIES * still.size // search.popsize), disable=None):
+    search = cma.CMAEvolutionStrategy(unchanged.ravel(), START, options)
+    for _ in tqdm(range(TRIES * unchanged.size // search.popsize), disable=None):
         if not search.stop():
-            tried = search.ask()
-            search.tell(tried, [cost(x) for x in tried])
+            candidates = search.ask()
+            search.tell(candidates, [cost(x) for x in candidates])
     change = change_of(search.best.x)
     if not lacks(change):
+        # Move each point back, the least moved first, if the arm stays sound.
         for p in np.argsort(np.linalg.norm(change, axis=1)):
-            back = np.where(np.arange(len(change))[:, None] == p, 0.0, change)
-            change = change if lacks(back) else back
+            without_point = np.where(np.arange(len(change))[:, None] == p, 0.0, change)
+            if not lacks(without_point):
+                change = without_point
     return change, before, lacks(change)
 
 
 def moved(robot: Robot, change: Array) -> Robot:
-    """Return a robot whose via points are elsewhere by (P, 3) [m], in the links' frames."""
-    left = iter(change)
+    """Return a robot with its via points moved by `change` [m] (P, 3), in the links' frames."""
+    shifts = iter(change)
     routes = [
-        tuple(p._replace(xyz=p.xyz + next(left)) if isinstance(p, RoutePoint) else p for p in route)
+        tuple(
+            item._replace(xyz=item.xyz + next(shifts)) if isinstance(item, RoutePoint) else item
+            for item in route
+        )
         for route in robot.description.routes
     ]
     return Robot(replace(robot.description, routes=tuple(routes)))
 
 
 def lacking(check: checks.RobotCheck) -> float:
-    """Return what an arm lacks that via points could give it; 0: nothing, and with a margin."""
+    """Return a measure of the requirements that an arm fails and via points influence.
+
+    It is 0 if the arm meets all of them with a margin.
+    """
     arms, least = check.moment_arms, check.matters
     torque = np.linalg.norm(check.missing_torque, axis=1)
     soft = np.maximum(1.0 - check.stiffness / check.required, 0.0)
     weak = np.where(check.held, soft / (1.0 + soft), 1.0 + torque / (1.0 + torque))
-    # Of either direction, as shares of what matters.
+    # Missing moment arm in each direction, relative to the smallest one that counts.
     short = [1.0 - arms.max(axis=1) / least, 1.0 + arms.min(axis=1) / least]
     actions = checks.read_declared_actions(check.setting.robot.description).items()
     short += [(RESOLUTION - sign * arms[:, [m], j]) / least[j] for (m, j), sign in actions]
@@ -104,35 +122,48 @@ def lacking(check: checks.RobotCheck) -> float:
 
 
 def write(robot: Robot, change: Array, out: Path) -> None:
-    """Write a robot directory with via points moved by (P, 3) [m], and a picture of both."""
+    """Write a robot directory with the via points moved, and a picture of both routes.
+
+    Args:
+        robot: The original robot.
+        change: Displacements of the via points in the links' frames [m], (P, 3).
+        out: The new directory.
+
+    Raises:
+        RobotDescriptionError: If other files of the directory cannot be copied.
+    """
     here, after = robot.description.directory, moved(robot, change)
     document = read_yaml(here / 'muscles.yaml', refusal)
     for muscle, route in zip(document['muscles'], after.description.routes, strict=True):
         muscle['route'] = [written(item) for item in route]
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
     out.mkdir(parents=True, exist_ok=True)
-    (out / 'muscles.yaml').write_text(text, encoding='utf-8')  # whatever becomes of the rest
-    # Meshes come along, wherever they lie in the directory; what is written may lie there too.
+    # Written first, so that it exists even if copying fails.
+    (out / 'muscles.yaml').write_text(text, encoding='utf-8')
+    # Copy meshes from anywhere in the directory, but not the output, which may lie there too.
     skipped = {out.resolve(), (here / 'muscles.yaml').resolve()}
 
-    def left(folder: str, names: list[str]) -> list[str]:
+    def not_copied(folder: str, names: list[str]) -> list[str]:
         paths = {name: Path(folder, name) for name in names}
-        copied = [n for n, p in paths.items() if p.is_file() or p.is_dir()]  # no pipe, no dead link
-        return [name for name in names if name not in copied or paths[name].resolve() in skipped]
+        # This excludes pipes and broken links.
+        copyable = [name for name, path in paths.items() if path.is_file() or path.is_dir()]
+        return [name for name in names if name not in copyable or paths[name].resolve() in skipped]
 
     try:
-        shutil.copytree(here, out, ignore=left, dirs_exist_ok=True)
+        shutil.copytree(here, out, ignore=not_copied, dirs_exist_ok=True)
     except shutil.Error as error:
-        told = '; '.join(f'{source}: {why}' for source, _, why in error.args[0])
-        raise refusal(out, f'muscles.yaml is written, but not copied was {told}') from error
+        failures = '; '.join(f'{source}: {reason}' for source, _, reason in error.args[0])
+        problem = f'muscles.yaml is written, but other files could not be copied: {failures}'
+        raise refusal(out, problem) from error
     middle, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
     lines = []
-    for was, now in zip(*(draw_arm(each, middle, bias) for each in (robot, after)), strict=True):
-        if was.kind == 'bones':
-            lines.append(now)
-        elif np.array_equal(was.points, now.points):
-            lines.append(now._replace(colour=(0.6, 0.6, 0.7), width=THIN))
+    pairs = zip(draw_arm(robot, middle, bias), draw_arm(after, middle, bias), strict=True)
+    for old, new in pairs:
+        if old.kind == 'bones':
+            lines.append(new)
+        elif np.array_equal(old.points, new.points):
+            lines.append(new._replace(colour=(0.6, 0.6, 0.7), width=THIN))
         else:
-            lines += [was._replace(colour=(0.9, 0.2, 0.1), width=THIN), now._replace(width=THIN)]
-    told = 'red: before, green: after, grey: as it was'
-    save_picture(lines, out / 'suggestion.png', told, whole=False)
+            lines += [old._replace(colour=(0.9, 0.2, 0.1), width=THIN), new._replace(width=THIN)]
+    title = 'muscle routes: red before, green after, grey unchanged'
+    save_picture(lines, out / 'suggestion.png', title, whole=False)

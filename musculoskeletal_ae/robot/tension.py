@@ -4,8 +4,8 @@
     hard:   min ‖T − T_desired‖²         subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
 
-(Kawamura 2016). T_desired = 0 gives the least tension that holds τ, also the QP bound of the
-control experiment; T_desired = 0.3 T_limit the well-tensed arm by which `check_robot` judges.
+(Kawamura 2016). T_desired = 0 gives the least tension that holds τ, which is also the QP bound of
+the control experiment. `check_robot` uses T_desired = 0.3 T_limit, a well-tensioned arm.
 """
 
 from functools import cache
@@ -18,10 +18,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot.robot import Robot
 
-# [N] gap between the limits of a muscle that is fixed at one value (hot, ruptured). Without a gap,
+# [N] gap between the limits of a muscle that is fixed at one tension (hot, ruptured). Without it,
 # rounding makes the problem infeasible for quadprog.
 ROOM = 1e-8
-SOFT_WEIGHT = 1e-7  # [N·m/N]², against torques of some N·m and tensions of some hundred N
+SOFT_WEIGHT = 1e-7  # ε [N·m/N]², for torques of some N·m and tensions of some hundred N
 
 
 class Exertion(NamedTuple):
@@ -32,16 +32,23 @@ class Exertion(NamedTuple):
 
 
 class TensionProgramme:
-    """Quadratic programmes over the tensions within limits that produce a torque.
+    """Quadratic programmes over the tensions that produce a torque within limits.
 
-    All of them raise an `InfeasibleError` if no such tension exists, or if an entry is not finite.
-    In the second case quadprog itself would return zeros without an error.
+    All methods raise an `InfeasibleError` if no such tension exists. The constructor and `minimum`
+    also raise it if an entry is not finite, for which quadprog would silently return zeros.
     """
 
     def __init__(
         self, muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
     ) -> None:
-        """State G [m/rad] (M, D), τ [N·m] (D,) and the limits [N], scalar or (M,)."""
+        """Set the constraints.
+
+        Args:
+            muscle_jacobian: G [m/rad], (M, D).
+            torque: τ [N·m], (D,).
+            low: Lowest tensions [N], scalar or (M,).
+            high: Highest tensions [N], scalar or (M,).
+        """
         self._jacobian, self._torque, self._count = muscle_jacobian, torque, len(muscle_jacobian)
         self._eye, limits = _unit(self._count)
         self._constraints = np.concatenate([-muscle_jacobian, limits], axis=1)
@@ -51,7 +58,13 @@ class TensionProgramme:
         _require_finite(self._constraints, self._bounds)
 
     def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
-        """Return argmin ½ Tᵀ Q T − aᵀ T [N], shape (M,), over the limits alone if not `hard`."""
+        """Return argmin ½ Tᵀ Q T − aᵀ T [N], shape (M,).
+
+        Args:
+            quadratic: Q, (M, M).
+            linear: a, (M,).
+            hard: Whether T must produce the torque; if false, only the limits apply.
+        """
         _require_finite(quadratic, linear)
         equalities = len(self._torque) if hard else 0
         first = len(self._torque) - equalities
@@ -64,11 +77,11 @@ class TensionProgramme:
             raise InfeasibleError(problem) from error
 
     def nearest(self, desired: Array | float) -> Array:
-        """Solve the hard form: return the tensions [N] (M,) nearest to the desired ones."""
+        """Solve the hard form; return the tensions [N] (M,) nearest to the desired ones."""
         return self.minimum(self._eye, np.full(self._count, desired, dtype=float))
 
     def compromise(self) -> Exertion:
-        """Solve the soft form: the lowest of the tensions that come nearest to the torque."""
+        """Solve the soft form; return the lowest tensions that come nearest to the torque."""
         jacobian = self._jacobian
         quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * self._eye
         tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
@@ -78,9 +91,16 @@ class TensionProgramme:
 def holding_tension(
     robot: Robot, theta: Array, desired: Array | float = 0.0, jacobian: Array | None = None
 ) -> Array:
-    """Return the T nearest to a desired one [N] that holds θ (D,) within [T_bias, T_limit], (M,).
+    """Return the tension within [T_bias, T_limit] that holds a posture [N], (M,).
 
-    G is the nominal one unless another is given. Errors as for `TensionProgramme`.
+    Args:
+        robot: The robot.
+        theta: θ [rad], (D,).
+        desired: Of all such tensions, the one nearest to this is returned [N], scalar or (M,).
+        jacobian: G [m/rad], (M, D); None: that of the geometric model.
+
+    Raises:
+        InfeasibleError: If no such tension exists, or if an entry is not finite.
     """
     jacobian = robot.routes.muscle_jacobian(theta) if jacobian is None else jacobian
     torque, limits = robot.kinematics.holding_torque(theta), robot.tension

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading robot.urdf by pinocchio, after a check of every number in it.
+"""Read robot.urdf with pinocchio, after a check of every number in it.
 
-The check is ours because the URDF parser drops in silence what it does not understand. It only
-warns about a mass or an inertia that is no number or missing, and goes on with a link without mass.
-Of a xacro that was not expanded it ignores the macros and reads the rest.
+The URDF parser silently ignores what it does not understand, so the file is checked here first. The
+parser only warns about a missing or malformed mass or inertia, and continues with a massless link.
+In a xacro file that was not expanded, it ignores the macros and reads the rest.
 """
 
 import math
@@ -18,18 +18,18 @@ import pinocchio as pin
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
 from musculoskeletal_ae.robot.joint_tree import Coupling
 
-# A body of a hundred links is large; parsers that recurse overflow their stack at thousands.
-# MuJoCo's and pinocchio's parser goes down 500 levels.
+# Recursive parsers overflow their stack at thousands of links; the parser of MuJoCo and pinocchio
+# descends at most 500 levels.
 MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
-#: elements of a robot that only a preprocessor understands, beside those with xacro's namespace
+#: elements below <robot> that only a preprocessor understands, besides those of xacro's namespace
 PREPROCESSED = 'include', 'macro', 'property'
-LARGEST = 1e6  # [SI units] of any number but an effort or velocity that nothing limits
+LARGEST = 1e6  # [SI units] of any number; efforts and velocities are not limited
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
 ONE_AXIS = *LIMITED, 'continuous'
 KINDS = *ONE_AXIS, 'fixed', 'floating', 'planar'
 
-#: how many numbers an attribute holds, by element
+#: number of values in each attribute, by element
 NUMBERS = {
     'origin': {'xyz': 3, 'rpy': 3},
     'axis': {'xyz': 3},
@@ -44,10 +44,15 @@ NUMBERS = {
 
 
 def read_urdf(file: Path, text: str) -> pin.Model:
-    """Return pinocchio's model of the text of a URDF.
+    """Return the pinocchio model of a URDF.
+
+    Args:
+        file: The file, for error messages.
+        text: Its content.
 
     Raises:
-        RobotDescriptionError: Naming the file, the link or joint, and what is expected.
+        RobotDescriptionError: If it is invalid; names the file, the link or joint, and the legal
+            values.
     """
     root = parse_xml(file, text)
     _check_expanded(file, root)
@@ -57,7 +62,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
     for part in parts:
         where = f'{file}: {part.tag} {part.get("name")!r}'
         if printable(name := part.get('name', '')) != name:
-            raise RobotDescriptionError(f'{where}: expected a name that can be printed')
+            raise RobotDescriptionError(f'{where}: expected printable characters only')
         if part.tag == 'joint' and name == 'universe':
             raise RobotDescriptionError(f'{where}: expected another name, pinocchio uses this one')
         for element in part.iter():
@@ -73,9 +78,12 @@ def read_urdf(file: Path, text: str) -> pin.Model:
 
 
 def parse_xml(file: Path, text: str) -> ET.Element:
-    """Return the root of an XML text; a RobotDescriptionError says what is wrong with it.
+    """Return the root element of an XML text.
 
-    It must have no DOCTYPE, and so no entities, and not be too deep.
+    A DOCTYPE is rejected, which excludes entities.
+
+    Raises:
+        RobotDescriptionError: If the text is not valid XML, has a DOCTYPE or is nested too deeply.
     """
     try:
         if '<!DOCTYPE' in text or '<!ENTITY' in text:
@@ -86,7 +94,7 @@ def parse_xml(file: Path, text: str) -> ET.Element:
             level, depth = [child for element in level for child in element], depth + 1
         if depth > DEEPEST:
             raise ValueError(f'more than {DEEPEST} levels')
-        # A default namespace, which the URDF parser does not look at.
+        # The URDF parser ignores a default namespace.
         if space := root.tag.rpartition('}')[0]:
             for element in root.iter():
                 element.tag = element.tag.removeprefix(space + '}')
@@ -96,7 +104,7 @@ def parse_xml(file: Path, text: str) -> ET.Element:
 
 
 def read_mimics(root: ET.Element) -> dict[str, Coupling]:
-    """Return which joints of a URDF that `read_urdf` has read follow others by <mimic>."""
+    """Return the couplings that a URDF, checked by `read_urdf`, declares with <mimic>."""
     mimics = {}
     for joint in root.findall('joint'):
         mimic = joint.find('mimic')
@@ -107,10 +115,10 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 
 
 def _check_expanded(file: Path, root: ET.Element) -> None:
-    """Refuse what only a preprocessor understands: the URDF parser ignores it without a warning."""
+    """Reject a file that still needs a preprocessor: the URDF parser would ignore the macros."""
     for problem in _preprocessor_parts(root):
         remedy = 'expand it first, by xacro FILE > robot.urdf'
-        raise RobotDescriptionError(f'{file}: it is a xacro, not a URDF ({problem}): {remedy}')
+        raise RobotDescriptionError(f'{file}: this is a xacro, not a URDF ({problem}): {remedy}')
 
 
 def _preprocessor_parts(root: ET.Element) -> Iterator[str]:
@@ -130,10 +138,10 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[str]:
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
-    """Make continuous joints that follow others revolute; return whether there are any.
+    """Change continuous joints with <mimic> into revolute ones; return whether there are any.
 
-    A joint that follows another needs no limits of its own, and pinocchio describes a continuous
-    joint by two coordinates, which cannot follow one.
+    A mimic joint needs no limits of its own. Pinocchio represents a continuous joint by two
+    coordinates, which cannot follow a single one.
     """
     followers = [
         part
@@ -150,7 +158,10 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 
 
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
-    """Refuse what is no tree; the parser says why on stderr only, and takes a link's last joint."""
+    """Reject links and joints that do not form a tree.
+
+    The parser would report this on stderr only, and would use the last joint of each link.
+    """
     links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
     for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():
         if not name or count > 1:
@@ -161,7 +172,8 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
             where = f'{file}: joint {part.get("name")!r}'
             _check_joint(where, part)
             for end in ('parent', 'child'):
-                link = '' if (found := part.find(end)) is None else found.get('link', '')
+                element = part.find(end)
+                link = '' if element is None else element.get('link', '')
                 if link not in links or (end == 'child' and link in held):
                     got = f'{link!r} has a joint above it already' if link in held else repr(link)
                     expected = 'expected a link of this file, each below one joint'
@@ -190,7 +202,7 @@ def _check(part: str, element: ET.Element) -> None:
         if (text := element.get(attribute)) is None:
             continue
         try:
-            # Python reads 1_000 and other alphabets' digits, the URDF parser does not.
+            # Python accepts 1_000 and the digits of other alphabets; the URDF parser does not.
             values = [float(word) for word in text.split() if word.isascii() and '_' not in word]
         except ValueError:
             values = []
@@ -206,8 +218,8 @@ def _check(part: str, element: ET.Element) -> None:
             raise RobotDescriptionError(f'{part}: {element.tag} {attribute}: {problem}')
     if element.tag == 'inertial':
         for tag in ('mass', 'inertia'):
-            found = element.find(tag)
-            present = set() if found is None else set(found.keys())
+            child = element.find(tag)
+            present = set() if child is None else set(child.keys())
             if missing := NUMBERS[tag].keys() - present:
                 expected = f'{", ".join(sorted(missing))}; links without mass have no <inertial>'
                 raise RobotDescriptionError(f'{part}: {tag}: expected {expected}')

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A wire between two points that a sphere or a cylinder may stand in the way of.
+"""The length of a tendon between two points, which may wrap around a sphere or a cylinder.
 
-In the plane of the end points and the centre (sphere) or across the axis (cylinder), the wire goes
-straight, or along a tangent, round by an arc, and off along the other tangent:
+In the plane of the end points and the centre (sphere), or in the plane normal to the axis
+(cylinder), the tendon is straight, or it follows a tangent, an arc and another tangent:
 
     length = √(a² − r²) + √(b² − r²) + r · arc        a, b: distances of the ends from the centre
 
-On a cylinder the wire also advances evenly along the axis: √(length² + Δz²). Without a `side` it
-wraps where the straight line would cut the object, the short way round. With one it passes the
-object on that side; a side *inside* the object makes it a ring that the wire runs through. Which
-tangents, and when, is MuJoCo's choice (its `mju_wrap`), so that its models keep their lengths. At
-the points where the wire lifts off the arc is nil and tangents and straight line are the same, so
-that length and moment arm are continuous. A point on the rim of what the wire wraps round is tied
-to it: within a share RIM of the radius it counts as outside, where MuJoCo lets rounding decide.
-Compiled by numba for one wire: the geometric model calls it for many, the emulator in each of its
-steps.
+On a cylinder the tendon also advances evenly along the axis, which gives √(length² + Δz²).
+
+- Without a `side`, the tendon takes the short way around if a straight line would cut the object.
+- With a `side`, it passes the object on that side.
+- A side *inside* the object makes the object a ring through which the tendon runs.
+
+The choice of tangents is that of MuJoCo's `mju_wrap`, so that imported models keep their lengths.
+Where the tendon lifts off, the arc has length zero and the tangents lie on the straight line.
+Length and moment arm are therefore continuous there. A point on the rim of the object is attached
+to it: within RIM · r of the surface it counts as outside, where MuJoCo lets rounding decide.
+
+The functions are compiled by numba. The geometric model evaluates many segments at once, and the
+emulator evaluates one segment after another in each step.
 """
 
 import cmath
@@ -35,19 +39,20 @@ Vector = tuple[float, float, float] | Array
 
 
 class WrapObjects(NamedTuple):
-    """One sphere or cylinder for each segment that has one, in the frame of its tree joint."""
+    """The sphere or cylinder of each of S segments, in the frame of the joint that carries it."""
 
-    joint: Ints  # (S,)
+    joint: Ints  # joint of the tree that carries the object, (S,)
     centre: Array  # [m], (S, 3)
     axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
-    #: [m], NaN for none, (S, 3): from the centre, or in the frame of another joint
+    #: the side point [m], NaN for none, (S, 3): relative to the centre if the object's own joint
+    #: carries it, else in the frame of the joint that does
     side: Array
-    side_joint: Ints  # that carries the side; the object's own or another, (S,)
+    side_joint: Ints  # joint of the tree that carries the side point, (S,)
     radius: Array  # [m], 0 for no object, (S,)
 
 
 def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
-    """Return what a description wraps segments round, one each, in the frames of tree joints."""
+    """Return the objects of a description's wraps, in the frames of the joints of the tree."""
     rows = []
     for wrap in wraps:
         joint, at = kinematics.placement(wrap.link)
@@ -62,12 +67,12 @@ def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
 
 @njit(cache=True)
 def _product(a: complex, b: complex) -> complex:
-    """Return a · b in the real part, a × b in the imaginary one."""
+    """Return a · b as the real part and a × b as the imaginary part."""
     return a.conjugate() * b
 
 
 @njit(cache=True)
-def _meet(a: complex, b: complex, c: complex, d: complex) -> bool:
+def _cross_each_other(a: complex, b: complex, c: complex, d: complex) -> bool:
     """Return whether the segments a–b and c–d cross."""
     determinant = _product(b - a, d - c).imag
     if abs(determinant) < TINY:
@@ -79,10 +84,10 @@ def _meet(a: complex, b: complex, c: complex, d: complex) -> bool:
 
 @njit(cache=True)
 def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, complex, complex]:
-    """Return what `_round` does for a wire that is drawn to a ring's inside.
+    """Return the results of `_round` for a tendon through a ring, which it touches from inside.
 
-    Where it touches, both straight parts make the same angle with the radius: with z its sine,
-    asin(r z / a) + asin(r z / b) − 2 asin z + (angle between the ends) = 0.
+    At the point of contact, both straight parts make the same angle with the radius. Its sine z is
+    the root of asin(r z / a) + asin(r z / b) − 2 asin z + (angle between the ends) = 0.
     """
     straight = False, 0.0, 0j, 0j
     d, far, near = b - a, abs(a), abs(b)
@@ -109,15 +114,23 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
 
 @njit(cache=True)
 def _beyond_rim(distance: float, r: float) -> float:
-    """Return a distance from the centre; that of a point on the rim is the radius."""
+    """Return a distance from the centre, set to the radius for a point on the rim."""
     return r if abs(distance - r) <= RIM * r else distance
 
 
 @njit(cache=True)
 def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float, complex, complex]:
-    """Return whether it wraps in the plane, its length, and the unit pulls at a and at b.
+    """Wrap a tendon around a circle of radius r at the origin of the complex plane.
 
-    The side is a direction, or 0 for none.
+    Args:
+        a: Start of the tendon [m].
+        b: End of the tendon [m].
+        r: Radius [m].
+        side: Direction in which the tendon passes the circle, or 0 for the short way around.
+
+    Returns:
+        Whether the tendon wraps; its length [m]; and the unit vectors along the tendon, away from
+        a and away from b. The last three are zero if it does not wrap.
     """
     straight = False, 0.0, 0j, 0j
     d, sided = b - a, abs(side) > 0.5
@@ -134,15 +147,15 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
         end = cmath.phase(b) - way * math.acos(r / near)
         u, v = cmath.rect(r, start), cmath.rect(r, end)
         good = _product(u + v, side).real / (abs(u + v) + TINY) if sided else -abs(u - v)
-        crosses = _meet(a, u, b, v)
+        crosses = _cross_each_other(a, u, b, v)
         if crosses:
             good = -1e4
         if good > best:
             best, arc = good, (way * (end - start)) % (2.0 * math.pi)
-            # An arc that rounding made just less than nothing is no turn round the object.
+            # Rounding may turn an arc of length zero into one of almost a full turn.
             wraps = not crosses and arc < 2.0 * math.pi - 1e-9
             length = math.sqrt(far**2 - r * r) + math.sqrt(near**2 - r * r) + r * arc
-            # Where it meets the circle, the wire goes the way it turns.
+            # The tangent at the point of contact has the direction of rotation.
             result = wraps, length, way * 1j * u / r, -way * 1j * v / r
     return result
 
@@ -173,19 +186,22 @@ def _unit(a: Vector) -> Vector:
 
 @njit(cache=True)
 def _beside(a: Vector) -> Vector:
-    """Return some unit vector across a unit vector."""
+    """Return a unit vector perpendicular to a unit vector."""
     return _unit(cross(a, (1.0, 0.0, 0.0) if abs(a[0]) < 0.6 else (0.0, 1.0, 0.0)))
 
 
 @njit(cache=True)
 def turned(rotation: Array, vector: Array) -> Vector:
-    """Return a vector (3,), turned by a matrix (3, 3)."""
+    """Return a vector (3,), rotated by a matrix (3, 3)."""
     return dot(rotation[0], vector), dot(rotation[1], vector), dot(rotation[2], vector)
 
 
 @njit(cache=True)
 def side_of(objects: WrapObjects, s: int, rotation: Array, translation: Array) -> Vector:
-    """Return the side of object s from its centre [m], in axes of the root link; NaN for none."""
+    """Return the side point of object s, relative to its centre and in root-link axes [m].
+
+    It is NaN if the object has no side.
+    """
     j, k = objects.joint[s], objects.side_joint[s]
     side = turned(rotation[k], objects.side[s])
     if j == k:
@@ -199,10 +215,17 @@ def wrapped_segment(
     objects: WrapObjects, s: int, rotation: Array, translation: Array, start: Array, end: Array,
     leave: Array, arrive: Array,
 ) -> float:  # fmt: skip
-    """Return the length [m] of segment s from start to end, points in the root link's frame.
+    """Return the length of segment s [m] and write its directions into `leave` and `arrive`.
 
-    The objects are placed by the poses (J, 3, 3), (J, 3) of the tree's joints. Fills the unit
-    vectors along which the wire pulls its start (`leave`) and its end (`arrive`).
+    Args:
+        objects: The objects of all segments.
+        s: Index of the segment.
+        rotation: Rotations of the joints of the tree, (J, 3, 3).
+        translation: Translations of the joints of the tree [m], (J, 3).
+        start: Start point in the root link's frame [m], (3,).
+        end: End point in the root link's frame [m], (3,).
+        leave: Output: unit vector along the tendon away from the start, (3,).
+        arrive: Output: unit vector along the tendon away from the end, (3,).
     """
     j, radius, line = objects.joint[s], objects.radius[s], plus(end, start, -1.0)
     straight = math.sqrt(dot(line, line))
@@ -220,9 +243,9 @@ def wrapped_segment(
         v = cross(axis, u)
     else:
         u = _unit(a)
-        normal = cross(u, _unit(b))  # of units: that of ends near the centre is short
+        normal = cross(u, _unit(b))  # of unit vectors, because ends may be close to the centre
         if dot(normal, normal) < 1e-18:
-            # Through the centre every plane is as good: take that of the side, or any.
+            # The line passes through the centre: use the plane of the side, or any plane.
             normal = cross(a, side) if sided else _beside(u)
         v = cross(_unit(normal), u)
     flat_a, flat_b = complex(dot(a, u), dot(a, v)), complex(dot(b, u), dot(b, v))
@@ -245,7 +268,11 @@ def wrapped_segment(
 def wrapped_segments(
     objects: WrapObjects, rotation: Array, translation: Array, start: Array, end: Array
 ) -> tuple[Array, Array, Array]:
-    """Return lengths (N, S) and pulls at start and end (N, S, 3) of segments, ends (N, S, 3)."""
+    """Return the results of `wrapped_segment` for S segments in N postures.
+
+    Returns:
+        Lengths [m], (N, S), and the unit vectors away from the start and from the end, (N, S, 3).
+    """
     lengths = np.zeros((start.shape[0], start.shape[1]))
     leave, arrive = np.zeros(start.shape), np.zeros(start.shape)
     for n in range(start.shape[0]):
@@ -257,13 +284,13 @@ def wrapped_segments(
     return lengths, leave, arrive
 
 
-def touched(
+def arc_points(
     objects: WrapObjects, s: int, most: int, rotation: Array, translation: Array,
     start: Array, end: Array,
 ) -> Array:  # fmt: skip
-    """Return points along the arc of one wrapped segment for drawing, (K, 3); none if straight.
+    """Return points along the arc of segment s for drawing, in the root link's frame [m], (K, 3).
 
-    K is `most` on an arc, 1 in a ring.
+    K is 0 for a straight segment, 1 for a ring, and `most` for an arc.
     """
     leave, arrive = np.zeros(3), np.zeros(3)
     length = wrapped_segment(objects, s, rotation, translation, start, end, leave, arrive)
@@ -272,7 +299,7 @@ def touched(
     j, radius = objects.joint[s], objects.radius[s]
     side = np.array(side_of(objects, s, rotation, translation))
     if side @ side < radius**2:
-        # A ring: the straight parts meet where the wire touches it.
+        # A ring: the straight parts meet at the point of contact.
         parts = np.linalg.lstsq(np.stack([leave, -arrive], axis=1), end - start, rcond=None)[0]
         return (start + parts[0] * leave)[None]
     axis, centre = rotation[j] @ objects.axis[s], translation[j] + rotation[j] @ objects.centre[s]

@@ -136,7 +136,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
         origins, axes, moments = pose[k, 3], pose[k, 4], pose[k, 5]
         master, weighs, slides = tree.master[k], tree.carried[k], tree.slides[k]
         acting, angles, gear = wrench if tree.carries[k] else nothing, theta[master], gears[k]
-        is_bent = len(tree.terms[k]) > 2
+        is_nonlinear = len(tree.terms[k]) > 2
         pushes, twists = acting[:3], acting[3:]
         for n in range(arms):
             at, axis = of(n, origins), of(n, axes)
@@ -150,7 +150,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
                 bending = cross(down, cross(weight, axis)), cross(push, cross(arm, axis))
                 torque, bent = dot(axis, turning), plus(bending[0], bending[1])
             load[master, n] -= gear[n] * torque
-            if is_bent:
+            if is_nonlinear:
                 gradient[master, master, n] -= polynomial(tree.terms[k], 2, angles[n]) * torque
             for r in range(3):
                 bend[r, n] = bent[r]
@@ -184,10 +184,10 @@ class Load:
             second=kin.tree.second,
             axis=kin.tree.local_axis,
             mass=mass,
-            carried=mass @ kin.tree.hangs_on,
+            carried=mass @ kin.tree.descends_from,
             centre=np.array([inertia.lever for inertia in model.inertias]),
             gravity=np.array(model.gravity.linear),
-            carries=kin.tree.hangs_on[joint].copy(),
+            carries=kin.tree.descends_from[joint].copy(),
             effector_joint=joint,
             effector=np.array(effector.placement.translation),
         )

@@ -35,7 +35,7 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.description import shown
-from musculoskeletal_ae.robot.jumps import told_of_jumps
+from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions, end_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
@@ -62,7 +62,7 @@ def train(args: Namespace) -> None:
             raise MusculoskeletalError(problem) from error
     train_on(args.device)
     robot = Robot.load(args.robot)
-    if warning := told_of_jumps(robot):
+    if warning := jump_warning(robot):
         print(f'warning: {warning}. Nodes may reject this network', file=sys.stderr)
     preset = PRESETS[args.preset]
     steps = preset.initial_steps(robot.groups) // (10 if args.quick else 1)

@@ -12,10 +12,10 @@ from musculoskeletal_ae.robot.checks import (
     MATTERS,
     REQUIRED_SHARE,
     RobotCheck,
+    arm_terms,
     check_robot,
-    figure,
     required_stiffness,
-    words,
+    rounded_text,
 )
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.kinematics import RACK
@@ -58,13 +58,14 @@ def _suggested(robot: Robot, args: Namespace) -> int:
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
     far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
     if not before:
-        print('no via point is to blame, nothing is written')
+        print('moving via points cannot remedy these faults; nothing is written')
         return 1
     if after:
-        print(f'no sound arm was found within {1e3 * args.reach:g} mm; the best is', end=' ')
+        print(f'no sound arm was found within {1e3 * args.reach:g} mm;', end=' ')
         if after >= before:
-            print('as it was, nothing is written')
+            print('no candidate is better, and nothing is written')
             return 1
+        print('the best candidate is', end=' ')
     write(robot, change, args.out)
     print(f'{args.out}: {np.sum(far > 0.0)} of {len(far)} points moved, up to {far.max():.1f} mm')
     for m, name in enumerate(robot.muscles):
@@ -105,7 +106,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
             'highest holding tension [N]': result.tension[held].max(axis=1),
         }.items():
             spread = np.percentile(values, [0, 5, 50, 100])
-            texts = [figure(value, 1, np.abs(spread).max()) for value in spread]
+            texts = [rounded_text(value, 1, np.abs(spread).max()) for value in spread]
             lines.append(f'{title:<44}' + ''.join(f' {text:>8}' for text in texts))
     return '\n'.join(lines)
 
@@ -114,22 +115,24 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     """Return a table of min, median and max of every moment arm [mm], one row per muscle."""
     width = max(18, *(len(name) + 2 for name in robot.joints))
     first = max(len(name) for name in robot.muscles) + 2
-    scale = np.array([words(robot, j).scale for j in range(robot.joint_count)])
+    scale = np.array([arm_terms(robot, j).scale for j in range(robot.joint_count)])
     arms, matters = scale * result.moment_arms, result.matters
     longest = np.abs(result.moment_arms).max(axis=(0, 1))
-    decimals = [words(robot, j).decimals(arm) for j, arm in enumerate(longest.tolist())]
+    decimals = [arm_terms(robot, j).decimals(arm) for j, arm in enumerate(longest.tolist())]
     spread = np.stack([arms.min(axis=0), np.median(arms, axis=0), arms.max(axis=0)], axis=-1)
     sliders = ', '.join(np.array(robot.joints)[robot.kinematics.slides])
-    moves = 'moves' if sliders else 'turns'
     tenth = ', and below a tenth of the longest at that joint,' * bool((matters < MATTERS).any())
-    sliding = f'of what slides ({sliders}): the share of the tension along it [%], "." = below '
     lines = [
         '',
-        f'moment arms [mm]: min, median, max; + {moves} the joint in its positive direction',
+        'moment arms [mm]: min, median, max; + moves the joint in its positive direction',
         f'"." = below {1e3 * MATTERS:g} mm{tenth} in every posture',
-        *[f'{sliding}{100 * MATTERS / RACK:g} %'] * bool(sliders),
-        ' ' * first + ''.join(name.rjust(width) for name in robot.joints),
     ]
+    if sliders:
+        least = f'"." = below {100 * MATTERS / RACK:g} %'
+        lines.append(
+            f'prismatic joints ({sliders}): share of the tension along the axis [%], {least}'
+        )
+    lines.append(' ' * first + ''.join(name.rjust(width) for name in robot.joints))
     for name, row in zip(robot.muscles, spread):
         cells = [
             '.' if np.abs(cell).max() < least else ' '.join(f'{v:+.{digits}f}' for v in cell)
@@ -149,7 +152,7 @@ def plot(robot: Robot, result: RobotCheck) -> Any:
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
     for j, (panel, name) in enumerate(zip(axes, robot.joints)):
-        slides, terms = robot.kinematics.slides[j], words(robot, j)
+        slides, terms = robot.kinematics.slides[j], arm_terms(robot, j)
         label, shown_as = ('position [mm]', 1e3) if slides else ('joint angle [deg]', 180.0 / np.pi)
         for m, muscle in enumerate(robot.muscles):
             arm = result.moment_arms[:, m, j]

@@ -79,7 +79,7 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
     for name, robot in arms.items():
         with pytest.raises(GateError) as refusal:
             CheckpointValidator(robot).check(initial_mae(robot, steps=1).mae)
-        reported = 'no network restores lengths that jump'
+        reported = 'no network can represent lengths that jump'
         assert (reported in str(refusal.value)) == (name == 'jumps')
     assert re.search(r': straightener \(\d+ mm\); see check_robot', str(refusal.value))
 

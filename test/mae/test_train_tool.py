@@ -47,7 +47,7 @@ def test_train_warns_of_lengths_that_jump_before_it_trains(tmp_path, capsys, nam
     arguments = ['--robot', str(tmp_path / 'arm'), '--out', str(tmp_path / 'x')]
     assert main([*arguments, '--from-bag', str(tmp_path / 'none')]) == 1  # nothing is trained
     error = capsys.readouterr().err
-    assert ('warning: no network restores lengths that jump' in error) == (name == 'jumps')
+    assert ('warning: no network can represent lengths that jump' in error) == (name == 'jumps')
     assert ('straightener (' in error and 'check_robot' in error) == (name == 'jumps')
 
 

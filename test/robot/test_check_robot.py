@@ -62,19 +62,19 @@ def test_routes_in_millimetres_are_suspected(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ('low', 'high', 'told'),
+    ('low', 'high', 'expected'),
     [
         ('-1.6', '-0.2', ''),
         ('-90', '-12', "joint 'bend' has limits of -90 to -12 rad; give them in radians"),
     ],
 )
-def test_limits_in_degrees_are_suspected(tmp_path, capsys, low, high, told):
+def test_limits_in_degrees_are_suspected(tmp_path, capsys, low, high, expected):
     urdf = write_robot(tmp_path / 'arm') / 'robot.urdf'
     old = 'lower="-1.6" upper="-0.2"'
     urdf.write_text(urdf.read_text().replace(old, f'lower="{low}" upper="{high}"'))
     _, out, _ = verdict(capsys, urdf.parent, '--postures', 50)
-    assert ('not degrees' in out) == bool(told)
-    assert told in out
+    assert ('not degrees' in out) == bool(expected)
+    assert expected in out
 
 
 @pytest.mark.parametrize('name', SHIPPED)
@@ -127,7 +127,7 @@ def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path):
     assert labels == ['joint angle [deg]'] * 3 + ['position [mm]']
     assert [panel.get_ylabel() for panel in panels[2:4]] == [
         'moment arm −G [mm]',
-        'pull −G [%]',
+        'force share −G [%]',
     ]
 
 
@@ -159,10 +159,10 @@ def test_what_slides_is_told_in_newtons_and_shares_of_the_tension(tmp_path, caps
     status, printed, _ = verdict(capsys, directory, '--postures', '40')
     assert status == 1
     assert re.search(r'wrist in \d+ \(up to [\d.]+ N\)', printed)
-    assert re.search(r"pull of wrong sign at joint 'wrist'.*\(median -\d+\.\d %\)", printed)
+    assert re.search(r"share of the wrong sign at joint 'wrist'.*\(median -\d+\.\d %\)", printed)
     assert re.search(r'act on it: .*slider_in \(-\d+ %\)', printed)
-    assert 'of what slides (wrist): the share of the tension along it [%]' in printed
-    assert '5 N·m/rad (where it slides, 1389 N/m)' in printed
+    assert 'prismatic joints (wrist): share of the tension along the axis [%]' in printed
+    assert '5 N·m/rad (1389 N/m for prismatic joints)' in printed
 
 
 @pytest.mark.parametrize('name', SHIPPED)
@@ -213,8 +213,8 @@ def test_a_joint_that_no_muscle_moves_is_to_be_left_out(tmp_path, capsys):
     directory = write_robot(tmp_path, joints=['swing', 'lift', 'bend', 'finger'], finger=True)
     _, printed, _ = verdict(capsys, directory, '--postures', 40)
     (line,) = [row for row in printed.splitlines() if 'muscles that act on it: none' in row]
-    told = printed[printed.index(line) :]
-    assert 'import_robot --joints' in told and 'type="fixed" in robot.urdf' in told
+    remedy = printed[printed.index(line) :]
+    assert 'import_robot --joints' in remedy and 'type="fixed" in robot.urdf' in remedy
 
 
 def test_columns_of_large_numbers_stay_apart(tmp_path, capsys):
@@ -235,7 +235,7 @@ def test_an_arm_too_heavy_for_its_muscles_is_named_with_the_joint_that_lacks_tor
     status, printed, _ = verdict(capsys, directory)
     assert status == 1
     assert 'fault: the arm is not held' in printed
-    assert 'torque lacks most at shoulder in' in printed
+    assert 'missing torque is largest at shoulder in' in printed
 
 
 def test_muscles_too_weak_to_hold_the_arm_are_a_fault(tmp_path):
@@ -258,7 +258,7 @@ def test_a_muscle_that_crosses_no_joint_never_matters(tmp_path, capsys):
 
     status, printed, _ = verdict(capsys, change(write_robot(tmp_path), idle))
     assert status == 1
-    assert "muscle 'idler' never matters" in printed
+    assert "muscle 'idler' has no effect" in printed
 
 
 def test_a_main_action_that_changes_sign_is_a_warning_not_a_fault(tmp_path):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wires that slip to the other side of what they wrap round: found, and in no individual."""
+"""Tendons that slip over an object: they are reported, and no emulated individual has one."""
 
 import re
 
@@ -32,7 +32,7 @@ def test_check_robot_warns_of_a_muscle_whose_length_jumps(tmp_path):
     (warning,) = check_robot(behind_a_drum(tmp_path, DRUM_ENDS['jumps'])).warnings
     assert warning.kind == 'jumping_muscle'
     assert "'straightener' jumps by 17" in warning.message
-    assert warning.message.endswith('wraps round, at bend -1.57')
+    assert warning.message.endswith('wraps around, at bend -1.57')
 
 
 def test_the_choices_that_a_jumping_length_leaves_are_named(tmp_path):
