@@ -332,7 +332,7 @@ def test_a_finger_is_judged_by_its_own_size_and_told_that_it_is_small(tmp_path, 
     assert status == 0, printed
     assert 'nearest to 1.5 N' in printed and 'stiffness >= 0.0' in printed
     (warning,) = (line for line in printed.splitlines() if line.startswith('warning: '))
-    assert 'moment arms are short, at knuckle (' in warning and 'human size' in warning
+    assert 'moment arms are short at knuckle (' in warning and 'human size' in warning
     (row,) = (line for line in printed.splitlines() if line.startswith('flexor '))
     assert re.fullmatch(r'flexor( +-\d\.\d){3}', row)
 

@@ -62,7 +62,7 @@ BAD = {
     'no muscles': (put(['muscles'], []), ['$.muscles', 'length >= 1']),
     'name with a comma': (put(['muscles', 0, 'name'], 'a, b'), ["'a, b'", 'without a comma']),
     'name with a space': (put(['muscles', 0, 'name'], 'a '), ["'a '", 'without spaces around']),
-    'an escape in a name': (put(['muscles', 0, 'name'], 'a\x9b1m'), ['can be printed']),
+    'an escape in a name': (put(['muscles', 0, 'name'], 'a\x9b1m'), ['printable characters']),
     'muscle twice': (put(['muscles', 1, 'name'], 'deltoid_anterior'), ['twice', 'unique']),
     'one-point route': (drop(POINT), ['$.muscles[0].route', 'length >= 2']),
     'the same point twice': (put(ROUTE, [{'link': 'hand', 'xyz': [0, 0, 0]}] * 2), ['2 different']),
@@ -267,7 +267,7 @@ STRANGE = {
     'an absurd place': (in_arm26('xyz="0 0 ', 'xyz="0 1e300 '), 'of at most'),
     'an axis of no direction': (in_arm26('<axis xyz="0 1 0"', '<axis xyz="0 0 0"'), 'a direction'),
     "pinocchio's own name": (in_arm26('<joint name="', '<joint name="universe" id="'), 'another'),
-    'an escape in a name': (in_arm26('<link name="', '<link name="\x9b1m'), 'printed'),
+    'an escape in a name': (in_arm26('<link name="', '<link name="\x9b1m'), 'printable'),
 }
 
 
