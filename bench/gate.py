@@ -22,13 +22,10 @@ from network_attacks import ATTACKS
 
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.estimation.checkpoint_validation import (
-    FLOOR,
-    LEAST_CUT,
-    LIMITS,
-    WORSE,
-    CheckpointValidator,
-)
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.estimation.validation.detector import LEAST_RUPTURED
+from musculoskeletal_ae.estimation.validation.message_errors import FLOOR, WORSE
+from musculoskeletal_ae.estimation.validation.postures import LIMITS
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
@@ -72,20 +69,22 @@ class Spread:
     def __init__(self) -> None:
         """Begin without networks."""
         self.most: defaultdict[str, float] = defaultdict(float)
-        self.least_cut, self.refused, self.count = np.inf, list[str](), 0
+        #: smallest d over its threshold with a ruptured muscle
+        self.least_ruptured, self.refused, self.count = np.inf, list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
         """Measure and validate a network."""
         self.count += 1
-        values = {key: share.max() for key, share in filter(None, gate.posture_errors(mae))}
-        left = gate.message_errors(mae)
-        values |= {f'{key} of messages': error.max() for key, error in left.items()}
-        if gate.mae is not None:
-            for key, before in (gate.message_errors(gate.mae) if left else {}).items():
-                worse = left[key][left[key] > FLOOR[key]] / before[left[key] > FLOOR[key]]
-                values[f'{key} beyond that in use'] = worse.max(initial=0.0)
-        values['d on messages'], *cuts = [*gate.detector(mae)] or [0.0]
-        self.least_cut = min(self.least_cut, max(cuts, default=np.inf))
+        values = {key: error.max() for key, error in filter(None, gate.postures.errors(mae))}
+        errors = gate.message_errors(mae)
+        values |= {f'{key} of messages': error.max() for key, error in errors.items()}
+        if gate.mae is not None and errors:
+            for key, in_use in gate.message_errors(gate.mae).items():
+                is_large = errors[key] > FLOOR[key]
+                ratio = errors[key][is_large] / in_use[is_large]
+                values[f'{key} over that in use'] = ratio.max(initial=0.0)
+        values['d on messages'], *ruptured = [*gate.detector_measures(mae)] or [0.0]
+        self.least_ruptured = min(self.least_ruptured, max(ruptured, default=np.inf))
         for key, value in values.items():
             self.most[key] = max(self.most[key], float(value))
         try:
@@ -121,13 +120,13 @@ def limit(name: str) -> float:
     """Return a measure's limit."""
     if name in (limits := LIMITS | MESSAGES):
         return limits[name]
-    return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'beyond' in name else 1.0)
+    return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'in use' in name else 1.0)
 
 
 def main(argv: list[str]) -> int:
     """Run the bench; return the exit status."""
     parser = Parser(
-        'gate', "Prints healthy networks' distance from the gate's limits, and attacks."
+        'gate', 'Compares healthy and attacked networks with the limits of checkpoint validation.'
     )
     parser.add_robot()
     parser.add_reality()
@@ -148,7 +147,8 @@ def main(argv: list[str]) -> int:
     print(f'{spread.count} healthy networks: largest of each measure, limit')
     for name, value in spread.most.items():
         print(f'  {name:<45}{value:10.4g}{limit(name):10.4g}')
-    print(f'  {"d with a ruptured muscle (smallest)":<45}{spread.least_cut:10.4g}{LEAST_CUT:10.4g}')
+    title = 'd with a ruptured muscle (smallest)'
+    print(f'  {title:<45}{spread.least_ruptured:10.4g}{LEAST_RUPTURED:10.4g}')
     print('\n'.join(['refused:', *(spread.refused or ['none'])]))
     failed = bool(spread.refused)
     for attack, change in ATTACKS.items():

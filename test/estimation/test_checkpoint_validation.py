@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network takes over only if it explains the arm; attacks are those of `network_attacks`."""
+"""A network takes over only if it explains the arm; `network_attacks` defines bad networks."""
 
 import re
 from collections import deque
@@ -12,14 +12,14 @@ from network_attacks import ATTACKS, CONSISTENT, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.estimation.checkpoint_validation import (
-    FLOOR,
-    LIMITS,
     MOST_USED,
     NOTICED,
     PROOF,
     CheckpointValidator,
 )
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
+from musculoskeletal_ae.estimation.validation.message_errors import FLOOR
+from musculoskeletal_ae.estimation.validation.postures import LIMITS
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.learning.learner import Learner
@@ -39,8 +39,8 @@ def body(count=60, seed=0):
     return tension, ROBOT.muscle_lengths(theta, tension) + 0.003
 
 
-def seeing(gate, start=0.0):
-    """Let a gate see six seconds of a healthy arm; return when they end."""
+def send_healthy_messages(gate, start=0.0):
+    """Give a gate six seconds of messages of a healthy arm; return the time at their end [s]."""
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
         gate.message(tension, length, start + 0.1 * k)
     return start + 6.0
@@ -57,7 +57,7 @@ def test_trained_networks_pass_with_and_without_messages(trained, preset):
     gate = CheckpointValidator(ROBOT)
     gate.check(trained[preset])
     gate.take(trained[preset], 0.0)
-    seeing(gate)
+    send_healthy_messages(gate)
     gate.check(trained[preset])
     for other in trained.values():
         gate.check(other)
@@ -69,7 +69,7 @@ def test_trained_networks_pass_with_and_without_messages(trained, preset):
 def test_a_bad_network_is_refused_without_any_message_and_the_error_names_figure_and_limit(
     trained, preset, attack
 ):
-    with pytest.raises(GateError, match=r'unexplained on the geometric model, limit') as refusal:
+    with pytest.raises(GateError, match=r'from the geometric model, limit') as refusal:
         CheckpointValidator(ROBOT).check(ATTACKS[attack](trained[preset]))
     assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
 
@@ -87,7 +87,7 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
 def test_a_network_is_validated_in_many_steps_and_refused_at_the_last(trained):
     gate, mae = CheckpointValidator(ROBOT), calibrated(trained['default'])
     gate.take(mae, 0.0)
-    seeing(gate)
+    send_healthy_messages(gate)
     whole = sum(1 for _ in gate.trial(mae))
     assert whole > 20
     trial = gate.trial(ATTACKS['weights × 1.5'](mae))
@@ -102,19 +102,19 @@ def test_a_network_that_the_geometric_model_accepts_is_refused_by_own_messages(t
     gate.take(mae, 0.0)
     bad = ON_MESSAGES[attack](mae)
     gate.check(bad)
-    seeing(gate)
-    with pytest.raises(GateError, match=r'own messages|muscle cut'):
+    send_healthy_messages(gate)
+    with pytest.raises(GateError, match=r'recent messages|ruptured muscle'):
         gate.check(bad)
 
 
 def test_a_detector_with_too_high_or_too_low_threshold_is_refused(trained):
     gate, mae = CheckpointValidator(ROBOT), calibrated(trained['default'])
-    seeing(gate)
+    send_healthy_messages(gate)
     gate.check(mae)
     for times, reported in (
-        (100.0, 'with a muscle cut'),
-        (0.01, 'on own messages'),
-        (0.0, 'on own messages'),
+        (100.0, 'with a ruptured muscle'),
+        (0.01, 'on recent messages'),
+        (0.0, 'on recent messages'),
     ):
         thresholds = {DISTANCE: times * mae.anomaly.thresholds[DISTANCE]}
         with pytest.raises(GateError, match=reported):
@@ -136,7 +136,7 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back(trained)
 
 def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trained):
     gate = CheckpointValidator(ROBOT)
-    end = seeing(gate)
+    end = send_healthy_messages(gate)
     before = gate.message_errors(trained['default'])
     tension, length = body()
     for k in range(15):
@@ -180,8 +180,8 @@ def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(
     gate = CheckpointValidator(ROBOT)
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
         gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), 0.1 * k)
-    left = gate.message_errors(trained['default'])
-    assert any(left[name].max() > FLOOR[name] for name in FLOOR)
+    errors = gate.message_errors(trained['default'])
+    assert any(errors[name].max() > FLOOR[name] for name in FLOOR)
     gate.check(trained['default'])
 
 
@@ -201,8 +201,8 @@ def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
     assert gate.anomaly(True, 0.0) is first
 
 
-def moving(gate, measures):
-    """Let a gate see an arm that is like its model, with joint sensors or without."""
+def send_messages_of_the_model(gate, measures):
+    """Give a gate messages of an arm that equals its model, with joint sensors or without."""
     rng = np.random.default_rng(0)
     theta = ROBOT.random_postures(60, rng)
     tension = rng.uniform(30.0, 150.0, (60, ROBOT.muscle_count))
@@ -217,7 +217,7 @@ def moving(gate, measures):
 def test_a_consistent_but_wrong_network_is_refused(trained, attack, measures):
     gate, mae = CheckpointValidator(ROBOT), trained['default']
     gate.take(mae, 0.0)
-    moving(gate, measures)
+    send_messages_of_the_model(gate, measures)
     with pytest.raises(GateError, match='limit'):
         gate.check(CONSISTENT[attack](mae))
 
@@ -228,7 +228,7 @@ def test_a_network_that_moves_the_posture_by_as_much_as_learning_does_is_accepte
 ):
     gate, mae = CheckpointValidator(ROBOT), trained['default']
     gate.take(_turned(mae, 0.3), 0.0)  # bad by 0.3 rad
-    moving(gate, measures)
+    send_messages_of_the_model(gate, measures)
     gate.check(mae)
 
 
@@ -238,7 +238,7 @@ def test_joint_sensors_decide_how_far_a_network_may_move_the_posture(trained):
     for measures in (True, False):
         gate.start()
         gate.take(learned, 0.0)
-        moving(gate, measures)
+        send_messages_of_the_model(gate, measures)
         compared = gate.agreement(mae)[0]
         assert ((compared.error <= compared.limit).all()) == measures
     gate.check(mae, is_chosen=True)
@@ -247,12 +247,12 @@ def test_joint_sensors_decide_how_far_a_network_may_move_the_posture(trained):
 def test_a_network_without_a_calibrated_detector_takes_over_with_that_in_use(trained):
     gate, mae = CheckpointValidator(ROBOT), trained['default']
     gate.take(calibrated(mae), 0.0)
-    end = seeing(gate)
+    end = send_healthy_messages(gate)
     kept = gate.with_detector(mae, end)
     assert kept.anomaly.calibrated
-    healthy, *cut = gate.detector(kept)
+    healthy, *ruptured = gate.detector_measures(kept)
     assert healthy < 1.0
-    assert max(cut) > 1.0
+    assert max(ruptured) > 1.0
     own = calibrated(trained['paper'])
     assert gate.with_detector(own, end) is own
     gate.declare_healthy(end)

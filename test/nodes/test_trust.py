@@ -42,7 +42,7 @@ def test_a_bad_network_is_rejected_for_all_nodes_and_the_arm_goes_on(arm, traine
     arm.graph.send_network(checkpoint.to_bytes(bad))
     arm.graph.wait(lambda: arm.estimator.rejected[REFUSED], 'the rejection')
     why = arm.estimator._reception.last_rejected
-    assert 'unexplained on the geometric model, limit' in why
+    assert 'from the geometric model, limit' in why
     assert 66 not in (arm.estimator.core.mae.version, arm.controller.core.mae.version)
     assert sim.arm.mae.version != 66
     arm.goes_to(HERE)

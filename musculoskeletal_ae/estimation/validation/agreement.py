@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check that a candidate network agrees with joint sensors, or else with the network in use.
+
+Three quantities are compared:
+
+    θ         the estimate through ② on the recent messages
+    lengths   l through ① at the same posture
+    shape     the change of l through ① from posture to posture, on the fixed states
+
+If joint sensors measured the postures, they are the reference. The median error of each joint and
+muscle may then be ANGLE_WORSE times that of the network in use, or ANGLE_FLOOR and LENGTH_FLOOR if
+that is more. The shape is compared only if the candidate's mean error of length is the larger one.
+
+Without joint sensors, the network in use is the reference. The median differences may be up to
+ANGLE_MOVED and LENGTH_MOVED, and the relative difference in shape up to SHAPE_MOVED. With too few
+messages, T and l of the fixed states take their place, with the lengths of the network in use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.estimation.validation.postures import PostureCheck
+from musculoskeletal_ae.estimation.validation.recent_messages import LEAST, RecentMessages
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+# Networks that were learned and published differed from joint sensors by 0.29 rad after others
+# that differed by 0.18 rad, and their lengths by 0.03 m. At its first update, an initial network
+# moves by 0.56 rad and its lengths by 0.05 m; a learned network moves by 0.31 rad.
+ANGLE_FLOOR, LENGTH_FLOOR, ANGLE_WORSE = 0.35, 0.06, 1.5  # [rad], [m], and a factor
+ANGLE_MOVED, ANGLE_MOVED_INITIAL = 0.45, 0.8  # [rad] from a learned network, from an initial one
+LENGTH_MOVED = 0.07  # [m]
+# A minute of learning changed the shape of an initial network by 0.32 and that of a learned one by
+# 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
+SHAPE_MOVED, SHAPE_MOVED_INITIAL = 0.3, 0.42  # from a learned network, from an initial one
+
+BY_SENSORS, BY_NETWORK = 'joint sensors', 'the network in use'  # sources of a reference
+
+
+class Comparison(NamedTuple):
+    """Differences of one quantity from its reference."""
+
+    name: str
+    owners: tuple[str, ...]  # what each entry belongs to
+    error: Array  # of each joint [rad] or muscle [m], or the relative one of all lengths
+    limit: Array  # largest permitted error of each entry
+    source: str  # source of the reference
+
+    def faults(self) -> Iterator[str]:
+        """Yield the fault, if an error exceeds its limit."""
+        excess = self.error / self.limit
+        if not excess.max() <= 1.0:
+            worst = int(excess.argmax())
+            yield (
+                f'{self.name}, {self.owners[worst]}: differs by {self.error[worst]:.2g} from '
+                f'{self.source}, limit {self.limit[worst]:.3g}'
+            )
+
+
+class AgreementCheck:
+    """Compares a candidate with the network in use, both without the isolated muscles.
+
+    Args:
+        robot: The geometric model.
+        postures: The fixed states.
+        messages: The recent messages.
+        in_use: The network in use.
+        isolated: Indices of the isolated muscles.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        postures: PostureCheck,
+        messages: RecentMessages,
+        in_use: Mae,
+        isolated: Iterable[int],
+    ) -> None:
+        self._robot, self._postures, self._messages = robot, postures, messages
+        self._in_use, self._isolated = in_use, tuple(isolated)
+        self._has_learned = in_use.covariance is not None
+
+    def comparisons(self, mae: Mae) -> list[Comparison]:
+        """Return all comparisons of a candidate."""
+        if not self._messages.are_enough:
+            theta, tension = self._postures.theta, self._postures.tension
+            length = self._in_use.lengths(theta, tension)
+            return self._with_network(mae, mae.estimate(tension, length).theta, theta, tension)
+        new = mae.estimate(*self._messages.readings(mae)).theta
+        tension, length = self._messages.readings(self._in_use)
+        old = self._in_use.estimate(tension, length).theta
+        measured_rows = np.flatnonzero(np.isfinite(self._messages.theta).all(axis=1))
+        if len(measured_rows) >= LEAST:
+            return self._with_sensors(mae, new, old, measured_rows)
+        return self._with_network(mae, new, old, tension)
+
+    def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Comparison]:
+        """Compare with the network in use; θ of the candidate and of that network, (N, D)."""
+        angle = ANGLE_MOVED if self._has_learned else ANGLE_MOVED_INITIAL
+        limit = angle * self._robot.kinematics.radian
+        change = self._length_error(mae, old, tension, self._in_use.lengths(old, tension))
+        length_limit = np.full(len(change), LENGTH_MOVED)
+        return [
+            self._angles(_median(new - old), limit, BY_NETWORK),
+            self._lengths(change, length_limit, BY_NETWORK),
+            self._shape(mae),
+        ]
+
+    def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Comparison]:
+        """Compare with joint sensors, which measured these rows of the messages."""
+        measured = self._messages.theta[rows]
+        error, error_in_use = (_median(theta[rows] - measured) for theta in (new, old))
+        least = ANGLE_FLOOR * self._robot.kinematics.radian
+        length_error, length_error_in_use = (
+            self._length_error(
+                each, measured, *(part[rows] for part in self._messages.readings(each))
+            )
+            for each in (mae, self._in_use)
+        )
+        length_limit = np.fmax(LENGTH_FLOOR, ANGLE_WORSE * length_error_in_use)
+        comparisons = [
+            self._angles(error, np.fmax(least, ANGLE_WORSE * error_in_use), BY_SENSORS),
+            self._lengths(length_error, length_limit, BY_SENSORS),
+        ]
+        if not length_error.mean() <= length_error_in_use.mean():
+            comparisons.append(self._shape(mae))
+        return comparisons
+
+    def _angles(self, error: Array, limit: Array, source: str) -> Comparison:
+        return Comparison('θ', self._robot.joints, error, limit, source)
+
+    def _lengths(self, error: Array, limit: Array, source: str) -> Comparison:
+        return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
+
+    def _shape(self, mae: Mae) -> Comparison:
+        """Compare the changes of all lengths over the fixed states."""
+        theta, tension = self._postures.theta, self._postures.tension
+        used = np.delete(np.arange(self._robot.muscle_count), self._isolated)
+        new, old = (each.lengths(theta, tension)[:, used] for each in (mae, self._in_use))
+        difference = np.linalg.norm((new - old).std(axis=0)) / np.linalg.norm(old.std(axis=0))
+        limit = SHAPE_MOVED if self._has_learned else SHAPE_MOVED_INITIAL
+        error = np.array([difference])
+        return Comparison(
+            'change of l by ①', ('all muscles',), error, np.array([limit]), BY_NETWORK
+        )
+
+    def _length_error(self, mae: Mae, theta: Array, tension: Array, length: Array) -> Array:
+        """Return the median error of l through ① [m], 0 for isolated muscles, (M,)."""
+        error = _median(mae.lengths(theta, tension) - length)
+        error[list(self._isolated)] = 0.0
+        return error
+
+
+def _median(error: Array) -> Array:
+    size: Array = np.median(np.abs(error), axis=0)
+    return size

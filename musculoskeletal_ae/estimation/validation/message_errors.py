@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check how well a candidate network explains recent messages of the arm.
+
+The errors are those of T and l through ②, and of l through ① at the θ that ② estimates. The median
+of each muscle may be WORSE times that of the network in use, or FLOOR if that is more.
+"""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.validation.recent_messages import RecentMessages
+from musculoskeletal_ae.mae.mae import Mae
+
+WORSE = 2.0
+FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
+
+
+def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:
+    """Return the median error of each muscle by name: T [N] and l [m], (M,).
+
+    The errors of isolated muscles are 0. The result is empty if there are too few messages.
+    """
+    if not messages.are_enough:
+        return {}
+    tension, length = messages.readings(mae)
+    muscle_count = tension.shape[1]
+    restored = mae.estimate(tension, length)
+    used = np.delete(np.arange(muscle_count), tuple(isolated))
+    parts = (
+        restored.tension - tension,
+        restored.length - length,
+        mae.lengths(restored.theta, tension) - length,
+    )
+    errors = {name: np.zeros(muscle_count) for name in FLOOR}
+    for error, part in zip(errors.values(), parts, strict=True):
+        error[used] = np.median(np.abs(part[:, used]), axis=0)
+    return errors
+
+
+def faults(
+    errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
+) -> Iterator[str]:
+    """Yield each fault of a candidate.
+
+    Args:
+        errors: Errors of the candidate.
+        in_use: Errors of the network in use.
+        muscles: Names of the muscles.
+    """
+    for name, error in errors.items():
+        limit = np.fmax(FLOOR[name], WORSE * in_use[name])
+        excess = error / limit
+        if not excess.max() <= 1.0:
+            worst = int(excess.argmax())
+            yield (
+                f'{name}, {muscles[worst]}: error {error[worst]:.3g} on recent messages, '
+                f'limit {limit[worst]:.3g}'
+            )

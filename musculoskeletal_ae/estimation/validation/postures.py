@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check a candidate network on fixed random states of the geometric model.
+
+    ①         restores θ, T and l of the geometric model, and its G
+    ②, ③      restore θ, T and l, where l is that of ①
+
+The lengths of a real arm differ from those of the model by centimetres, so ② and ③ are compared
+with the lengths of ① rather than with the model's.
+
+The relative error of a joint or muscle is its root mean square error divided by the standard
+deviation of the true values. A network with a constant output has a relative error of 1. LIMITS
+holds the largest permitted values.
+
+Where muscles determine a joint only poorly, for example because several postures have the same
+lengths, a relative error of θ up to UNDETERMINED times that of the best affine map of (T, l) is
+permitted. This does not apply to the mean error.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES = 64
+
+#: largest relative errors; they leave a margin to those of healthy networks (`bench gate`)
+LIMITS = {
+    'θ by ①': 0.6,
+    'T by ①': 1.35,  # two exchanged muscles have √2
+    'l by ①': 1.7,
+    'θ by ②': 1.3,  # a joint that the muscles do not determine has 1
+    'T by ②': 1.35,
+    'l by ②': 0.6,
+    'θ by ③': 0.7,
+    'T by ③': 13.0,
+    'l by ③': 0.6,
+    'G by ①': 1.6,
+    'mean θ by ①': 0.6,
+    'mean θ by ③': 0.7,
+}
+# Smallest spread of a length and size of a moment arm by which errors are divided [m].
+LEAST_SPREAD, LEAST_ARM = 0.04, 0.01
+UNDETERMINED = 1.2
+AFFINE = 1000  # states to which the affine map is fitted; as many others give its error
+
+
+class PostureCheck:
+    """The fixed states of one robot, and the errors of networks on them.
+
+    Attributes:
+        theta: θ [rad], (N, D).
+        tension: T [N], (N, M).
+        length: l of the geometric model [m], (N, M).
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.theta, self.tension, self.length = self._states(POSTURES)
+        slope = robot.series_elastic.length_slope(self.tension)[..., None]
+        self._jacobian = robot.routes.muscle_jacobian(self.theta) * (1.0 - slope)
+
+    def faults(self, mae: Mae) -> Iterator[str | None]:
+        """Yield each fault of a network, or None after each piece of work."""
+        for item in self.errors(mae):
+            yield None
+            if item is None:
+                continue
+            name, error = item
+            limit = np.full(len(error), LIMITS[name])
+            if name.startswith('θ') and not error.max() <= LIMITS[name]:
+                limit = np.maximum(limit, self._undetermined)
+            excess = error / limit
+            if not excess.max() <= 1.0:
+                worst = int(excess.argmax())
+                owner = (self._robot.joints if 'θ' in name else self._robot.muscles)[worst]
+                source = 'the geometric model' if name.endswith('①') else 'the lengths of ①'
+                yield (
+                    f'{name}, {owner}: relative error {error[worst]:.2g} from {source}, '
+                    f'limit {limit[worst]:.3g}'
+                )
+
+    def errors(self, mae: Mae) -> Iterator[tuple[str, Array] | None]:
+        """Yield the relative errors of each joint or muscle by name, or None in between."""
+        own_length = mae.lengths(self.theta, self.tension)
+        for mask, symbol in zip(Mask, '①②③', strict=True):
+            restored = mae.decode(mae.encode(mask, self.theta, self.tension, own_length))
+            length = self.length if symbol == '①' else own_length
+            truth = self.theta, self.tension, length
+            for name, value, true in zip('θTl', restored, truth, strict=True):
+                spread = np.maximum(true.std(axis=0), LEAST_SPREAD if name == 'l' else 1e-9)
+                yield f'{name} by {symbol}', _root_mean_square(value - true) / spread
+                if name == 'θ' and symbol != '②':
+                    yield f'mean θ by {symbol}', np.abs((value - true).mean(axis=0)) / spread
+        error = np.empty_like(self._jacobian)
+        for rows in np.array_split(np.arange(POSTURES), 4):
+            jacobian = mae.muscle_jacobian(self.theta[rows], self.tension[rows])
+            error[rows] = jacobian - self._jacobian[rows]
+            yield None
+        muscle_count = error.shape[1]
+        size, moment_arm = (
+            _root_mean_square(part.swapaxes(1, 2).reshape(-1, muscle_count))
+            for part in (error, self._jacobian)
+        )
+        yield 'G by ①', size / np.maximum(moment_arm, LEAST_ARM)
+
+    def _states(self, count: int) -> tuple[Array, Array, Array]:
+        """Return θ, T and l of random states of the geometric model."""
+        robot, rng = self._robot, np.random.default_rng(0)
+        theta = robot.random_postures(count, rng)
+        share = rng.uniform(size=(count, robot.muscle_count))
+        tension = robot.tension.bias + share * (robot.tension.limit - robot.tension.bias)
+        return theta, tension, robot.muscle_lengths(theta, tension)
+
+    @cached_property
+    def _undetermined(self) -> Array:
+        """Permitted relative error of each joint, derived from that of an affine map, (D,)."""
+        theta, tension, length = self._states(2 * AFFINE)
+        ones = np.ones((2 * AFFINE, 1))
+        inputs = np.hstack([ones, tension / tension.std(), length / length.std()])
+        affine = np.linalg.lstsq(inputs[:AFFINE], theta[:AFFINE], rcond=None)[0]
+        error: Array = _root_mean_square((inputs @ affine - theta)[AFFINE:]) / theta.std(axis=0)
+        return UNDETERMINED * error
+
+
+def _root_mean_square(error: Array) -> Array:
+    size: Array = np.sqrt(np.square(error).mean(axis=0))
+    return size

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keep the last seconds of healthy messages, on which candidate networks are validated."""
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
+
+SPAN, SPACING = 10.0, 0.1  # [s] that the kept messages cover, and shortest time between two of them
+LEAST = 20  # smallest number of messages that permits a verdict
+LONGEST_PERIOD = 0.5  # [s] without messages, after which the direction of sliding is unknown
+
+
+class _Message(NamedTuple):
+    time: float  # [s]
+    tension: Array  # T [N], (M,)
+    length: Array  # l [m], (M,)
+    direction: Array  # s: direction in which each tendon slid last, (M,)
+    theta: Array  # measured θ [rad], NaN if it was not measured, (D,)
+
+
+class RecentMessages:
+    """The last healthy messages, thinned out. All times are of one steady clock [s]."""
+
+    def __init__(self, joint_count: int) -> None:
+        self._unmeasured = np.full(joint_count, np.nan)
+        self._messages: deque[_Message] = deque()
+        self._direction, self._time = FrictionDirection(), math.inf
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @property
+    def are_enough(self) -> bool:
+        """Whether a network can be validated on the messages."""
+        return len(self._messages) >= LEAST
+
+    @property
+    def theta(self) -> Array:
+        """Measured θ [rad], with NaN where it was not measured, (N, D)."""
+        return np.array([message.theta for message in self._messages])
+
+    def note(
+        self, tension: Array, length: Array, now: float, theta: Array | None, is_healthy: bool
+    ) -> None:
+        """Take a message; keep it if the arm is healthy and the last kept one is old enough.
+
+        Args:
+            tension: T [N], (M,).
+            length: l [m], (M,).
+            now: Time of the message [s].
+            theta: Measured θ [rad], (D,), or None.
+            is_healthy: Whether no anomaly is detected.
+        """
+        period, self._time = now - self._time, now
+        if not 0.0 <= period < LONGEST_PERIOD:
+            self._direction.reset()
+        direction = self._direction.step(length)
+        is_too_early = bool(self._messages) and 0.0 <= now - self._messages[-1].time < SPACING
+        if not is_healthy or is_too_early:
+            return
+        measured = self._unmeasured if theta is None else theta
+        self._messages.append(_Message(now, tension, length, direction, measured))
+        while now - self._messages[0].time > SPAN:
+            self._messages.popleft()
+
+    def readings(self, mae: Mae) -> tuple[Array, Array]:
+        """Return T_end [N] and l [m] of the messages, (N, M), with the tendon friction of `mae`."""
+        tension = np.array([message.tension for message in self._messages])
+        length = np.array([message.length for message in self._messages])
+        direction = np.array([message.direction for message in self._messages])
+        return end_tension(mae.friction, tension, direction), length
+
+    def drop_after(self, time: float) -> None:
+        """Discard the messages that are newer than a time [s]."""
+        while self._messages and self._messages[-1].time > time:
+            self._messages.pop()
+
+    def clear(self) -> None:
+        """Discard all messages."""
+        self._messages.clear()
+
+    def forget(self) -> None:
+        """Discard all messages and the direction of sliding, for example after a calibration."""
+        self._messages.clear()
+        self._direction.reset()
