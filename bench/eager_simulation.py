@@ -61,6 +61,7 @@ class EagerSimulation:
         self.carried, self.carries = _single(tree.carried[1:]), _single(tree.carries[1:])
         self.hangs = _single(ways[1:, 1:].T)  # bodies that a joint carries
         self.down, self.tip = _single(tree.gravity), _single(tree.effector)
+        self.springs, self.preload = _single(tree.springs), _single(tree.preload)
         self.sliding = torch.as_tensor(tree.slides[1:])[:, None]
         self.limbs = []
         parts = limbs.joints, limbs.muscles, limbs.first, limbs.second
@@ -158,7 +159,8 @@ class EagerSimulation:
         bend = torch.where(self.sliding, cross(axis, force), bending)
         lower = self.before * (bend @ axis.transpose(1, 2))  # ∂τ_k/∂θ_j, j at or before k
         both = lower + lower.transpose(1, 2) - torch.diag_embed(lower.diagonal(dim1=1, dim2=2))
-        return -torque @ self.onto, -self.onto.T @ both @ self.onto
+        load = theta @ self.springs - self.preload - torque @ self.onto
+        return load, self.springs - self.onto.T @ both @ self.onto
 
     def _slopes(self, theta: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
         """Return the terms of `add_slopes`: G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D)."""

@@ -12,6 +12,7 @@ class ExactMae:
     def __init__(self, robot: Any) -> None:
         self.robot = robot
         self.friction = np.zeros(robot.muscle_count)
+        self.elasticity = self.touch = None
         self.offset = 0.0  # [m] on every length, to tell two networks apart
         self.fail: Exception | None = None
 
@@ -23,6 +24,10 @@ class ExactMae:
     def muscle_jacobian(self, theta, tension):
         slope = self.robot.series_elastic.length_slope(tension)[..., None]
         return self.robot.routes.muscle_jacobian(theta) * (1.0 - slope)
+
+    def lengths_with_pullback(self, theta, tension):
+        jacobian = self.muscle_jacobian(theta, tension)
+        return self.lengths(theta, tension), lambda g: np.einsum('nm,nmd->nd', g, jacobian)
 
 
 def rest_readings(robot, theta, tension=None):

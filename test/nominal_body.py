@@ -79,7 +79,7 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
         wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
     """
     torque = robot.kinematics.end_effector_jacobian(theta).T @ wrench
-    turn: Array = np.linalg.inv(stiffness + robot.kinematics.gravity_gradient(theta)) @ torque
+    turn: Array = np.linalg.inv(stiffness + robot.kinematics.holding_gradient(theta)) @ torque
     return turn
 
 

@@ -213,6 +213,10 @@ class Controller:
         """Use another network, which has been validated."""
         self.mae, self.watchdog.has_checkpoint = mae, True
         self.stream.use_friction(mae.friction)
+        robot = self.robot.with_elasticity(mae.elasticity)
+        if robot is not self.robot:
+            self.robot = robot
+            self._use_parts()
         self.activities.follower.use_network(mae)
         if self.activities.entered is self.activities.ramped_target:
             self.activities.ramps.solve_again()

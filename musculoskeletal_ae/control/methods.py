@@ -130,6 +130,7 @@ class StiffnessModel(NamedTuple):
     hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
     compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
     module: Array  # K_stiff [N/m], (M,)
+    springs: Array  # of the joints [N·m/rad], (D, D)
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
@@ -155,6 +156,7 @@ class StiffnessModel(NamedTuple):
             hessian=bend,
             compliance=cubic[:3] * np.array([3.0, 2.0, 1.0])[:, None],
             module=robot.stiffness,
+            springs=robot.kinematics.elasticity.stiffness,
         )
 
     def muscle_stiffness(self, tension: Array) -> tuple[Array, Array]:
@@ -169,7 +171,8 @@ class StiffnessModel(NamedTuple):
     def joint_stiffness(self, tension: Array) -> Array:
         """Return K_θ [N·m/rad] at T (M,), shape (D, D)."""
         k, _ = self.muscle_stiffness(tension)
-        return robot_stiffness.joint_stiffness(self.jacobian, self.hessian, k, tension)
+        muscular = robot_stiffness.joint_stiffness(self.jacobian, self.hessian, k, tension)
+        return self.springs + muscular
 
     def slope(self, tension: Array) -> Array:
         """Return ∂K_jj/∂T_i [N·m/rad/N] at T (M,), shape (D, M)."""
@@ -190,8 +193,9 @@ def stiffness_command(
 
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
-    K_θ is that of `robot/stiffness.py`. Its G, ∂²l/∂θ² and L_e(T) = −l(θ, T) + const come from ①
-    of the network (paper, §III-E, third: variable stiffness). Tensions in the null space of Gᵀ keep
+    K_θ is that of `robot/stiffness.py`, with the springs of the joints. Its G, ∂²l/∂θ² and
+    L_e(T) = −l(θ, T) + const come from ① of the network (paper, §III-E, third: variable stiffness).
+    Tensions in the null space of Gᵀ keep
     the posture and stiffen the elastic elements. T_low lies above T_bias, because a muscle that MSC
     holds at T_bias is stiff in one direction only. K is nearly linear in T, so a few quadratic
     programmes around the last solution suffice.

@@ -39,10 +39,13 @@ STOP_LOAD = 40.0  # [N·m] load by weight and muscles at T_bias above which stop
 #: Constants of one individual for the compiled step: series elastic elements, tendons and sensors
 #: of M muscles; friction and stops of the J−1 joints of the tree; joint of the end effector, and
 #: its position in that joint's frame [m]. `gear` multiplies viscous friction, `firmness` the stops.
+#: `springs` (D, D), `preload` and `damping` (D,) are those of the joints of θ, whose indices in the
+#: tree are `order`.
 Body = namedtuple(
     'Body',
     'force rate wire_stretch length_at_zero tendon_friction sensor_gain sensor_offset '
-    'joint_friction lower upper gear firmness effector_joint effector',
+    'joint_friction lower upper gear firmness effector_joint effector '
+    'springs preload damping order',
 )
 #: q, q̇, friction state in [−1, 1] and generalised torque of the tree, each (J−1,).
 JointState = namedtuple('JointState', 'q velocity sticking torque')
@@ -102,6 +105,11 @@ def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
         if beyond != 0.0:
             stop = STOP_STIFFNESS * beyond + STOP_DAMPING * joint.velocity[i]
             joint.torque[i] -= body.firmness[i] * stop
+    for d in range(body.order.shape[0]):
+        i = body.order[d]
+        joint.torque[i] += body.preload[d] - body.damping[d] * joint.velocity[i]
+        for e in range(body.order.shape[0]):
+            joint.torque[i] -= body.springs[d, e] * joint.q[body.order[e]]
     for s in range(routes.first.shape[0]):
         tension = muscle.end_tension[routes.muscle[s]]
         wrapping.add_tension_torque(routes, s, placed, tension, joint.torque)
@@ -184,6 +192,7 @@ class EmulatedArm(modules.Arm):
 
     def _constants(self) -> Body:
         robot, true, elastic = self.robot, self.individual, self.individual.elastic
+        springs = true.joint_elasticity
         # Coupled joints have neither friction nor stops of their own.
         friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
         friction[self._order] = true.joint_friction
@@ -196,6 +205,8 @@ class EmulatedArm(modules.Arm):
             elastic.force, elastic.rate, elastic.wire_stretch, true.length_at_zero,
             true.tendon_friction, true.tension_gain, true.tension_bias, friction, lower, upper,
             self._gear, firmness, joint, np.array(hand.translation),
+            np.ascontiguousarray(springs.stiffness), springs.preload.copy(),
+            springs.damping.copy(), self._order.astype(np.int64),
         )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:

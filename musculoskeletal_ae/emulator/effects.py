@@ -28,6 +28,8 @@ class Effects:
     give: float = 5e-5  # displacement of a route point under its load [m/N]
     joint_friction: float = 0.02  # share of a joint's largest load by weight and muscles at T_bias
     links: float = 0.0  # multiple of σ: lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
+    springs: float = 0.25  # σ of the logarithm of the stiffness of each joint's spring
+    spring_rest: float = 0.08  # σ of the angle at which it is at rest [rad]; prismatic: times RACK
     # Series elastic elements, made of rubber
     stiffness: float = 0.4  # largest relative deviation from the data sheet
     laws: float = 1.0  # share of the muscles whose law differs from the data sheet

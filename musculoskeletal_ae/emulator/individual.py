@@ -6,7 +6,7 @@ those of the model (paper, §I: assumed correct).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -36,10 +36,13 @@ class Spread:
     length_bias: float = 0.0005  # standard deviation of each length sensor's offset [m]
     tension_bias: float = 1.0  # standard deviation of each tension sensor's offset [N]
     tension_gain: float = 0.01  # standard deviation of each tension sensor's relative gain error
+    springs: float = 0.2  # standard deviation of the logarithm of each joint's spring stiffness
+    #: standard deviation of the angle at which each spring is at rest [rad]; prismatic: times RACK
+    spring_rest: float = 0.05
 
 
 #: No differences: a body equal to the geometric model, without friction.
-NOMINAL = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NOMINAL = Spread(**{field.name: 0.0 for field in fields(Spread)})
 
 
 class Individual:
@@ -92,6 +95,11 @@ class Individual:
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
         self.tension_gain: Array = 1.0 + rng.normal(0.0, spread.tension_gain, muscles)
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
+        drawn = np.random.default_rng([seed, 0x5B]).normal(size=(2, robot.joint_count))
+        #: springs and dampers of the joints
+        self.joint_elasticity = kin.elasticity.deviating(
+            np.exp(spread.springs * drawn[0]), spread.spring_rest * kin.radian * drawn[1]
+        )
 
     def _redraw_jumping_routes(
         self, robot: Robot, off: Array, again: Array, routes: Callable[[Array], WrappedRoutes]

@@ -23,6 +23,7 @@ from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints, tie_rim
 from musculoskeletal_ae.importing.source import names_of_all, safe_name
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import Wrap, branches
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.kinematics import Kinematics, link_placement
 from musculoskeletal_ae.robot.robot import Robot
@@ -35,7 +36,7 @@ POSTURES = 300  # random postures over which their radii are fitted
 # MuJoCo ignores the ratio of a coupling when it scales its stiffness. With the default, a prismatic
 # joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-HAND = 'hand of the emulator'
+HAND, SPRING = 'hand of the emulator', 'spring'
 OF_MOTORS = (
     *('actdim', 'actearly', 'actlimited', 'actrange', 'armature', 'biasprm', 'biastype'),
     *('ctrllimited', 'ctrlrange', 'damping', 'delay', 'dynprm', 'dyntype', 'forcelimited'),
@@ -70,6 +71,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     spec.compiler.boundmass = 1e-6  # for links without mass
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
     bodies, gear = [spec.worldbody], joint_gear(kin)
+    springs = _drawn_springs(robot, draw)
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
         # Joints at a common point stay there.
@@ -90,6 +92,8 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
         if name in robot.joints:
             k = robot.joints.index(name)
             joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
+            damping = float(gear[i] * DAMPING + springs.damping[k])
+            joint.damping = [damping, 0.0, 0.0]
         else:
             coupling, data = robot.description.couplings[name], np.zeros(mujoco.mjNEQDATA)
             if len(coupling.terms) > 5:
@@ -101,7 +105,42 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
             link |= {'data': data, 'solimp': STIFF}
             spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, **link)
         bodies.append(body)
+    _add_springs(robot, springs, spec)
     return spec, bodies
+
+
+def _drawn_springs(robot: Robot, draw: Draw) -> JointElasticity:
+    """Return the springs of an individual's joints."""
+    kin, drawn = robot.kinematics, draw.rng('springs').normal(size=(2, robot.joint_count))
+    factor = np.exp(draw.sizes.springs * drawn[0])
+    return kin.elasticity.deviating(factor, draw.sizes.spring_rest * kin.radian * drawn[1])
+
+
+def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
+    """Add the springs of the joints; those that couple joints become fixed tendons.
+
+    K is the sum of one spring for each of its eigenvectors v, along the coordinate v · θ.
+    """
+    off = springs.stiffness - np.diag(np.diag(springs.stiffness))
+    for k in np.flatnonzero(~off.any(axis=1)).tolist():
+        joint = spec.joint(robot.joints[k])
+        joint.stiffness, joint.springref = (
+            [float(springs.stiffness[k, k]), 0.0, 0.0],
+            springs.rest[k],
+        )
+    coupled = np.flatnonzero(off.any(axis=1)).tolist()
+    values, vectors = np.linalg.eigh(springs.stiffness[np.ix_(coupled, coupled)])
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value <= 1e-9 * values[-1]:
+            continue
+        if vector @ springs.rest[coupled] < 0.0:
+            vector = -vector  # a length of −1 means another thing to MuJoCo
+        names = ', '.join(robot.joints[k] for k in coupled)
+        tendon = spec.add_tendon(name=f'{SPRING} {len(spec.tendons)} of {names}')
+        for k, share in zip(coupled, vector, strict=True):
+            tendon.wrap_joint(robot.joints[k], float(share))
+        rest = float(vector @ springs.rest[coupled])
+        tendon.stiffness, tendon.springlength = [float(value), 0.0, 0.0], [rest, rest]
 
 
 def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:

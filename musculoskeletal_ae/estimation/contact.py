@@ -107,6 +107,7 @@ class ContactEstimator:
     def use(self, mae: Mae) -> None:
         """Use another network, with its tendon friction and healthy torque."""
         joint_count, healthy = self._robot.joint_count, mae.touch
+        self._robot = self._robot.with_elasticity(mae.elasticity)
         self._mae = mae
         self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated
         self._weight = np.ones(joint_count)  # 1/σ²

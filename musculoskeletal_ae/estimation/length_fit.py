@@ -2,7 +2,7 @@
 """Fit the length offsets, and the postures of all moments, to readings of length and tension.
 
     l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
-    0 = g(θ) + G(θ, T)ᵀ T                      D more while the arm moves slowly
+    0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more while the arm moves slowly
 
 Where the angles were measured, o is the mean of what the first line leaves. Otherwise o and the
 postures of all moments are found together, by maximum likelihood with Student's noise; l and G are
@@ -83,12 +83,13 @@ class LengthFit:
     """
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
+        robot = robot.with_elasticity(mae.elasticity)
         self._robot, self._mae = robot, mae
         self._rng = np.random.default_rng([0, 0x2E])
         muscle_count, joint_count = robot.muscle_count, robot.joint_count
         self._radian = radian = robot.kinematics.radian
         postures = robot.random_postures(64, self._rng)
-        weight = np.abs(radian * robot.kinematics.holding_torque(postures)).max()
+        weight = np.abs(radian * robot.kinematics.weight_torque(postures)).max()
         moment_arms = np.abs(radian * robot.routes.muscle_jacobian(postures))
         # Joints rub even if they carry no weight, as joints with upright axes.
         by_bias = (robot.description.tension.bias @ moment_arms).max()

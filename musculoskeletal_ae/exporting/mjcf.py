@@ -40,7 +40,7 @@ length      root mean square difference of lengths, their mean apart
 moment arm  the same of dl/dq, over all joints, beside its size
 spring      largest error of the linear spring between T_bias and T_limit
 offset      control = l + offset, where l is the length in muscle_states
-Gravity torques of the network are those of the robot directory: masses are not learned.
+Torques of weight and springs are those of the robot directory, unless the springs were learned.
 The model does not hold: what is left of lengths and moment arms (above), the bend of the springs,
 friction as a share of the tension, creep, sensor errors, heat.
 """
@@ -72,7 +72,7 @@ class Report(NamedTuple):
             for name, value, unit in zip(robot.joints, self.torque, robot.units)
         )
         warned = '; '.join(self.warnings) or 'of nothing'
-        lines += ['', f'gravity torque, largest difference: {torques}']
+        lines += ['', f'torque of weight and springs, largest difference: {torques}']
         lines += [f'MuJoCo warns: {warned}', f'MJX {self.mjx}', '', LEGEND]
         return '\n'.join(lines)
 
@@ -98,8 +98,10 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise MusculoskeletalError(f'{out}: expected a new or empty directory')
+    robot = robot.with_elasticity(mae.elasticity)
     fitted = fit(robot, mae, seed)
     moved = Robot(replace(robot.description, routes=_moved(robot, fitted.shift)))
+    moved = moved.with_elasticity(mae.elasticity)
     springs = _springs(fitted)
     spec = _spec(moved, mae, springs)
     try:
@@ -172,7 +174,10 @@ def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
     kin, gear = robot.kinematics, joint_gear(robot.kinematics)
     for i in range(1, kin.model.njoints):
         joint = spec.joint(kin.model.names[i])
-        joint.damping, joint.armature = [float(gear[i]) * DAMPING, 0.0, 0.0], 0.0
+        name, damping = kin.model.names[i], float(gear[i]) * DAMPING
+        if name in robot.joints:
+            damping += float(kin.elasticity.damping[robot.joints.index(name)])
+        joint.damping, joint.armature = [damping, 0.0, 0.0], 0.0
         bodies[i].name = f'{kin.model.names[i]} link'
         reach = kin.tree.placement_translation[kin.tree.parent == i]
         for end in reach[np.linalg.norm(reach, axis=1) > SHORTEST_BONE]:
@@ -230,7 +235,7 @@ def _compare(
         theirs[n] = data.ten_length[tendons]
         mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
         arms[n] = kin.tree.of_theta(dense[tendons][:, tree], row)
-        torques[n] = kin.tree.of_theta(data.qfrc_bias[tree], row)
+        torques[n] = kin.tree.of_theta((data.qfrc_bias - data.qfrc_passive)[tree], row)
     # What the spring adds at T_mid is a constant.
     off = theirs - springs.elongation - lengths
     return Report(

@@ -3,7 +3,8 @@
 
 Spatial tendons become routes: sites, wrapping spheres and cylinders with their side sites, and
 branches over pulleys. Hinges and slides become joints, a body with several of them a chain of
-massless links; a ball joint three hinges. `equality/joint` becomes a coupling.
+massless links; a ball joint three hinges. `equality/joint` becomes a coupling. Springs and dampers
+of joints, and springs of fixed tendons, become `joint_elasticity`.
 
 Where a site of a tendon lies on the rim of what the tendon wraps round, MuJoCo lets rounding decide
 whether it does. It is tied to the rim here (`robot/wrapping.py`), and the geom that MuJoCo computes
@@ -20,9 +21,10 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.importing.source import (
     Source,
+    Spring,
     distinct,
     names_of_all,
     refuse,
@@ -172,6 +174,7 @@ class _Reader:
         self._bodies()
         self._points()
         self._couplings()
+        self._springs()
         self._not_modelled()
         self._tendons()
         self.source.lengths = self._lengths
@@ -185,15 +188,42 @@ class _Reader:
             self.source.renamed(kind, each, name)
         return names
 
+    def _springs(self) -> None:
+        """Take springs and dampers of joints, and springs of tendons that only add up joints."""
+        m, source, kinds = self.model, self.source, mujoco.mjtJoint
+        for j, name in enumerate(self.names['joint']):
+            stiffness, damping = m.jnt_stiffness[j], float(m.dof_damping[m.jnt_dofadr[j]])
+            if m.jnt_type[j] not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
+                for effect in ('springs',) * bool(stiffness) + ('damping',) * bool(damping):
+                    source.note('dropped', f'{effect}: joint {name}, no hinge or slide')
+                continue
+            if stiffness:
+                rest = float(m.qpos_spring[m.jnt_qposadr[j]])
+                source.springs.append(Spring({name: 1.0}, float(stiffness), rest, f'of {name}'))
+            if damping:
+                source.damping[name] = damping
+        for t in np.flatnonzero(self._is_fixed() & (m.tendon_stiffness > 0.0)).tolist():
+            path = range(m.tendon_adr[t], m.tendon_adr[t] + m.tendon_num[t])
+            shares = {self.names['joint'][m.wrap_objid[w]]: float(m.wrap_prm[w]) for w in path}
+            low, high = m.tendon_lengthspring[t]
+            name = f'tendon {self.names["tendon"][t]}'
+            if high - low > 1e-9:
+                source.note('dropped', f'springs: {name}, which is slack from {low:g} to {high:g}')
+                continue
+            source.springs.append(Spring(shares, float(m.tendon_stiffness[t]), float(low), name))
+
+    def _is_fixed(self) -> Bools:
+        """Return which tendons add up joints instead of having a route, (tendons,)."""
+        fixed: Bools = self.model.wrap_type[self.model.tendon_adr] == mujoco.mjtWrap.mjWRAP_JOINT
+        return fixed
+
     def _not_modelled(self) -> None:
-        m = self.model
+        m, fixed = self.model, self._is_fixed()
         for kind, effect, values in (
-            ('joint', 'springs', m.jnt_stiffness),
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
             ('joint', "limits of the actuators' force", m.jnt_actfrclimited),
-            ('joint', 'damping', m.dof_damping[m.jnt_dofadr]),
             ('joint', 'friction', m.dof_frictionloss[m.jnt_dofadr]),
-            ('tendon', 'springs', m.tendon_stiffness),
+            ('tendon', 'springs', m.tendon_stiffness * ~fixed),
             ('tendon', 'armature', m.tendon_armature),
             ('tendon', 'limits', m.tendon_limited),
             ('tendon', 'damping', m.tendon_damping),

@@ -42,6 +42,15 @@ def refuse(file: Path, problem: str) -> SourceError:
     return SourceError(f'{file}: {problem}')
 
 
+class Spring(NamedTuple):
+    """A spring along a weighted sum of joints, x = Σ share · q, with the torque −k (x − x_0)."""
+
+    shares: dict[str, float]  # of joints
+    stiffness: float  # k [N·m/rad]
+    rest: float  # x_0 [rad]
+    name: str  # what the source calls it
+
+
 @dataclass
 class Source:
     """Everything that was read, as a model of pinocchio in which links are frames."""
@@ -54,6 +63,8 @@ class Source:
     couplings: dict[str, Coupling] = field(default_factory=dict)
     routes: dict[str, Route] = field(default_factory=dict)
     strength: dict[str, float] = field(default_factory=dict)  # highest tension [N], where known
+    springs: list[Spring] = field(default_factory=list)
+    damping: dict[str, float] = field(default_factory=dict)  # of joints [N·m·s/rad]
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
     end_effector: str = ''
@@ -386,11 +397,56 @@ def write(source: Source, out: Path) -> None:
     document['end_effector'] = source.end_effector
     if source.couplings:
         document['couplings'] = [_coupling(s, c) for s, c in source.couplings.items()]
+    if elasticity := _joint_elasticity(source, joints):
+        document['joint_elasticity'] = elasticity
     text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)
     head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
     out.mkdir(parents=True, exist_ok=True)
     (out / 'muscles.yaml').write_text(head + text, encoding='utf-8')
     (out / 'robot.urdf').write_text(body, encoding='utf-8')
+
+
+def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]:
+    """Return the entries of muscles.yaml for springs and dampers.
+
+    A spring of a joint that follows another by a line is one of that other joint.
+    """
+    stiffness, preload = np.zeros((len(joints), len(joints))), np.zeros(len(joints))
+    for spring in source.springs:
+        share, rest, bent = np.zeros(len(joints)), spring.rest, list[str]()
+        for name, factor in spring.shares.items():
+            coupling = source.couplings.get(name)
+            if coupling is not None and coupling.higher:
+                bent.append(name)
+            elif coupling is not None:
+                share[joints.index(coupling.master)] += factor * coupling.ratio
+                rest -= factor * coupling.offset
+            elif name in joints:
+                share[joints.index(name)] += factor
+            else:
+                rest -= factor * source.rest.get(name, 0.0)
+        if bent:
+            source.note('dropped', f'spring {spring.name}: {bent[0]} follows another by a curve')
+            continue
+        stiffness += spring.stiffness * np.outer(share, share)
+        preload += spring.stiffness * rest * share
+    angles = np.linalg.pinv(stiffness, hermitian=True) @ preload if joints else preload
+    entries = list[dict[str, Any]]()
+    for i, name in enumerate(joints):
+        own = {'stiffness': stiffness[i, i], 'rest_angle': angles[i]}
+        own['damping'] = source.damping.get(name, 0.0)
+        entry: dict[str, Any] = {'joint': name}
+        entry |= {key: float(f'{value:.10g}') for key, value in own.items() if abs(value) > 1e-12}
+        coupled = {
+            joints[j]: float(f'{stiffness[i, j]:.10g}')
+            for j in range(i + 1, len(joints))
+            if abs(stiffness[i, j]) > 1e-12
+        }
+        if coupled:
+            entry['coupled'] = coupled
+        if len(entry) > 1:
+            entries.append(entry)
+    return entries
 
 
 def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:

@@ -12,7 +12,8 @@
     ψᵀ v    residual model: random Fourier features over the joints that the muscle crosses. It
             represents what straight lines between route points miss, such as wrapping round bones
 
-With all parameters zero this is the geometric model. The module `fit` estimates the parameters.
+With all parameters zero this is the geometric model. The module `fit` estimates the parameters. The
+springs of the joints do not change lengths; `springs` describes their corrections.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints, Singles
+from musculoskeletal_ae.learning import springs
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import end_tension
@@ -150,6 +153,8 @@ class CalibratedBody:
         # The next fit starts from these values:
         #: joint-sensor offsets [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
+        #: corrections of the joints' springs, as in the module `springs`, (2, D)
+        self.springs = springs.none_learned(robot.joint_count)
         #: fitted θ (D,) and a row of `posture_model.Bent` for each sample; the key is the bytes of
         #: the sample's lengths
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
@@ -166,6 +171,11 @@ class CalibratedBody:
         body = copy(self)
         body.parameters = parameters
         return body
+
+    @property
+    def elasticity(self) -> JointElasticity:
+        """The springs and dampers of the joints, as far as learned."""
+        return springs.learned(self.robot.kinematics.elasticity, self.springs)
 
     def elastic(self, m: int) -> SeriesElastic:
         """Return the elastic constants of one muscle as arrays of shape ()."""

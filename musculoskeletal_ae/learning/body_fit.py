@@ -34,6 +34,8 @@ class BodyFit:
 
     def __init__(self, robot: Robot, mae: Mae | None, seed: int = 0) -> None:
         """Begin with a body fitted to the network `mae`, or with the geometric model if None."""
+        if mae is not None:
+            robot = robot.with_elasticity(mae.elasticity)
         self.body = CalibratedBody(robot, seed=seed)
         #: parameters fitted to the network, which replace the geometric model as prior mean
         self._prior_mean: list[Array] | None = None
@@ -61,7 +63,8 @@ class BodyFit:
     def start_anew(self) -> None:
         """Start again from the geometric model."""
         self._prior_mean = None
-        self.body = CalibratedBody(self.body.robot, smooth=self.body.smooth)
+        robot = self.body.robot.with_elasticity(None)
+        self.body = CalibratedBody(robot, smooth=self.body.smooth)
 
     def fit(self, observed: Observations, guess: Array) -> Fit:
         """Fit the body to samples.

@@ -2,12 +2,12 @@
 """Residuals of rest samples against the calibrated body, and their derivatives.
 
     length    l_nm − l_m(θ_n, T_n; w)
-    torque    τ_nj = −(g(θ_n) + Gᵀ T_end)_j, which is 0 at rest
+    torque    τ_nj = −(g(θ_n) + K θ_n − b + Gᵀ T_end)_j, which is 0 at rest
     angle     y_nj − θ_nj − z_j
     gravity   u_ni − R_iᵀ(θ_n) ĝ
 
 Here w are the parameters of the body, θ_n the postures of the samples and z the joint-sensor
-offsets; see `postures`.
+offsets; see `postures`. K and b are those of the joints' springs; see `springs`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.learning import springs
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
@@ -36,6 +37,7 @@ class Unknowns(NamedTuple):
     theta: Array  # θ of all joints of the body [rad], (N, all joints)
     zero: Array  # z [rad], (D,)
     parameters: list[Array]  # w of each muscle
+    springs: Array  # α and β of all joints of the body, as in the module `springs`, (2, all joints)
 
 
 class Residuals(NamedTuple):
@@ -45,7 +47,8 @@ class Residuals(NamedTuple):
     muscle_jacobian: Array  # G, (N, M, D)
     by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
     torque: Array  # (N, D)
-    torque_by_body: Array  # ∂τ/∂w, (N, D, W)
+    torque_by_body: Array  # −∂τ/∂w, (N, D, W)
+    torque_by_springs: Array  # −∂τ/∂(α, β) of the S joints with springs, (N, D, 2S)
     load: Array  # median sum of the muscles' absolute torques at each joint [N·m], (D,)
     angle: Array  # (N, D); 0 where the angle was not measured
     gravity: Array  # (N, 3J)
@@ -83,9 +86,14 @@ class PostureModel:
         self.body, self.observed = body.limb(joints, muscles), observed.limb(joints, muscles)
         self.joints = joints
         self._kinematics = body.robot.kinematics  # of the whole body
+        #: joints of the group with a spring, indices in θ of the whole body, (S,)
+        self.sprung: Ints = joints[self._kinematics.elasticity.is_sprung[joints]]
         ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])
         #: positions of each muscle's parameters in w
         self.columns = [slice(*pair) for pair in pairwise(ends.tolist())]
+        nominal, radian = self._kinematics.elasticity, self._kinematics.radian
+        #: prior spread of α and β of these joints, (2, S)
+        self.spring_spread = springs.prior_spread(nominal, radian)[:, self.sprung]
         self._crossed = self.body.robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
         #: the parameters of the muscles that cross each joint
@@ -139,14 +147,19 @@ class PostureModel:
             block[:, :, body.layouts[m].friction] -= direction * end[:, m] * slope[:, m, turns].T
             torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)
         muscular = end[:, :, None] * slope
-        weight = self._kinematics.holding_torque(at.theta)[:, self.joints]
+        nominal = self._kinematics.elasticity
+        held = self._kinematics.weight_torque(at.theta)
+        if nominal.is_present:
+            held = held + springs.learned(nominal, at.springs).holding_torque(at.theta)
+        by_springs = springs.slope(nominal, at.springs, at.theta, self.sprung)
         down = self._down(at.theta)
         return Residuals(
             length,
             slope,
             by_body,
-            -weight - muscular.sum(axis=1),
+            -held[:, self.joints] - muscular.sum(axis=1),
             torque_by_body,
+            by_springs[:, self.joints],
             np.median(np.abs(muscular).sum(axis=1), axis=0),
             np.where(self.is_read, observed.theta - own - self.by_sensor * at.zero, 0.0),
             self.is_tilt_known * (self._tilt - down[0]),
@@ -168,11 +181,15 @@ class PostureModel:
         down = np.einsum('njba,b->nja', rotation, gravity / max(np.linalg.norm(gravity), SMALL))
         return down.reshape(-1, *self._tilt.shape)
 
-    def stiffness(self, theta: Array) -> Array:
-        """Return ∂τ/∂θ [N·m/rad] (N, D, D), with the muscles' part from the geometric model."""
-        within = self.joints[:, None], self.joints
-        gravity = np.stack([self._kinematics.gravity_gradient(row) for row in theta])
-        stiffness: Array = gravity[:, within[0], within[1]]
+    def stiffness(self, at: Unknowns) -> Array:
+        """Return −∂τ/∂θ [N·m/rad] (N, D, D), with the muscles' part from the geometric model."""
+        within, theta = (self.joints[:, None], self.joints), at.theta
+        kinematics = self._kinematics
+        if kinematics.elasticity.is_present:
+            now = springs.learned(kinematics.elasticity, at.springs)
+            kinematics = kinematics.with_elasticity(now)
+        held = np.stack([kinematics.holding_gradient(row) for row in theta])
+        stiffness: Array = held[:, within[0], within[1]]
         return stiffness + self._muscle_stiffness(theta[:, self.joints])
 
     def _muscle_stiffness(self, own: Array) -> Array:

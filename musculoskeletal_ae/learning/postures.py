@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint fit of the body and the postures of its samples from all available sensors.
 
-    min  Σ ω (l_nm − l_m(θ_n, T_n; w))²/σ_m² + Σ ω (g(θ_n) + Gᵀ T_end)_j²/σ_τ²
+    min  Σ ω (l_nm − l_m(θ_n, T_n; w))²/σ_m² + Σ ω (g(θ_n) + K θ_n − b + Gᵀ T_end)_j²/σ_τ²
          + Σ (θ_nj + z_j − y_nj)²/σ_y² + Σ ‖R_iᵀ(θ_n) ĝ − u_ni‖²/σ_u² + Σ ((w − w̄)/s)²
-         + Σ ((z − z̄)/s_z)²
+         + Σ ((z − z̄)/s_z)² + Σ (e/s_e)²
 
-The minimum is over the parameters w of the calibrated body, the postures θ_n and the joint-sensor
-offsets z, by robust Gauss–Newton (`gauss_newton`). y are joint angles that a joint sensor (with
-offset z) or a camera measured, or that a user stated. u are directions of gravity in links that
-carry an IMU. Any of these measurements may be missing. z̄ and s_z are derived from the joints' stops
-(`stops`).
+The minimum is over the parameters w of the calibrated body, the postures θ_n, the joint-sensor
+offsets z and the corrections e = (α, β) of the joints' springs (`springs`), by robust Gauss–Newton
+(`gauss_newton`). y are joint angles that a joint sensor (with offset z) or a camera measured, or
+that a user stated. u are directions of gravity in links that carry an IMU. Any of these
+measurements may be missing. z̄ and s_z are derived from the joints' stops (`stops`).
 
 The problem can be solved because M > D. N rests give N (M − D) more length equations than there are
 angles, and N D torque equations. A joint that muscles push against its stop harder than friction
@@ -114,13 +114,15 @@ class GroupFit:
         radian = model.body.robot.kinematics.radian
         self.usual = (
             1.0 / (EXPECTED * radian) ** 2,
-            np.append(self.prior.precision, self.prior.zero_precision),
+            np.concatenate(
+                [self.prior.precision, self.prior.zero_precision, self.prior.spring_precision]
+            ),
         )
 
     def run(self, start: Unknowns) -> tuple[Unknowns, Array]:
-        """Fit from initial values; return the unknowns and the posterior root of (w, z).
+        """Fit from initial values; return the unknowns and the posterior root of (w, z, e).
 
-        The root R is upper triangular, and (RᵀR)⁻¹ is the covariance of w and z.
+        The root R is upper triangular, and (RᵀR)⁻¹ is the covariance of w, z and e.
         """
         enough = ENOUGH * self._known.sum()
         fit = minimise(self, self.point(start), ROUNDS, enough)
@@ -181,6 +183,7 @@ class GroupFit:
             + (weights.gravity * residuals.gravity**2).sum()
             + prior.precision @ prior.deviation(unknowns.parameters) ** 2
             + prior.zero_precision @ (unknowns.zero - prior.zero) ** 2
+            + prior.spring_precision @ self._springs(unknowns) ** 2
         )
 
     def equations(self, point: Point) -> Equations:
@@ -188,7 +191,7 @@ class GroupFit:
         model, weights, residuals = self.model, self._weights, point.residuals
         count, places = model.by_sensor.shape
         size = model.parameter_count
-        self._stiffness = stiffness = model.stiffness(point.unknowns.theta)
+        self._stiffness = stiffness = model.stiffness(point.unknowns)
         a, b, slope = weights.length, weights.torque, residuals.muscle_jacobian
         turned, e = residuals.gravity_by_posture, weights.gravity
         inner = np.einsum('nmi,nm,nmj->nij', slope, a, slope)
@@ -198,13 +201,20 @@ class GroupFit:
         diagonal = weights.angle + by_stop + self.stops.least_weight
         inner += diagonal[:, :, None] * np.eye(places)
 
-        outer = np.zeros((size + places, size + places))
-        mixed = np.zeros((count, places, size + places))
-        by_torque = residuals.torque_by_body
+        by_torque, by_springs = residuals.torque_by_body, residuals.torque_by_springs
+        every = size + places + by_springs.shape[2]
+        outer, mixed = np.zeros((every, every)), np.zeros((count, places, every))
         for j, acting in enumerate(model.acting):
             weighted = by_torque[:, j, acting] * np.sqrt(b[:, j, None])
             outer[np.ix_(acting, acting)] += weighted.T @ weighted
         mixed[:, :, :size] = stiffness.swapaxes(1, 2) @ (b[:, :, None] * by_torque)
+        if by_springs.size:
+            own, weighted = slice(size + places, every), b[:, :, None] * by_springs
+            outer[own, own] = np.einsum('njp,njq->pq', weighted, by_springs)
+            outer[own, own] += np.diag(self.prior.spring_precision)
+            outer[:size, own] = np.einsum('njp,njq->pq', by_torque, weighted)
+            outer[own, :size] = outer[:size, own].T
+            mixed[:, :, own] = stiffness.swapaxes(1, 2) @ weighted
         curvature = []
         for m, (column, by_body) in enumerate(zip(model.columns, residuals.by_body)):
             weighted = by_body * a[:, m, None]
@@ -241,18 +251,28 @@ class GroupFit:
         right += np.tensordot(torque, residuals.torque_by_body, 2)
         angle = (weights.angle * self.model.by_sensor * residuals.angle).sum(axis=0)
         of_zero = angle + prior.zero_precision * (prior.zero - unknowns.zero)
-        return RightSides(of_postures, np.append(right, of_zero))
+        of_springs = np.tensordot(torque, residuals.torque_by_springs, 2)
+        of_springs -= prior.spring_precision * self._springs(unknowns)
+        return RightSides(of_postures, np.concatenate([right, of_zero, of_springs]))
+
+    def _springs(self, unknowns: Unknowns) -> Array:
+        """Return α, then β of the joints of the group with springs, (2S,)."""
+        return unknowns.springs[:, self.model.sprung].ravel()
 
     def moved(self, point: Point, step: Step) -> Point:
         """Return the point after a step."""
-        theta, zero, parameters = point.unknowns
+        theta, zero, parameters, springs = point.unknowns
         joints, size = self.model.joints, self.model.parameter_count
+        after_zero, sprung = size + len(joints), self.model.sprung
         theta = theta.copy()
         theta[:, joints] += step.samples
-        zero = zero + step.common[size:]
+        zero = zero + step.common[size:after_zero]
+        if len(sprung):
+            springs = springs.copy()
+            springs[:, sprung] += step.common[after_zero:].reshape(2, -1)
         steps = (step.common[column] for column in self.model.columns)
         parameters = [own + change for own, change in zip(parameters, steps, strict=True)]
-        return self.point(Unknowns(theta, zero, parameters))
+        return self.point(Unknowns(theta, zero, parameters, springs))
 
 
 def fit_jointly(
@@ -266,7 +286,7 @@ def fit_jointly(
     """Fit the body, the joint-sensor offsets and the postures of the samples.
 
     Args:
-        body: The body, whose parameters and joint-sensor offsets are changed in place.
+        body: The body, whose parameters, springs and joint-sensor offsets are changed in place.
         observed: The samples.
         start: Initial postures [rad], (N, D).
         mean: Prior mean of each muscle's parameters.
@@ -288,9 +308,10 @@ def fit_jointly(
         joints, muscles = np.array(group.joints), np.array(group.muscles)
         model = PostureModel(body, observed, joints, muscles, bent)
         fit = GroupFit(model, [mean[m] for m in muscles], [spread[m] for m in muscles], least_noise)
-        begin = Unknowns(theta, zero[joints], [body.parameters[m] for m in muscles])
+        own_parameters = [body.parameters[m] for m in muscles]
+        begin = Unknowns(theta, zero[joints], own_parameters, body.springs)
         solution, group_root = fit.run(begin)
-        theta, zero[joints] = solution.theta, solution.zero
+        theta, zero[joints], body.springs = solution.theta, solution.zero, solution.springs
         for m, parameters in zip(muscles, solution.parameters):
             body.parameters[m] = parameters
         noise[muscles], weight[:, muscles] = fit.noise, fit.weight

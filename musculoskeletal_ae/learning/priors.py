@@ -75,6 +75,7 @@ class GroupPrior:
         angle_precision: 1/σ_y²; 0 where the angle was not measured, (N, D).
         repeated: Number of readings of a joint sensor that count as one, (D,).
         unread: Number of samples that count as one for a joint without a sensor, (D,).
+        spring_precision: 1/s_e² of the α, then of the β of the joints with springs, (2S,).
     """
 
     mean: Array
@@ -84,6 +85,7 @@ class GroupPrior:
     angle_precision: Array
     repeated: Array
     unread: Array
+    spring_precision: Array
 
     @classmethod
     def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
@@ -104,6 +106,7 @@ class GroupPrior:
             ),
             repeated=repeated,
             unread=np.maximum(1.0, (~by_sensor).sum(axis=0) / ALIKE),
+            spring_precision=model.spring_spread.ravel() ** -2.0,
         )
 
     def deviation(self, parameters: list[Array]) -> Array:

@@ -73,6 +73,8 @@ class Updater(ABC):
         if self.body is not None:
             touch = TouchStatistics(self.body.frictions(), np.ones(self._robot.joint_count))
             mae = replace(mae, touch=touch)
+            if self.body.elasticity.is_present:
+                mae = replace(mae, elasticity=self.body.elasticity)
         mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if fit is not None and self.body is not None:
             tension, judging = job.observed.end_tension(mae.friction), job.healthy.judging

@@ -27,6 +27,7 @@ from musculoskeletal_ae.mae.units import UNITS, ActivationName
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.groups import Group
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
@@ -39,6 +40,7 @@ LARGEST = 1e9
 SMALLEST_STD = 1e-9
 LARGEST_FRICTION = 5.0  # μ; a factor of 150 between the tensions at the ends of a tendon
 SMALLEST_EIGENVALUE = 1e-12  # of a covariance, relative to the largest eigenvalue
+INDEFINITE = -1e-6  # smallest eigenvalue of the springs, relative to the largest
 #: limits of a trained network's estimate of a rest posture: θ [rad], T [N], l [m], G [m/rad]
 ABSURD = (100.0, 1e5, 100.0, 1e5)
 
@@ -72,6 +74,7 @@ class Metadata(Strict, frozen=True):
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None  # None: no touch statistics
     uncertain: bool  # whether the covariance of the estimates is included
+    elastic: bool = False  # whether learned springs of the joints are included
 
     def __post_init__(self) -> None:
         """Check the rules that types cannot express."""
@@ -122,6 +125,10 @@ class Metadata(Strict, frozen=True):
             shapes |= {'touch.friction': (len(self.muscles),), 'touch.spread': (len(self.joints),)}
         if self.uncertain:
             shapes['covariance'] = len(self.joints), len(self.joints)
+        if self.elastic:
+            count = len(self.joints)
+            shapes |= {f'elasticity.{name}': (count,) for name in ('preload', 'damping')}
+            shapes['elasticity.stiffness'] = count, count
         return shapes
 
 
@@ -141,6 +148,9 @@ def to_bytes(mae: Mae) -> bytes:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
     if mae.covariance is not None:
         tensors['covariance'] = mae.covariance
+    if (springs := mae.elasticity) is not None:
+        tensors['elasticity.stiffness'] = springs.stiffness
+        tensors |= {'elasticity.preload': springs.preload, 'elasticity.damping': springs.damping}
     entries = {name: getattr(mae, name) for name in SHARED} | {
         'format_version': FORMAT_VERSION,
         'units': UNITS,
@@ -151,6 +161,7 @@ def to_bytes(mae: Mae) -> bytes:
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
         'touch_time': None if touch is None else touch.time,
         'uncertain': mae.covariance is not None,
+        'elastic': mae.elasticity is not None,
     }
     return save_tensors(
         {name: np.ascontiguousarray(value) for name, value in tensors.items()},
@@ -249,6 +260,8 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
             _check_covariance(name, tensors[name])
+    if meta.elastic:
+        _check_elasticity(tensors['elasticity.stiffness'], tensors['elasticity.damping'])
     return tensors
 
 
@@ -264,6 +277,17 @@ def _check_covariance(name: str, covariance: Array) -> None:
         raise CheckpointError(
             f'tensor {name} has eigenvalues from {least:g} to {most:g}; the smallest must '
             f'be positive and above {SMALLEST_EIGENVALUE:g} times the largest'
+        )
+
+
+def _check_elasticity(stiffness: Array, damping: Array) -> None:
+    if not np.array_equal(stiffness, stiffness.T):
+        raise CheckpointError('tensor elasticity.stiffness is not symmetric')
+    least, most = np.linalg.eigvalsh(stiffness)[[0, -1]]
+    if least < INDEFINITE * most or damping.min() < 0.0:
+        problem = f'eigenvalues from {least:g} to {most:g} and dampers from {damping.min():g}'
+        raise CheckpointError(
+            f'tensors elasticity have {problem}; none may be below 0, as springs only store energy'
         )
 
 
@@ -286,6 +310,10 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
     if meta.touch_time is not None:
         friction, spread = tensors['touch.friction'], tensors['touch.spread']
         touch = TouchStatistics(friction, spread, meta.touch_time)
+    elasticity = None
+    if meta.elastic:
+        parts = ('stiffness', 'preload', 'damping')
+        elasticity = JointElasticity(*(tensors[f'elasticity.{part}'] for part in parts))
     return Mae(
         encoder=stack('encoder'),
         decoder=stack('decoder'),
@@ -294,6 +322,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         anomaly=anomaly,
         touch=touch,
         covariance=tensors.get('covariance'),
+        elasticity=elasticity,
         **{name: getattr(meta, name) for name in SHARED},
     )
 

@@ -43,6 +43,7 @@ from musculoskeletal_ae.mae.units import (
     visible,
 )
 from musculoskeletal_ae.robot.groups import Group
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
@@ -267,6 +268,7 @@ class Mae:
     anomaly: AnomalyStatistics | None = None  # residuals on healthy data
     touch: TouchStatistics | None = None  # friction and healthy torques; None: not yet learned
     covariance: Array | None = None  # of θ_est − θ [rad²] (D, D); None: not yet learned
+    elasticity: JointElasticity | None = None  # springs of the joints; None: not learned
     groups: tuple[Group, ...] = ()  # each has a block of the network; empty: one block for all
     isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)

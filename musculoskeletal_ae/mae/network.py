@@ -177,6 +177,7 @@ class TorchLengths:
         """Copy the weights of a network to the device."""
         self._network, self._tensor = from_mae(mae).to(device), partial(torch.tensor, device=device)
         self.lengths, self.friction = mae.lengths, mae.friction
+        self.elasticity = mae.elasticity
         self._scale = self._tensor(scale_vector(len(mae.joints), len(mae.muscles)))
         self._muscles = len(mae.muscles)
 

@@ -12,7 +12,8 @@ and, where joints are forced to θ_fix,
     (θ_sim, T_sim) ← f_decode(z) after the descent (`latent_descent`)
 
 l_sim is the commanded length l_target (in the Japanese text: the muscle length sent to the robot).
-Only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF. A muscle without a command gives way:
+Only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF, with that of the
+joints' springs. A muscle without a command gives way:
 its l_sim is its present length.
 
 The paper does not state that θ_sim and T_sim are kept within the limits of joints and modules; we
@@ -49,11 +50,12 @@ class LatentSimulation:
     """Simulates arms of one robot; arguments are those of `QuasiStatics`."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self._load = robot, Load(robot.kinematics)
+        self._robot = robot
 
     def use(self, mae: Mae, robot: Robot) -> None:
         """Use a network, and the robot with the muscles that are now isolated."""
-        self._mae, self._robot = mae, robot
+        self._mae, self._robot = mae, robot.with_elasticity(mae.elasticity)
+        self._load = Load(self._robot.kinematics)
 
     def step(
         self,

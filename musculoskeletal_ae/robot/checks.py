@@ -3,15 +3,16 @@
 
 For postures drawn uniformly within the joint limits, the check computes
 
-- the tension nearest to 0.3 T_limit within [T_bias, T_limit] that holds the arm's own weight,
-- the joint stiffness under muscle stiffness control (MSC) at that tension, and
+- the tension nearest to 0.3 T_limit within [T_bias, T_limit] that holds weight and springs,
+- the joint stiffness under muscle stiffness control (MSC) at that tension, with the springs, and
 - the moment arms r(θ) = −G(θ) [m], the joint torque for one newton of tension. A muscle with r > 0
   moves the joint in its positive direction.
 
 To give all joints the same unit, a prismatic joint is treated as if a pinion of radius RACK moved
 it: a tendon parallel to its axis has r = RACK. doc/explanation/method.md ("An arm must be
-holdable") defines a sound arm. The report also shows the one-sided stiffness, in which muscles at
-the bias tension count as slack; it is not a criterion.
+holdable") defines a sound arm. A joint with a spring of its own may have muscles on one side only,
+if these hold it. The report also shows the one-sided stiffness, in which muscles at the bias
+tension count as slack; it is not a criterion.
 """
 
 from __future__ import annotations
@@ -85,15 +86,20 @@ class Setting(NamedTuple):
     theta: Array  # [rad] or [m], (N, D)
     jacobian: Array  # G [m/rad], (N, M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
-    torque: Array  # g [N·m], (N, D)
+    torque: Array  # g + K θ − b, of weight and springs [N·m], (N, D)
+    weight: Array  # g [N·m], (N, D)
+    springs: Array  # K [N·m/rad], (D, D)
 
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
         """Return the setting of a robot in postures θ (N, D)."""
         jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
         hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
-        torque = radian * robot.kinematics.holding_torque(theta)
-        return cls(robot, theta, radian * jacobian(theta), hessian, torque)
+        weight = radian * robot.kinematics.weight_torque(theta)
+        elasticity = robot.kinematics.elasticity
+        torque = weight + radian * elasticity.holding_torque(theta)
+        springs = radian[:, None] * elasticity.stiffness * radian
+        return cls(robot, theta, radian * jacobian(theta), hessian, torque, weight, springs)
 
 
 @dataclass(frozen=True)
@@ -148,10 +154,10 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 
 def judge(setting: Setting) -> RobotCheck:
     """Check the muscles of a robot in the postures of a setting; errors as for `check_robot`."""
-    robot, theta, jacobian, hessian, torque = setting
+    robot, theta, jacobian, hessian, torque, *_ = setting
     bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
-    load = float(robot.joint_load(torque, jacobian).max())
+    load = float(robot.joint_load(setting.weight, jacobian).max())
     required = min(REQUIRED_STIFFNESS, REQUIRED_BY_LOAD * load)
     longest = np.abs(arms).max(axis=(0, 1))
     matters = np.clip(MATTERS_SHARE * longest, MATTERS_LEAST, MATTERS)
@@ -164,7 +170,8 @@ def judge(setting: Setting) -> RobotCheck:
     k = robot.muscle_stiffness(theta[held], tension[held])
     taut = np.where(tension[held] > bias + SLACK_MARGIN, k, 0.0)
     full, sided = (
-        joint_stiffness(jacobian[held], hessian[held], x, tension[held]) for x in (k, taut)
+        setting.springs + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
+        for x in (k, taut)
     )
     values, vectors = np.linalg.eigh(full)
     stiffness[held], one_sided[held] = values[:, 0], np.linalg.eigvalsh(sided)[:, 0]
@@ -290,6 +297,9 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
     }
     median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
     one_way = np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE
+    # A spring turns the joint back from where a muscle pulls it.
+    has_muscle = ~(lacks['+'] & lacks['-']).any(axis=0)
+    one_way &= ~(robot.kinematics.elasticity.is_sprung & has_muscle)
     for joint in np.flatnonzero(one_way).tolist():
         missing = ' and '.join(
             f'{sign} (in {100 * lacking[:, joint].mean():.0f} % of postures)'

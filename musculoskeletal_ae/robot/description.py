@@ -23,6 +23,7 @@ from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot import series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, resolved
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.muscle_file import (
@@ -40,6 +41,9 @@ Fail = Callable[[str], RobotDescriptionError]
 
 #: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
+
+#: smallest eigenvalue of a stiffness matrix, as a share of its largest; less is not rounding
+INDEFINITE = -1e-9
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
 
@@ -113,6 +117,7 @@ class RobotDescription:
     tension: TensionRange
     end_effectors: tuple[str, ...]  # links; `end_effector` is the first
     couplings: dict[str, Coupling]  # of joints that follow others
+    joint_elasticity: JointElasticity  # springs and dampers of the joints
     warnings: tuple[str, ...]  # accepted, but questionable entries
 
     @property
@@ -184,6 +189,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         tension=TensionRange(**_columns(tension)),
         end_effectors=_read_end_effectors(content, model, couplings, order, fail),
         couplings=couplings,
+        joint_elasticity=_read_joint_elasticity(content, couplings, fail),
         warnings=tuple(warnings),
     )
 
@@ -270,6 +276,53 @@ def _read_couplings(
             raise refused(slave, problem)
         del couplings[slave]  # a wheel, for example; like all unlisted joints, it is held fixed
     return couplings
+
+
+def _read_joint_elasticity(
+    content: MuscleFile, couplings: Iterable[str], fail: Fail
+) -> JointElasticity:
+    """Return the springs and dampers of the joints."""
+    joints = content.joints
+    stiffness, rest, damping = (
+        np.zeros(shape) for shape in ((len(joints),) * 2, *[len(joints)] * 2)
+    )
+
+    def index(place: str, name: str) -> int:
+        if name in joints:
+            return joints.index(name)
+        followed = ' (it follows another joint: state the spring there)' * (name in couplings)
+        legal = ', '.join(joints)
+        raise fail(f'{place}: unknown joint {name!r}{followed}; legal: those under joints, {legal}')
+
+    for k, entry in enumerate(content.joint_elasticity):
+        place = f'$.joint_elasticity[{k}]'
+        i = index(f'{place}.joint', entry.joint)
+        stiffness[i, i], rest[i], damping[i] = entry.stiffness, entry.rest_angle, entry.damping
+        for other, value in entry.coupled.items():
+            j = index(f'{place}.coupled', other)
+            if i == j:
+                problem = f'{other!r} is the joint itself; give its own stiffness as stiffness'
+                raise fail(f'{place}.coupled: {problem}')
+            if stiffness[i, j]:
+                problem = f'the term of {entry.joint!r} and {other!r} is given twice; give it once'
+                raise fail(f'{place}.coupled: {problem}')
+            stiffness[i, j] = stiffness[j, i] = value
+    for i, j in np.argwhere(np.triu(stiffness, 1)).tolist():
+        most = math.sqrt(stiffness[i, i] * stiffness[j, j])
+        if abs(stiffness[i, j]) > most * (1.0 - INDEFINITE):
+            size, limit = distinct(abs(stiffness[i, j]), most)
+            pair = f'{joints[i]!r} and {joints[j]!r}'
+            legal = f'at most {limit}, the geometric mean of their own stiffnesses'
+            raise fail(
+                f'$.joint_elasticity: the term of {pair} has the size {size}; legal: {legal}, as '
+                'springs only store energy'
+            )
+    if joints and (values := np.linalg.eigvalsh(stiffness))[0] < INDEFINITE * values[-1]:
+        raise fail(
+            f'$.joint_elasticity: the stiffness matrix has the eigenvalue {values[0]:.3g}; legal: '
+            'none below 0, as springs only store energy; make the terms under coupled smaller'
+        )
+    return JointElasticity(stiffness, stiffness @ rest, damping)
 
 
 def _read_tension(

@@ -6,6 +6,9 @@ Training, learning and the view need the poses of thousands of postures at once;
 computes these from the same placements. A test compares the two.
 """
 
+from __future__ import annotations
+
+import copy
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -13,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import Coupling, JointTree
 
 #: [m] travel of a prismatic joint that counts as one radian of a revolute joint, wherever both are
@@ -67,7 +71,7 @@ def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
 
 
 class Kinematics:
-    """Rigid-body side of a robot: link poses, gravity torque and end-effector Jacobian."""
+    """Body side of a robot: link poses, torques of weight and springs, end-effector Jacobian."""
 
     def __init__(
         self,
@@ -75,6 +79,7 @@ class Kinematics:
         joints: Sequence[str],
         end_effector: str,
         couplings: Mapping[str, Coupling] | None = None,
+        elasticity: JointElasticity | None = None,
     ) -> None:
         """Reduce a URDF's model to the joints of θ and the joints coupled to them.
 
@@ -86,7 +91,10 @@ class Kinematics:
             joints: The D joints of θ, in order.
             end_effector: Link for poses and external wrenches.
             couplings: Coupling of each coupled joint.
+            elasticity: Springs and dampers of the joints; None for none.
         """
+        #: springs and dampers of the joints
+        self.elasticity = elasticity or JointElasticity.none(len(joints))
         couplings = couplings or {}
         followers = [name for name, coupling in couplings.items() if coupling.master in joints]
         kept, still = [*joints, *followers], pin.neutral(full_model)
@@ -120,10 +128,26 @@ class Kinematics:
         """Return the joint of the tree that carries a link, and the link's pose in its frame."""
         return link_placement(self.model, link)
 
+    def with_elasticity(self, elasticity: JointElasticity) -> Kinematics:
+        """Return a copy with other springs and dampers."""
+        changed = copy.copy(self)
+        changed.elasticity = elasticity
+        return changed
+
     def holding_torque(self, theta: Array) -> Array:
+        """Return the torque that holds the arm against its weight and its springs.
+
+        g(θ) + K θ − b    [N·m], shape (..., D)
+        """
+        weight = self.weight_torque(theta)
+        if not self.elasticity.is_present:
+            return weight
+        return weight + self.elasticity.holding_torque(theta)
+
+    def weight_torque(self, theta: Array) -> Array:
         """Return g(θ), the joint torque that holds the arm's own weight [N·m], (..., D)."""
         if theta.ndim > 1:
-            return np.stack([self.holding_torque(row) for row in theta])
+            return np.stack([self.weight_torque(row) for row in theta])
         return self.tree.of_theta(self._gravity(theta), theta)
 
     def _gravity(self, theta: Array) -> Array:
@@ -132,24 +156,30 @@ class Kinematics:
         return np.array(pin.computeGeneralizedGravity(self.model, self.data, q))
 
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
-        """Return M(θ) θ̈ + h(θ, θ̇), the joint torque of a motion [N·m], shape (D,)."""
+        """Return the joint torque of a motion, with that of springs and dampers.
+
+        M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇    [N·m], shape (D,)
+        """
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
         if tree.is_coupled:
             squared_velocity = rates[0] ** 2
             rates = tree.ratios(theta) * rates
             rates[1] += tree.curvatures(theta) * squared_velocity
         torque = pin.rnea(self.model, self.data, tree.angles(theta), *rates)
-        return tree.of_theta(torque, theta)
+        result, elasticity = tree.of_theta(torque, theta), self.elasticity
+        if elasticity.is_present:
+            result = result + elasticity.holding_torque(theta) + elasticity.damping * velocity
+        return result
 
-    def gravity_gradient(self, theta: Array) -> Array:
-        """Return ∂g/∂θ [N·m/rad], shape (D, D), at θ (D,)."""
+    def holding_gradient(self, theta: Array) -> Array:
+        """Return ∂g/∂θ + K, the gradient of `holding_torque` [N·m/rad], shape (D, D), at θ (D,)."""
         tree, q = self.tree, self.tree.angles(theta)
         gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, q)
         result = tree.of_both(gradient, theta)
         if tree.is_nonlinear:
             of_curvature = self._gravity(theta) * tree.curvatures(theta)
             result = result + np.diag(of_curvature @ tree.moved_by)
-        return result
+        return result + self.elasticity.stiffness
 
     def joint_inertia(self, theta: Array) -> Array:
         """Return the inertia at each joint with the others held [kg·m² or kg], (D,), at θ (D,)."""

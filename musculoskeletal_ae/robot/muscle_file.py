@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import UNSET, Meta, UnsetType, field
 
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
@@ -129,6 +129,19 @@ class CouplingEntry(Strict, frozen=True):
             raise ValueError('expected polynomial, or ratio and offset, got both')
 
 
+class JointElasticityEntry(Strict, frozen=True):
+    """Spring and damper of a joint; where it slides, per metre instead of per radian."""
+
+    joint: Name
+    stiffness: NotNegative = 0.0  # [N·m/rad]
+    rest_angle: Number = 0.0  # at which the spring exerts no torque [rad]
+    damping: NotNegative = 0.0  # [N·m·s/rad]
+    #: terms of the stiffness with other joints [N·m/rad]
+    coupled: Annotated[dict[Name, Number], Meta(max_length=LONGEST_LIST)] = field(
+        default_factory=dict
+    )
+
+
 class MuscleFile(Strict, frozen=True):
     """The whole file."""
 
@@ -140,6 +153,9 @@ class MuscleFile(Strict, frozen=True):
     end_effector: Name | None = None
     end_effectors: Names | None = None
     couplings: Annotated[tuple[CouplingEntry, ...], Meta(max_length=LONGEST_LIST)] = ()
+    joint_elasticity: Annotated[
+        tuple[JointElasticityEntry, ...], Meta(max_length=LONGEST_LIST)
+    ] = ()
 
     def __post_init__(self) -> None:
         """Check that names are unique."""
@@ -147,6 +163,7 @@ class MuscleFile(Strict, frozen=True):
         _check_unique('muscles', (muscle.name for muscle in self.muscles))
         _check_unique('end_effectors', self.end_effectors or ())
         _check_unique('couplings', (coupling.joint for coupling in self.couplings))
+        _check_unique('joint_elasticity', (entry.joint for entry in self.joint_elasticity))
         if self.end_effector is not None and self.end_effectors is not None:
             raise ValueError('expected end_effector or end_effectors, got both')
 

@@ -83,7 +83,9 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
     robot = copy(setting.robot)
     if what == 'mass':
         text = f'links at {100 * factor:g} % of their mass'
-        return setting._replace(torque=factor * setting.torque), text
+        weight = factor * setting.weight
+        torque = setting.torque - setting.weight + weight
+        return setting._replace(torque=torque, weight=weight), text
     if what == 'moment arms':
         scale = np.where(np.arange(robot.joint_count) == joint, factor, 1.0)
         hessian = scale[:, None] * setting.hessian * scale

@@ -14,6 +14,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import RobotDescription, TensionRange, load_description
 from musculoskeletal_ae.robot.groups import groups
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -35,7 +36,11 @@ class Robot:
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
-            description.model, self.joints, description.end_effector, description.couplings
+            description.model,
+            self.joints,
+            description.end_effector,
+            description.couplings,
+            description.joint_elasticity,
         )
         self.routes = Routes(self.kinematics, description.routes)
         self.groups = groups(self.routes.crossed)
@@ -63,6 +68,7 @@ class Robot:
             series_elastic=SeriesElastic(*elastic),
             stiffness=whole.stiffness[muscles],
             tension=TensionRange(*tension),
+            joint_elasticity=whole.joint_elasticity.of_joints(joints),
         )
         return Robot(description)
 
@@ -103,6 +109,18 @@ class Robot:
         reduced.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
         return reduced
 
+    def with_elasticity(self, elasticity: JointElasticity | None) -> Robot:
+        """Return a copy with learned springs and dampers; None: those of the description.
+
+        The copy shares the geometry with the original.
+        """
+        own = self.description.joint_elasticity if elasticity is None else elasticity
+        if own is self.kinematics.elasticity:
+            return self
+        changed = copy.copy(self)
+        changed.kinematics = self.kinematics.with_elasticity(own)
+        return changed
+
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m], θ (..., D), T (..., M)."""
         absolute = self.routes.absolute_lengths(theta)
@@ -110,10 +128,10 @@ class Robot:
         return relative - self.series_elastic.elongation(absolute, tension)
 
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
-        """Return the highest load of weight and muscles at T_bias on each joint [N·m], (D,).
+        """Return the highest load on each joint by a torque and the muscles at T_bias [N·m], (D,).
 
         Args:
-            torque: Torque that holds the weight in N postures [N·m], (N, D).
+            torque: Torque that holds the arm in N postures [N·m], (N, D).
             jacobian: G [m/rad], (N, M, D).
         """
         pulls = np.abs(jacobian) * self.tension.bias[:, None]

@@ -3,7 +3,7 @@
 
     l = f_decode,l(①(θ, T_end)),  T_end = T e^{−μ s}            learned body and tendon friction
     T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     muscle stiffness control (MSC)
-    B θ̇ = −(g(θ) − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
+    B θ̇ = −(g(θ) + K θ − b − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
 The paper descends on a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and
 length, and the arm settles in another posture. Here torque and length are equations instead. On the
@@ -13,9 +13,11 @@ body, and each step costs more.)
 
 The arm approaches the root through a viscous medium B by linearly implicit Euler steps. These are
 Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and geared
-muscle modules, and so makes speeds realistic; it is larger where muscles have larger moment arms. B
-does not affect the rest posture. A joint limit is a hard stop that exerts any torque needed. Tendon
-friction (`friction`) does affect the rest posture: it differs after winding in and paying out.
+muscle modules, and so makes speeds realistic; it is larger where muscles have larger moment arms,
+and includes the dampers of the joints. B does not affect the rest posture. K and b are those of the
+joints' springs (`JointElasticity`), as far as learned those of the network. A joint limit is a hard
+stop that exerts any torque needed. Tendon friction (`friction`) does affect the rest posture: it
+differs after winding in and paying out.
 """
 
 import math
@@ -363,10 +365,11 @@ class QuasiStatics:
     """The equations above for one robot and the network that `use` has set."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot, self.tree, self.slopes = robot, Load(robot.kinematics).tree, Slopes(robot)
+        self._robot, self.slopes = robot, Slopes(robot)
         postures = robot.random_postures(JACOBIAN_POSTURES, np.random.default_rng(0))
         moment_arms = np.abs(robot.routes.muscle_jacobian(postures)).sum(axis=1).mean(axis=0)
-        self._viscosity = np.maximum(VISCOSITY * moment_arms, LEAST_VISCOSITY)
+        viscosity = np.maximum(VISCOSITY * moment_arms, LEAST_VISCOSITY)
+        self._viscosity = viscosity + robot.kinematics.elasticity.damping
 
     def use(self, mae: Mae, robot: Robot) -> None:
         """Set the network, and the robot with the currently isolated muscles.
@@ -375,7 +378,9 @@ class QuasiStatics:
             FloatingPointError: If the network's lengths are not finite somewhere.
         """
         self.slopes.fit(mae)
+        robot = robot.with_elasticity(mae.elasticity)
         self._robot, elastic, self._mae = robot, robot.series_elastic, mae
+        self.tree = Load(robot.kinematics).tree
         # A noisy fit may return a slightly negative friction, which would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint torques that hold N arms against gravity and a wrench, and their gradient, by numba.
+"""Joint torques that hold N arms against weight, springs and a wrench, and their gradient.
 
-    load(θ) = g(θ) − Jᵀ F
+    load(θ) = g(θ) + K θ − b − Jᵀ F
 
-(paper, §III-F: the necessary torque from the geometric model). Pinocchio computes the same torque,
+(paper, §III-F: the necessary torque from the geometric model), compiled by numba; K and b are those
+of `JointElasticity`. Pinocchio computes the same torque of the weight,
 and a test compares the two. However, it has no gradient with a wrench, and called from Python it
 takes as long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with axis a_k
 needs only sums over the bodies that it carries:
@@ -45,6 +46,8 @@ class Tree(NamedTuple):
     carries: Bools  # whether a joint carries the end effector, (J,)
     effector_joint: int
     effector: Array  # end effector in the frame of the joint that carries it [m], (3,)
+    springs: Array  # K [N·m/rad], (D, D)
+    preload: Array  # b [N·m], (D,)
 
 
 @njit(cache=True)
@@ -126,6 +129,15 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
             for n in range(arms):
                 pose[tree.parent[i], 5, r, n] += pose[i, 5, r, n]
     load[:], gradient[:] = 0.0, 0.0
+    for d in range(len(theta)):
+        for n in range(arms):
+            load[d, n] = -tree.preload[d]
+        for e in range(len(theta)):
+            spring = tree.springs[d, e]
+            if spring != 0.0:
+                for n in range(arms):
+                    load[d, n] += spring * theta[e, n]
+                    gradient[d, e, n] = spring
     down, tip, hand = vector(tree.gravity), vector(tree.effector), pose[tree.effector_joint]
     tips, nothing = hand[3].copy(), np.zeros_like(wrench)
     for c in range(3):
@@ -167,7 +179,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
 
 
 class Load:
-    """Torques that hold N arms against gravity and a wrench, and their gradient."""
+    """Torques that hold N arms against weight, springs and a wrench, and their gradient."""
 
     def __init__(self, kinematics: Kinematics) -> None:
         kin, model = kinematics, kinematics.model
@@ -190,6 +202,8 @@ class Load:
             carries=kin.tree.descends_from[joint].copy(),
             effector_joint=joint,
             effector=np.array(effector.placement.translation),
+            springs=np.ascontiguousarray(kin.elasticity.stiffness),
+            preload=kin.elasticity.preload.copy(),
         )
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.tendons import law
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 
 WRAP = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, -0.3], 'axis': [0, 1, 0], 'radius': 0.02}
@@ -93,6 +94,8 @@ def test_a_prismatic_joint_coupled_to_a_revolute_one_does_not_lag(tmp_path):
 
 @pytest.mark.parametrize('name', EFFECTS)
 def test_each_effect_alone_changes_the_motion(robot, name, monkeypatch):
+    sprung = JointElasticity(np.eye(2), np.zeros(2), np.zeros(2))
+    robot = robot.with_elasticity(sprung)  # joints without springs cannot show theirs
     monkeypatch.setattr(foreign, 'SLIP_TIME', 0.01)
     monkeypatch.setattr(foreign, 'HOUR', 0.1)
     size = EFFECTS[name] if name != 'dropouts' else 0.5

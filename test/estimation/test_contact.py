@@ -164,7 +164,7 @@ class StatedPosture:
     theta: np.ndarray
     touch: TouchStatistics
     exact = ExactMae(ARM)
-    friction = exact.friction
+    friction, elasticity = exact.friction, None
 
     def estimate(self, *_):
         return SimpleNamespace(theta=self.theta)

@@ -144,7 +144,7 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
     body = CalibratedBody(arm26, [p.copy() for p in resting.body.parameters], seed=7)
     joints, muscles = np.arange(2), np.arange(6)
     model = PostureModel(body, part, joints, muscles, Bent.unknown(8, 2))
-    unknowns, step = Unknowns(part.theta, np.zeros(2), body.parameters), 1e-6
+    unknowns, step = Unknowns(part.theta, np.zeros(2), body.parameters, body.springs), 1e-6
     rows = model.residuals(unknowns)
     column = 0
     for m, layout in enumerate(body.layouts):

@@ -47,7 +47,7 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         gravity = slopes(lambda t: energy(robot, t), theta)
         np.testing.assert_allclose(kin.holding_torque(theta), gravity, atol=1e-6)
         gradient = slopes(kin.holding_torque, theta)
-        np.testing.assert_allclose(kin.gravity_gradient(theta), gradient, atol=1e-5)
+        np.testing.assert_allclose(kin.holding_gradient(theta), gradient, atol=1e-5)
         load, load_slope = Load(kin)(theta[None])
         np.testing.assert_allclose(load[0], kin.holding_torque(theta), atol=1e-9)
         np.testing.assert_allclose(load_slope[0], gradient, atol=1e-5)

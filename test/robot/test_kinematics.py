@@ -44,11 +44,11 @@ def test_holding_torque_is_the_gradient_of_potential_energy(robot):
         np.testing.assert_allclose(robot.kinematics.holding_torque(theta), gradient, atol=1e-6)
 
 
-def test_gravity_gradient_is_the_derivative_of_the_holding_torque(robot):
+def test_holding_gradient_is_the_derivative_of_the_holding_torque(robot):
     kin = robot.kinematics
     for theta in robot.random_postures(5, np.random.default_rng(8)):
         expected = slopes(kin.holding_torque, theta, 1e-5)
-        np.testing.assert_allclose(kin.gravity_gradient(theta), expected, atol=1e-7)
+        np.testing.assert_allclose(kin.holding_gradient(theta), expected, atol=1e-7)
         np.testing.assert_allclose(expected, expected.T, atol=1e-7)  # it has a potential
 
 

@@ -26,6 +26,7 @@ class GeometricBody:
 
     def __init__(self, robot, friction=0.0):
         self.robot, self.friction = robot, np.full(robot.muscle_count, friction)
+        self.elasticity = None
 
     def lengths(self, theta, tension):
         return self.robot.muscle_lengths(theta, tension)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learned springs of the joints: corrections of the springs that muscles.yaml states.
+
+    K = S K̄ S,  S = diag(e^{α/2}),      b = e^α b̄ + β
+
+α are logarithmic errors of the stiffnesses, and β errors of the torques at θ = 0 [N·m]. With this
+form, K keeps no negative eigenvalue whatever α is. Only joints with a spring of their own in
+muscles.yaml have these two parameters. They follow from the torque balance of rest samples
+(`posture_model`), and therefore only from samples with tensions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
+
+#: prior standard deviations: of α, and of the angle at which a spring is at rest [rad], for
+#: prismatic joints times RACK [m]
+STIFFNESS, REST = 0.5, 0.2
+LARGEST = 2.0  # bound on |α|
+
+
+def none_learned(joint_count: int) -> Array:
+    """Return α and β of joints about whose springs nothing was learned, (2, D)."""
+    return np.zeros((2, joint_count))
+
+
+def prior_spread(nominal: JointElasticity, radian: Array) -> Array:
+    """Return the prior spread of α and of β [N·m], (2, D); `radian` as in `Kinematics`."""
+    stiffness = np.diag(nominal.stiffness)
+    return np.stack([np.full(len(stiffness), STIFFNESS), stiffness * REST * radian])
+
+
+def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
+    """Return the springs with corrections α and β, (2, D)."""
+    if not nominal.is_present:
+        return nominal
+    log = np.clip(springs[0], -LARGEST, LARGEST)
+    scale = np.exp(0.5 * log)
+    stiffness = scale[:, None] * nominal.stiffness * scale
+    return JointElasticity(stiffness, np.exp(log) * nominal.preload + springs[1], nominal.damping)
+
+
+def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) -> Array:
+    """Return the derivative of K θ − b by α and β of some joints, (N, D, 2 · joints).
+
+    Args:
+        nominal: The springs that muscles.yaml states.
+        springs: α and β of all joints, (2, D).
+        theta: θ of all joints [rad], (N, D).
+        joints: The joints, indices in θ.
+    """
+    now = learned(nominal, springs)
+    count, places = theta.shape
+    result = np.zeros((count, places, 2 * len(joints)))
+    # α of joint j scales row and column j of K, each by half of it.
+    result[:, :, : len(joints)] = 0.5 * now.stiffness[:, joints] * theta[:, None, joints]
+    torque = theta @ now.stiffness
+    for k, j in enumerate(joints.tolist()):
+        result[:, j, k] += 0.5 * torque[:, j] - now.preload[j] + springs[1, j]
+        result[:, j, len(joints) + k] = -1.0
+    return result

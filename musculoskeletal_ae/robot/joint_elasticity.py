@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passive elasticity of the joints: springs, ligaments and soft links.
+
+    τ_passive = −K (θ − θ_0) − diag(d) θ̇ = b − K θ − diag(d) θ̇,    b = K θ_0
+
+K is symmetric. An entry off its diagonal couples two joints, as a ligament or a soft link does that
+both of them bend. K has no negative eigenvalue, because passive parts only store energy. The
+muscles therefore have to exert g(θ) + K θ − b to hold a posture (`Kinematics.holding_torque`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class JointElasticity:
+    """Springs and dampers of D joints, in the order of θ."""
+
+    stiffness: Array  # K [N·m/rad], symmetric, (D, D)
+    preload: Array  # b = K θ_0, the torque of the springs at θ = 0 [N·m], (D,)
+    damping: Array  # d [N·m·s/rad], (D,)
+
+    @classmethod
+    def none(cls, joint_count: int) -> JointElasticity:
+        """Return that of joints without springs and dampers."""
+        nothing = np.zeros(joint_count)
+        return cls(np.zeros((joint_count, joint_count)), nothing, nothing)
+
+    @cached_property
+    def is_present(self) -> bool:
+        """Whether any joint has a spring or a damper."""
+        return bool(self.stiffness.any() or self.damping.any())
+
+    @property
+    def is_sprung(self) -> Bools:
+        """Which joints have a spring of their own, (D,)."""
+        return np.diag(self.stiffness) > 0.0
+
+    @property
+    def rest(self) -> Array:
+        """The posture at which no spring exerts torque [rad], (D,); 0 for joints without one."""
+        rest: Array = np.linalg.pinv(self.stiffness, hermitian=True) @ self.preload
+        return rest
+
+    def holding_torque(self, theta: Array) -> Array:
+        """Return K θ − b, the torque that holds the springs at θ [N·m], θ (..., D)."""
+        torque: Array = theta @ self.stiffness - self.preload
+        return torque
+
+    def deviating(self, factor: Array, shift: Array) -> JointElasticity:
+        """Return springs `factor` times as stiff (D,), which rest `shift` [rad] (D,) elsewhere."""
+        scale = np.sqrt(factor)
+        stiffness = scale[:, None] * self.stiffness * scale
+        return JointElasticity(stiffness, stiffness @ (self.rest + shift), self.damping)
+
+    def of_joints(self, joints: Ints) -> JointElasticity:
+        """Return the elasticity of some joints while all others are at 0."""
+        rows = np.ix_(joints, joints)
+        return JointElasticity(self.stiffness[rows], self.preload[joints], self.damping[joints])
