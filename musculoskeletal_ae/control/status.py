@@ -88,7 +88,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
         unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
-        values['unknown length zeros'] = robot.names(unknown)
+        values['unknown length offsets'] = robot.names(unknown)
         warnings.append('length offsets are unknown: the arm only explores, gently')
     if tense := core.watchdog.overload.tense:
         warnings.append(f'too much tension: {", ".join(tense)}')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core of the node `estimator`: estimate the joint angles and watch the body's health.
+"""The core of the node `estimator`: estimates the joint angles and monitors the body's health.
 
     muscle_states ─► MuscleStream ─► MuscleSample ─► StateEstimator ─► Estimate ─► HealthMonitor
                          ▲                │                              │              │ Finding
@@ -8,9 +8,9 @@
                          ▲                                                              │
                          └────────────── isolated muscles ──────────────────────────────┘
 
-The estimator owns the body state. Whenever isolated muscles or length offsets change, it makes a
-new one, which its node publishes. While the offsets are being found, only those detectors decide
-that do not need lengths. `suspects.py` describes the sequence from a rupture to moving on.
+The estimator owns the body state. When isolated muscles or length offsets change, it creates a new
+body state, which its node publishes. During a length calibration, only the detectors that do not
+need lengths report findings. `suspects.py` describes the sequence from a rupture to resuming.
 """
 
 import math
@@ -46,22 +46,22 @@ from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-#: A pause in the messages counts as at most this much of the time that detectors measure.
-LONGEST_PERIOD = 0.1  # [s]
-JOINTS_AGE = 0.05  # [s] for which measured joint angles belong to a message
-SHIFTED = 0.02  # [m] by which a guess of an offset has to change before it is published again
+#: largest time between two messages that detectors count [s]; a longer pause counts as this
+LONGEST_PERIOD = 0.1
+JOINTS_AGE = 0.05  # [s] age up to which measured joint angles are used with a message
+SHIFTED = 0.02  # [m] change of an estimated offset above which it is published again
 
 
 class Output(NamedTuple):
-    """What one message gives.
+    """The results of one message.
 
     Attributes:
-        sample: What was read.
+        sample: The readings.
         state: (θ, T, l) as the network restores them.
-        covariance: Of θ [rad²], (D, D), or None.
-        anomaly: A, scaled units.
+        covariance: Covariance of θ [rad²], (D, D), or None.
+        anomaly: A, in scaled units.
         detected: Whether this message latches a finding.
-        contact: What acts from outside; None while the length offsets are unknown.
+        contact: External load; None while the length offsets are unknown.
     """
 
     sample: MuscleSample
@@ -73,27 +73,29 @@ class Output(NamedTuple):
 
 
 class Estimator:
-    """Composes the parts. `time` is the clock of the messages [s], `now` a steady one [s].
+    """Passes each message through its parts.
+
+    `time` is the clock of the messages [s], `now` a steady clock [s].
 
     Attributes:
         robot: The nominal body, with all muscles.
         body: Isolated muscles and length offsets.
-        stream: Turns messages into samples.
-        heat: Thermal models of the modules.
+        stream: Converts messages into samples.
+        heat: Thermal models of the muscle modules.
         state: The state estimator.
         health: The detectors.
         suspects: The latched finding and its verification.
-        calibration: The length calibration while it runs, or None.
+        calibration: The running length calibration, or None.
         contact: The contact estimator.
-        sample: The last one that was read; None before the first.
-        output: Of the last message with an estimate; None before the first, and when a length
-            calibration begins.
-        measured: θ by joint sensors [rad] (D,) of that message; None where not all reported.
-        stepped_at: When the last message with an estimate came, by the steady clock [s].
+        sample: The last sample; None before the first.
+        output: Results of the last message with an estimate; None before the first, and from the
+            start of a length calibration until its first estimate.
+        measured: θ from joint sensors [rad], (D,), at that message; None unless all reported it.
+        stepped_at: Time of the last message that was estimated, on the steady clock [s].
     """
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:
-        """Wait for a network; the preset says what decides that there is an anomaly."""
+        """Start without a network; the preset provides the detectors."""
         self.robot = robot
         self.body = BodyState.healthy(robot.muscle_count)
         self.stream = MuscleStream(robot, self.body)
@@ -108,11 +110,12 @@ class Estimator:
         self.measured: Array | None = None
         self.stepped_at = -math.inf
         self._stated_posture: tuple[float, ...] = ()  # of the last length calibration
-        self._jumps = 0  # of lengths, that were handled
-        self._valid_offsets = self.body.offsets  # the last ones that were known
+        self._jumps = 0  # number of length jumps handled so far
+        self._valid_offsets = self.body.offsets  # the last known offsets
         self._commands = ModuleCommands()
-        self._measured: tuple[float, Array | None] = -math.inf, None  # θ, and when it came
-        #: whether the network says which muscles are isolated: until this estimator decides
+        self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
+        #: whether the network determines the isolated muscles, as it does until `isolate` or a
+        #: finding
         self._follows_network = True
 
     @property
@@ -122,25 +125,25 @@ class Estimator:
 
     @property
     def cause(self) -> str:
-        """The latched finding, for people, or ''."""
+        """The latched finding as a text for users, or ''."""
         return self.suspects.cause
 
-    # -- what is set ----------------------------------------------------------------------------
+    # -- settings and services ------------------------------------------------------------------
 
     def configure(self, settings: Detection) -> None:
-        """Use these settings of detection."""
+        """Use these detection settings."""
         self.health.configure(settings)
         self.suspects.settings = settings
 
     def use(self, mae: Mae) -> None:
-        """Use this network and its healthy statistics, without the isolated muscles.
+        """Use another network and its healthy statistics, without the isolated muscles.
 
-        Until this estimator has isolated or found anything, or `keep_isolated` was called, those
-        are the muscles that were isolated when the network was learned. A length calibration
-        begins again: its guess depends on the network.
+        The isolated muscles are those of the network until the first finding or call of `isolate`
+        or `keep_isolated`; from then on they are those of this estimator. A running length
+        calibration starts again, because its estimate depends on the network.
 
         Raises:
-            numpy.linalg.LinAlgError: If its statistics are singular; the network before stays.
+            numpy.linalg.LinAlgError: If its statistics are singular; the previous network stays.
         """
         isolated = mae.isolated if self._follows_network else self.body.isolated
         reduced = mae.without(isolated)
@@ -153,13 +156,13 @@ class Estimator:
             self.calibration = LengthCalibration(self.robot, reduced, self.calibration.posture)
 
     def keep_isolated(self) -> None:
-        """Follow no network any more in which muscles are isolated: from now on we know."""
+        """Stop taking the isolated muscles from networks."""
         self._follows_network = False
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Isolate these muscles (positions in T and l), and restore all others.
+        """Isolate exactly these muscles (indices in T and l), and restore all others.
 
-        A suspect among the others is verified no longer; what was found stays latched.
+        Restoring a suspect ends its verification; the finding stays latched.
         """
         self._follows_network = False
         body = self.body.with_isolated(muscles)
@@ -171,20 +174,20 @@ class Estimator:
         self.health.reset()
 
     def forget_offsets(self) -> None:
-        """Consider the length offsets unknown, until a calibration finds them."""
+        """Consider the length offsets unknown until the next length calibration."""
         self._use_body(self.body.with_offsets(LengthOffsets.unknown(self.robot.muscle_count)))
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
-        """Begin to find the length offsets, while the arm stands in a posture or moves gently.
+        """Start a length calibration, while the arm stands in a posture or moves gently.
 
         Args:
             posture: θ in which the arm stands [rad], (D,); () if it moves gently.
 
         Raises:
-            MusculoskeletalError: If there is no network, or no such posture.
+            MusculoskeletalError: If there is no network, or the posture is not valid.
         """
         if self.mae is None:
-            raise MusculoskeletalError('no checkpoint, and length offsets are found with a network')
+            raise MusculoskeletalError('no checkpoint; a length calibration requires one')
         check_stated_posture(self.robot, posture)
         self._stated_posture = posture
         stated = np.array(posture) if posture else None
@@ -199,15 +202,15 @@ class Estimator:
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
     ) -> None:
-        """Note the target lengths [m] or tensions [N] (M,) sent to the modules."""
+        """Note the target lengths [m] or tensions [N] (M,) sent to the muscle modules."""
         self._commands.note(now, length, tension)
 
     def joints(self, theta: Array, now: float) -> None:
-        """Note measured θ [rad] (D,), which length calibration uses."""
+        """Note measured θ [rad], (D,)."""
         self._measured = now, theta
 
     def reset(self) -> None:
-        """Clear the anomaly: the body is considered healthy as it is.
+        """Clear the anomaly, and consider the body healthy in its present state.
 
         Raises:
             MusculoskeletalError: If the length offsets have been revoked, and joint sensors do not
@@ -221,7 +224,7 @@ class Estimator:
         self._clear(self.suspects.clear(self.body.isolated))
 
     def clock_jumped_back(self) -> None:
-        """Forget what came before; a latched finding stays."""
+        """Forget earlier messages, after a jump of the clock; a latched finding stays."""
         self.sample = None
         self.stream.reset()
         self.health.reset()
@@ -238,20 +241,24 @@ class Estimator:
         return self._take(partial(self.stream.take, message, time, now), now)
 
     def step(self, states: Array, time: float, now: float) -> Output | None:
-        """Take l as it was read [m], T [N] and temperature [°C], (3, M).
+        """Take raw l [m], T [N] and temperature [°C], (3, M).
 
         Returns:
-            The estimate; None without a network, or while nothing is known of the length offsets.
+            The results; None without a network, or before the first estimate of the length offsets.
 
         Raises:
-            RejectionError: If the values are not plausible.
+            RejectionError: If the values are implausible.
         """
         return self._take(partial(self.stream.take_states, states, time, now), now)
 
     def posture_of_marker(self, pose: pin.SE3) -> Array:
-        """Return θ [rad] (D,) that brings the end effector to a pose in the frame of the root link.
+        """Return θ that brings the end effector to a pose [rad], (D,).
 
-        NaN for joints that do not move it.
+        Args:
+            pose: The pose in the frame of the root link.
+
+        Returns:
+            θ, with NaN for joints that do not move the end effector.
 
         Raises:
             MessageError: If the pose is out of reach.
@@ -261,7 +268,7 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Return what /diagnostics shows."""
+        """Return the status for /diagnostics."""
         return status.report(self, now)
 
     def _take(self, take: Callable[[], MuscleSample], now: float) -> Output | None:
@@ -310,7 +317,7 @@ class Estimator:
         )
         return self.output
 
-    # -- what follows ---------------------------------------------------------------------------
+    # -- findings, verification and calibration -------------------------------------------------
 
     def _use_body(self, body: BodyState) -> None:
         if body.offsets.known:
@@ -319,25 +326,26 @@ class Estimator:
         self.stream.use_body(body)
 
     def _measured_theta(self, now: float) -> Array | None:
-        """Return θ [rad] (D,) by joint sensors, if all have reported it with this message."""
-        came, theta = self._measured
-        if theta is None or now - came >= JOINTS_AGE or not np.isfinite(theta).all():
+        """Return θ from joint sensors [rad] (D,), or None unless all have reported just now."""
+        time, theta = self._measured
+        if theta is None or now - time >= JOINTS_AGE or not np.isfinite(theta).all():
             return None
         return theta
 
     def _handle_jump(self, now: float) -> None:
-        """Take that lengths have jumped, where detectors do not see it."""
+        """Handle jumps of lengths while no detector runs."""
         if self.stream.jumps == self._jumps:
             return
         self._jumps = self.stream.jumps
         jumped = tuple(sorted(self.stream.displaced))
-        if self.calibration is not None:  # what it has collected is of other offsets
+        if self.calibration is not None:
+            # Readings before the jump have other offsets.
             self.calibrate_lengths(self._stated_posture)
         elif self.mae is None and self.body.offsets.known and jumped:
             self._handle(finding_of(jumped), now)
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
-        """Take what detectors found, if anything; return whether it is latched now, and new."""
+        """Handle a finding, if there is one; return whether it has just been latched."""
         if finding is None:
             return False
         before = self.suspects.finding
@@ -377,13 +385,13 @@ class Estimator:
     def _calibrate(
         self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
-        """Go on with the length calibration; return the newest guess of the offsets, if any."""
+        """Continue the length calibration; return the newest estimate of the offsets, or None."""
         measured = self._measured_theta(now)
         calibration.step(sample.motor_tension, sample.length_read, dt, measured)
         guess = calibration.offsets
         if guess is None or (calibration.is_standing and not calibration.is_done):
-            return None  # nobody may move a standing arm
-        # A guess is published again only if it has changed: who follows it goes on from there.
+            return None  # the arm has to stand until the calibration ends
+        # Publish the estimate again only after a substantial change.
         difference = np.abs(guess.offset - self.body.offsets.offset).max()
         if guess.known or self.output is None or difference > SHIFTED:
             self._use_body(self.body.with_offsets(guess))

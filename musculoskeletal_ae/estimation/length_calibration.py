@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Length calibration: find by how much every length sensor reads too much after power-on.
+"""Length calibration: determine the offset of every length sensor after power-on.
 
-The offsets are found while the arm moves gently, with or without measured joint angles, or while it
-stands in a stated posture. `length_moments.py` collects the readings, `length_fit.py` has the
-equations, and this file decides when to fit and whether the result can be relied on.
+The arm moves gently, with or without measured joint angles, or it stands in a stated posture.
+`length_moments.py` collects the readings, `length_fit.py` has the equations, and this file decides
+when to fit and whether the result is reliable.
 """
 
 from __future__ import annotations
@@ -18,43 +18,42 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
 
-#: [s] of gentle motion that are enough with measured joint angles and without, and of standing in a
-#: stated posture
+#: duration of a calibration [s]: gentle motion with measured joint angles, gentle motion without
+#: them, and standing in a stated posture
 ENOUGH_WITH_ANGLES, ENOUGH, STANDING = 20.0, 38.0, 1.0
-FIRST, AGAIN = 0.5, 2.0  # [s] until the first guess, and between later ones
-#: [m] median of what is left, and cost of a residual (0.95 if all is noise), beyond which offsets
-#: are wrong. Correct ones leave 0.3 mm and cost 0.2–0.5; those of a wrong posture cost 1.1.
-LARGEST_LEFT, LARGEST_COST = 0.02, 0.75
-#: a moment in so many is independent of the others
-CORRELATED = 10.0
-BEYOND_STOP = 0.01  # share of a joint's range that a stated posture may lie beyond it
-MAD_TO_DEVIATION = 1.48  # standard deviation over median absolute deviation
+FIRST, AGAIN = 0.5, 2.0  # [s] until the first estimate, and between later ones
+#: median residual [m] and cost per residual above which a fit is rejected. Correct offsets have
+#: 0.0003 m and 0.2–0.5, those of a wrong posture cost 1.1, and pure noise costs 0.95.
+LARGEST_RESIDUAL, LARGEST_COST = 0.02, 0.75
+CORRELATED = 10.0  # number of successive moments that carry the information of one
+BEYOND_STOP = 0.01  # share of its range by which a stated joint angle may exceed a limit
+MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
 
 
 class LengthCalibration:
-    """Collects readings and fits the offsets, a little at every message.
+    """Collects readings and fits the offsets, with a small amount of work at every message.
 
     Attributes:
         posture: θ [rad] (D,) in which the arm stands, or None if it moves gently.
-        offsets: The guess so far, known or not; None before the first one.
+        offsets: The newest estimate, known or not; None before the first one.
     """
 
     def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
-        """Begin.
+        """Start a calibration.
 
         Args:
             robot: The nominal body.
-            mae: The network; its isolated muscles do not count.
-            posture: θ [rad] (D,) if the arm stands in a known posture.
+            mae: The network; its isolated muscles are ignored.
+            posture: θ [rad] (D,) if the arm stands in a stated posture, else None.
         """
         self._robot, self._mae, self.posture = robot, mae, posture
         self._fit = LengthFit(robot, mae)
         self._collector = MomentCollector(self._fit.used, robot.joint_count, posture)
         self._since = 0.0  # [s] since the last fit began
-        self._work: tuple[Steps, Moments] | None = None  # the fit that is being made
+        self._work: tuple[Steps, Moments] | None = None  # the running fit
         self._best: Fit | None = None
         self._has_angles = False  # whether joint angles are measured most of the time
-        self._problem = ''  # why the last fit cannot be relied on
+        self._problem = ''  # reason why the last fit is not reliable
         self.offsets: LengthOffsets | None = None
 
     @property
@@ -81,7 +80,7 @@ class LengthCalibration:
 
     @property
     def progress(self) -> str:
-        """How far the calibration is, and what is in its way."""
+        """Progress of the calibration and any problem, as a text for users."""
         how = 'of standing still' if self.is_standing else 'of gentle motion'
         progress = f'{self.time:.0f} of {self.enough:.0f} s {how}'
         problem = self._problem
@@ -94,9 +93,9 @@ class LengthCalibration:
 
         Args:
             tension: T [N], (M,).
-            length: l as it was read [m], (M,).
-            dt: Time since the message before [s].
-            theta: Measured θ [rad], (D,), if there is any.
+            length: Raw l [m], (M,).
+            dt: Time since the previous message [s].
+            theta: Measured θ [rad], (D,), or None.
         """
         has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
         if self.is_done or has_failed:
@@ -130,49 +129,55 @@ class LengthCalibration:
             self._judge(ended.value, moments)
 
     def _judge(self, fit: Fit, moments: Moments) -> None:
-        """Use a fit as the guess; the offsets are known if it rests on enough and explains it."""
+        """Use a fit as the newest estimate, and decide whether the offsets are known by it."""
         muscle_count, used = self._robot.muscle_count, self._fit.used
         expected = self._mae.lengths(fit.theta, moments.tension)
-        # An isolated muscle still gets commands: its offset is known as well as its readings allow.
+        # An isolated muscle still receives commands and needs an offset, however uncertain.
         of_isolated = np.median(moments.read - expected, axis=0)
         of_isolated = np.clip(of_isolated, -FARTHEST, FARTHEST)
         offset = np.where(used, fit.constants[:muscle_count], of_isolated)
-        left = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
+        residual = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
         self._best, self._problem = fit, ''
         deviation = np.full(muscle_count, UNKNOWN)
         if self.time >= self.enough:
-            self._problem = self._problem_of(fit, left)
+            self._problem = self._problem_of(fit, residual)
             if not self._problem:
                 independent = max(1.0, len(fit.theta) / CORRELATED)
-                deviation = MAD_TO_DEVIATION * left / np.sqrt(independent)
-                deviation[~used] = LARGEST_LEFT
+                deviation = MAD_TO_DEVIATION * residual / np.sqrt(independent)
+                deviation[~used] = LARGEST_RESIDUAL
         self.offsets = LengthOffsets(offset, deviation)
 
-    def _problem_of(self, fit: Fit, left: Array) -> str:
-        """Return why a fit cannot be relied on, or ''; `left` [m] is unexplained, (M,)."""
-        if left.max() > LARGEST_LEFT:
-            name = self._robot.muscles[int(left.argmax())]
-            return f'{1e3 * left.max():.1f} mm of {name} are left unexplained'
+    def _problem_of(self, fit: Fit, residual: Array) -> str:
+        """Return why a fit is not reliable, or ''; `residual` is that of l [m], (M,)."""
+        if residual.max() > LARGEST_RESIDUAL:
+            name = self._robot.muscles[int(residual.argmax())]
+            limit = 1e3 * LARGEST_RESIDUAL
+            return f'{name} has a residual of {1e3 * residual.max():.1f} mm, limit {limit:g} mm'
         cost = self._fit.cost_per_residual(fit)
-        if not cost <= LARGEST_COST:  # another posture may look alike
-            return f'lengths and tensions do not agree: {cost:.2f} of {LARGEST_COST:g}'
+        if not cost <= LARGEST_COST:  # the fit may have found a similar, wrong posture
+            problem = 'lengths and tensions do not agree with one posture'
+            return f'{problem}: cost {cost:.2f}, limit {LARGEST_COST:g}'
         return ''
 
 
 def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
-    """Check that an arm can stand in θ [rad] (D,); () is legal and means no posture.
+    """Check a stated posture.
+
+    Args:
+        robot: The nominal body.
+        posture: θ [rad], (D,); () means no posture and is legal.
 
     Raises:
-        MusculoskeletalError: With the legal range of every joint.
+        MusculoskeletalError: If it is outside the joint limits; names the legal ranges.
     """
     if not posture:
         return
     theta = np.array(posture)
-    # A joint that rests on its stop reads a little beyond it.
+    # The measured angle of a joint at its stop may slightly exceed the limit.
     beyond = BEYOND_STOP * (robot.upper - robot.lower)
     low, high = robot.lower - beyond, robot.upper + beyond
     if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
         return
     limits = zip(robot.units, robot.lower, robot.upper, strict=True)
     legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
-    raise MusculoskeletalError(f'{list(posture)}; legal: none, or {legal}')
+    raise MusculoskeletalError(f'posture {list(posture)}; legal: an empty list, or {legal}')

@@ -4,15 +4,15 @@
     l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
     0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more while the arm moves slowly
 
-Where the angles were measured, o is the mean of what the first line leaves. Otherwise o and the
-postures of all moments are found together, by maximum likelihood with Student's noise; l and G are
-those of the network (①). Muscles outnumber joints, and G changes from posture to posture. Therefore
-only one o explains all moments while the arm wanders. The weight of the arm determines its posture
-before the lengths do, even from a single moment.
+l and G are those of the network (①). If the joint angles were measured, o is the mean residual of
+the first line. Otherwise o and the postures of all moments are estimated together, by maximum
+likelihood with noise of Student's distribution. Because muscles outnumber joints and G changes with
+the posture, only one o explains all moments of a moving arm. The weight of the arm already
+restricts its posture at the first moment, when the lengths do not yet.
 
 The fit is a damped Gauss–Newton method that eliminates the postures. It starts from the best of
-many random first postures. Constants that are estimated besides o: the friction μ of every tendon,
-the offset of every tension sensor, and the Coulomb friction torque of every joint.
+many random first postures. Besides o it estimates the friction μ of every tendon, the offset of
+every tension sensor, and the Coulomb friction torque of every joint.
 """
 
 from __future__ import annotations
@@ -27,41 +27,42 @@ from musculoskeletal_ae.estimation.length_moments import Moments
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-# Where a joint slides, [rad] below are times RACK [m], and [N·m] are over RACK [N].
+# For prismatic joints, [rad] below are multiplied by RACK [m], and [N·m] divided by it.
 
-# What the residuals weigh: standard deviations.
-LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, beyond friction
-WORST = 0.3, 5.0  # times LENGTH_NOISE, of the muscles that a network restores best and worst
+# Standard deviations of the residuals.
+LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, without friction
+WORST = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
 OUTSIDE = 0.05  # [rad] beyond the joint limits
-ISOLATED = 1e-6  # weight of an isolated muscle's length beside that of others
-FREEDOM = 4.0  # of the Student distribution
-AT_STOP = 0.03  # [rad] from a joint limit, where the stop may carry torque
+ISOLATED = 1e-6  # weight of an isolated muscle's length relative to the others
+FREEDOM = 4.0  # degrees of freedom of the Student distribution
+AT_STOP = 0.03  # [rad] from a joint limit, within which the stop may carry torque
 
-# What is known of the constants before: mean and standard deviation, or the latter alone.
+# Prior of the constants: the standard deviation. The mean is 0 except for FRICTION.
 OFFSET = 0.1  # [m] of a length
-FRICTION = 0.05  # μ of a tendon; mean and standard deviation
+FRICTION = 0.05  # μ of a tendon: both mean and standard deviation
 TENSION_OFFSET = 1.5  # [N] of a tension sensor; covers the error of its gain
-JOINT_FRICTION = 0.03  # Coulomb torque of a joint over the largest that the weight needs
-STICKING = 0.003  # [rad] after a reversal, in which the friction of a joint changes sign
-LEAST_WEIGHT = 0.1  # of what T_bias exerts at the joints: the least that the weight counts for
+JOINT_FRICTION = 0.03  # Coulomb torque of a joint over the largest torque of the weight
+STICKING = 0.003  # [rad] after a reversal, over which the friction of a joint changes sign
+LEAST_WEIGHT = 0.1  # smallest torque of the weight that is assumed, over that of T_bias
 
-# The search for a start: random postures, and those that are tried, listed and pursued.
+# The search for a start: numbers of random postures that are drawn, fitted coarsely to the
+# lengths, compared by torque as well, and refined.
 DRAWN, TRIED, LISTED, PURSUED = 3200, 400, 30, 6
-FEW_MOMENTS = 24  # by which random postures are compared
-BATCH = 20  # postures that are tried at one message
-COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: standard deviations in that comparison
-FARTHEST = 0.3  # [m] of an offset; [rad] of one step of an angle
+FEW_MOMENTS = 24  # moments in that search
+BATCH = 20  # postures that are fitted during one message
+COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: standard deviations in that search
+FARTHEST = 0.3  # largest offset [m], and largest step of an angle [rad]
 
-ROUNDS, FIRST_ROUNDS = 20, 6  # Gauss–Newton steps at most
+ROUNDS, FIRST_ROUNDS = 20, 6  # largest numbers of Gauss–Newton steps
 STEP = 1e-3  # of numerical derivatives
 LARGEST_DAMPING = 1e4
 
 
 class Fit(NamedTuple):
-    """What explains K moments.
+    """A fit to K moments.
 
     Attributes:
-        cost: Negative logarithm of the posterior, up to a constant; less is better.
+        cost: Negative logarithm of the posterior, up to a constant.
         constants: o [m], μ of the tendons, offsets of the tension sensors [N], Coulomb torques of
             the joints [N·m], (3M + D,).
         theta: Postures [rad], (K, D).
@@ -72,14 +73,14 @@ class Fit(NamedTuple):
     theta: Array
 
 
-Steps = Generator[None, None, Fit]  # yields between short pieces of work, and returns a fit
+Steps = Generator[None, None, Fit]  # yields after each short piece of work, and returns a fit
 
 
 class LengthFit:
     """Fits length offsets with one network.
 
     Attributes:
-        used: Which muscles are not isolated, (M,).
+        used: Whether each muscle is used, that is, not isolated, (M,).
     """
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
@@ -91,7 +92,7 @@ class LengthFit:
         postures = robot.random_postures(64, self._rng)
         weight = np.abs(radian * robot.kinematics.weight_torque(postures)).max()
         moment_arms = np.abs(radian * robot.routes.muscle_jacobian(postures))
-        # Joints rub even if they carry no weight, as joints with upright axes.
+        # Joints with a vertical axis have friction although they carry no weight.
         by_bias = (robot.description.tension.bias @ moment_arms).max()
         weight = max(weight, LEAST_WEIGHT * by_bias)
         counts = muscle_count, muscle_count, muscle_count, joint_count
@@ -107,31 +108,36 @@ class LengthFit:
 
     def known_angles(self, moments: Moments) -> Fit:
         """Fit moments whose angles were measured."""
-        left = moments.length - self._mae.lengths(moments.theta, moments.tension)
+        residual = moments.length - self._mae.lengths(moments.theta, moments.tension)
         muscle_count = self._robot.muscle_count
-        constants = np.concatenate([left.mean(axis=0), self._prior_mean[muscle_count:]])
+        constants = np.concatenate([residual.mean(axis=0), self._prior_mean[muscle_count:]])
         return Fit(0.0, constants, moments.theta)
 
     def unknown_angles(self, moments: Moments, before: Fit | None) -> Steps:
-        """Fit moments whose angles were not measured, beginning also from an earlier fit."""
+        """Fit moments whose angles were not measured.
+
+        Args:
+            moments: The moments.
+            before: An earlier fit, from which the search also starts, or None.
+        """
         rows = np.unique(np.linspace(0, len(moments.length) - 1, FEW_MOMENTS).astype(np.int64))
         few = moments.rows(rows)
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
-        # Few moments may be wrong. All of them choose between the newest guess and the last fit.
+        # A few moments may mislead. All of them decide between the new start and the earlier fit.
         candidates = [likeliest.constants]
         if before is not None:
             candidates.append(before.constants)
         return (yield from self._best(candidates, moments, ROUNDS))
 
     def cost_per_residual(self, fit: Fit) -> float:
-        """Return the cost of a fit over the number of its residuals of length and torque."""
+        """Return the cost of a fit divided by its number of residuals of length and torque."""
         return fit.cost / (len(fit.theta) * (len(self._noise) - self._robot.joint_count))
 
-    # -- where to begin -------------------------------------------------------------------------
+    # -- search for a start ---------------------------------------------------------------------
 
     def _best(self, guesses: list[Array], moments: Moments, rounds: int) -> Steps:
-        """Return the best of the fits near each guess of the constants."""
+        """Refine each guess of the constants, and return the best fit."""
         fits = list[Fit]()
         for constants in guesses:
             length = moments.length - constants[: self._robot.muscle_count]
@@ -141,10 +147,10 @@ class LengthFit:
         return min(fits, key=lambda fit: fit.cost)
 
     def _guesses(self, moments: Moments, few: Moments) -> Generator[None, None, list[Array]]:
-        """Return constants with the offsets of the likeliest of many random first postures."""
+        """Return the constants that the likeliest of many random first postures imply."""
         mae = self._mae
         tension = np.tile(moments.tension[0], (TRIED, 1))
-        # Before the lengths say anything, the weight excludes most postures.
+        # The balance of torques excludes most postures before any offset is known.
         drawn, unbalanced = list[Array](), list[Array]()
         for _ in range(DRAWN // TRIED):
             drawn.append(self._robot.random_postures(TRIED, self._rng))
@@ -161,10 +167,10 @@ class LengthFit:
             length = few.length - offset[n : n + BATCH, None]
             tension = np.broadcast_to(few.tension, length.shape)
             theta = mae.estimate(tension, length).theta
-            left = self.used * (length - mae.lengths(theta, tension))
-            parts = left / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
-            counted = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
-            cost[n : n + BATCH] = np.sum(counted, axis=0)
+            residual = self.used * (length - mae.lengths(theta, tension))
+            parts = residual / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
+            costs = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
+            cost[n : n + BATCH] = np.sum(costs, axis=0)
             postures.extend(theta)
             yield
         order = np.argsort(cost)[:LISTED]
@@ -176,13 +182,13 @@ class LengthFit:
         others = self._prior_mean[self._robot.muscle_count :]
         return [np.concatenate([offset[n], others]) for n in best]
 
-    # -- what is left ---------------------------------------------------------------------------
+    # -- residuals ------------------------------------------------------------------------------
 
     def _outside(self, theta: Array) -> Array:
         return theta - np.clip(theta, self._robot.lower, self._robot.upper)
 
     def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return the torque that is not balanced [N·m] (K, D), and G (K, M, D)."""
+        """Return the unbalanced torque [N·m], (K, D), and G [m/rad], (K, M, D)."""
         jacobian = self._mae.muscle_jacobian(theta, tension)
         by_muscles = np.einsum('kmd,km->kd', jacobian, tension)
         return self._robot.kinematics.holding_torque(theta) + by_muscles, jacobian
@@ -190,14 +196,17 @@ class LengthFit:
     def _residuals(
         self, fit: Fit, moments: Moments, turning: Array, derivatives: bool = False
     ) -> tuple[Array, ...]:
-        """Return what is left of lengths, torques and joint limits, over its noise (K, M + 2D).
+        """Return the residuals of lengths, torques and joint limits over their noise.
 
         Args:
             fit: Constants and postures.
             moments: The readings.
-            turning: Which way the joints turned last, (K, D).
-            derivatives: Whether to return the derivatives by θ (K, M + 2D, D) and by the constants
-                (K, M + 2D, 3M + D) as well.
+            turning: Direction in which each joint moved last, (K, D).
+            derivatives: Whether to return the derivatives as well.
+
+        Returns:
+            The residuals, (K, M + 2D), and, if requested, their derivatives with respect to θ,
+            (K, M + 2D, D), and to the constants, (K, M + 2D, 3M + D).
         """
         theta, muscles, joints = fit.theta, self._robot.muscle_count, self._robot.joint_count
         ends = [muscles, 2 * muscles, 3 * muscles]
@@ -207,16 +216,16 @@ class LengthFit:
         length, outside = self._mae.lengths(theta, end), self._outside(theta)
         unbalanced, jacobian = self._torque(theta, pull)
         torque = unbalanced + joint_friction * turning
-        # A stop carries any torque. There, the balance costs as much as a usual residual.
+        # A stop carries any torque, so a joint at its stop has the cost of a typical residual.
         at_stop = AT_STOP * self._radian
         is_free = (self._robot.lower + at_stop < theta) & (theta < self._robot.upper - at_stop)
         torque = np.where(is_free, torque, self._torque_noise)
-        left = [moments.length - offset - length, torque, outside]
-        value = np.concatenate(left, axis=1) / self._noise
+        residuals = [moments.length - offset - length, torque, outside]
+        value = np.concatenate(residuals, axis=1) / self._noise
         if not derivatives:
             return (value,)
-        turned = [self._torque(theta + STEP * row, pull)[0] for row in np.eye(joints)]
-        torque_slope = (np.stack(turned, axis=-1) - unbalanced[..., None]) / STEP
+        shifted = [self._torque(theta + STEP * row, pull)[0] for row in np.eye(joints)]
+        torque_slope = (np.stack(shifted, axis=-1) - unbalanced[..., None]) / STEP
         torque_slope = torque_slope * is_free[..., None]
         outside_slope = (outside != 0.0)[..., None] * np.eye(joints)
         by_theta = np.concatenate([-jacobian, torque_slope, outside_slope], axis=1)
@@ -241,7 +250,7 @@ class LengthFit:
     # -- Gauss–Newton ---------------------------------------------------------------------------
 
     def _refine(self, fit: Fit, moments: Moments, rounds: int) -> Steps:
-        """Return the best fit near one, after so many Gauss–Newton steps at most."""
+        """Refine a fit by at most `rounds` Gauss–Newton steps."""
         joint_eye, constant_eye = np.eye(self._robot.joint_count), np.eye(len(self._prior_mean))
         damping = 1e-3
         turning = _turning(fit.theta, STICKING * self._radian)
@@ -253,7 +262,7 @@ class LengthFit:
             value, by_theta, by_constants = self._residuals(fit, moments, turning, derivatives=True)
             weight = (FREEDOM + 1.0) / (FREEDOM + value**2)
             weight[:, -len(joint_eye) :] = 1.0
-            # Normal equations: of θ for each moment, of the constants, and between the two.
+            # Blocks of the normal equations: θ of each moment, the constants, and the cross terms.
             weighted = weight[..., None] * by_theta
             theta_normal = np.swapaxes(by_theta, 1, 2) @ weighted
             theta_gradient = np.einsum('krd,kr->kd', weighted, value)
@@ -274,25 +283,27 @@ class LengthFit:
                 shift = -np.linalg.solve(reduced, gradient - eliminated)
                 turn = theta_gradient + np.einsum('kpd,p->kd', cross, shift)
                 turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -farthest, farthest)
-                tried = Fit(np.inf, fit.constants + shift, fit.theta + turn)
-                (value,) = self._residuals(tried, moments, turning)
-                cost = self._cost(value, tried.constants)
+                candidate = Fit(np.inf, fit.constants + shift, fit.theta + turn)
+                (value,) = self._residuals(candidate, moments, turning)
+                cost = self._cost(value, candidate.constants)
                 if cost < before:
                     break
                 damping *= 5.0
                 yield
             else:
                 break
-            fit, damping = tried._replace(cost=cost), max(0.2 * damping, 1e-6)
+            fit, damping = candidate._replace(cost=cost), max(0.2 * damping, 1e-6)
             if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
                 break
         return fit
 
 
 def _turning(theta: Array, sticking: Array) -> Array:
-    """Return which way each joint turned last, in [−1, 1], for K consecutive postures (K, D).
+    """Return the direction in which each joint moved last, in [−1, 1], (K, D).
 
-    Its friction changes sign over `sticking` [rad] (D,).
+    Args:
+        theta: K consecutive postures [rad], (K, D).
+        sticking: Motion after a reversal over which the direction changes its sign [rad], (D,).
     """
     result, reference = np.zeros_like(theta), theta[0].copy()
     for k, posture in enumerate(theta):
@@ -302,10 +313,11 @@ def _turning(theta: Array, sticking: Array) -> Array:
 
 
 def _relative_error(mae: Mae) -> Array:
-    """Return how much worse than the median muscle the network restores each muscle, (M,).
+    """Return the variance of each muscle's length residual relative to the median one, (M,).
 
-    The error of a network is the same in neighbouring postures. Therefore a muscle that ② restores
-    badly pulls the offsets of all others along, and its weight falls with the square of its error.
+    The errors of a network in neighbouring postures are correlated, so a muscle with large errors
+    would bias the offsets of all others. The weights therefore use the variance where independent
+    errors would require the standard deviation.
     """
     if mae.anomaly is None:
         return np.ones(len(mae.muscles))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collect the readings that length calibration rests on: means of short windows, called moments.
+"""Collect the readings for a length calibration: means over short windows, called moments.
 
-Tendon friction lengthens and shortens by turns. Therefore the moments have to cover many postures,
-which are reached from different sides. Only moments at which the arm has moved on count.
+Tendon friction changes its sign with the direction of motion. The moments therefore have to cover
+many postures, reached from different sides. A moment counts only if the arm has moved since the
+previous one.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-WINDOW = 0.25  # [s] that one moment averages
-MOVED = 0.002  # [m] of some muscle since the moment before, beyond which the arm has moved on
-FASTEST = 0.05  # [m/s] of a muscle, above which inertia is no longer small beside the weight
-MOST = 240  # moments that are kept
+WINDOW = 0.25  # [s] over which one moment averages
+MOVED = 0.002  # [m] change of a muscle's length above which the arm has moved
+FASTEST = 0.05  # [m/s] speed of a muscle above which inertial forces are not negligible
+MOST = 240  # largest number of moments kept
 
 
 class Moments(NamedTuple):
@@ -25,10 +26,10 @@ class Moments(NamedTuple):
 
     Attributes:
         tension: T [N], (K, M).
-        length: l as it was read [m], (K, M); 0 for isolated muscles.
-        sliding: s of every tendon's friction: 1 wound in last, −1 paid out last, (K, M).
-        read: l of all muscles as it was read, also of isolated ones [m], (K, M).
-        theta: Measured θ [rad], (K, D); NaN where it was not measured.
+        length: Raw l [m], 0 for isolated muscles, (K, M).
+        sliding: Direction s in which each tendon slid last: 1 wound in, −1 paid out, (K, M).
+        read: Raw l of all muscles, including isolated ones [m], (K, M).
+        theta: Measured θ [rad], NaN where it was not measured, (K, D).
     """
 
     tension: Array
@@ -38,7 +39,7 @@ class Moments(NamedTuple):
     theta: Array
 
     def rows(self, rows: Ints) -> Moments:
-        """Return some of the moments."""
+        """Return the moments with these indices."""
         return Moments(*(part[rows] for part in self))
 
 
@@ -46,26 +47,26 @@ class MomentCollector:
     """Collects the moments of an arm that moves gently, or that stands in a stated posture.
 
     Attributes:
-        time: How long the arm has moved gently, or stood [s].
-        has_moved_away: Whether an arm that was to stand has moved.
+        time: Duration of the gentle motion, or of standing [s].
+        has_moved_away: Whether an arm that should stand has moved.
     """
 
     def __init__(self, used: Bools, joint_count: int, posture: Array | None) -> None:
-        """Collect.
+        """Start without moments.
 
         Args:
-            used: Which muscles are not isolated, (M,).
-            joint_count: D.
+            used: Whether each muscle is used, that is, not isolated, (M,).
+            joint_count: Number of joints D.
             posture: θ [rad] (D,) in which the arm stands, or None if it moves.
         """
         self._used, self._posture = used, posture
         self._no_angles = np.full(joint_count, np.nan)
         self._direction = FrictionDirection()
-        self._window: list[tuple[Array, ...]] = []  # T, l, s and l as it was read
-        self._angles: list[Array] = []  # θ in the same window, where it was measured
-        self._span = 0.0  # [s] of the window so far
+        self._window: list[tuple[Array, ...]] = []  # T, l, s and raw l of each message
+        self._angles: list[Array] = []  # measured θ in the same window
+        self._span = 0.0  # [s] duration of the window so far
         self._moments: list[tuple[Array, ...]] = []
-        self._last_length: Array = np.zeros(len(used))  # of the last moment at which it had moved
+        self._last_length: Array = np.zeros(len(used))  # l when the arm had moved last [m]
         self.time = 0.0
         self.has_moved_away = False
 
@@ -73,11 +74,18 @@ class MomentCollector:
         return len(self._moments)
 
     def moments(self) -> Moments:
-        """Return all moments that are kept."""
+        """Return all moments."""
         return Moments(*map(np.array, zip(*self._moments)))
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None) -> None:
-        """Take T [N] and l as it was read [m], (M,), dt [s] after the last, and θ if measured."""
+        """Take the readings of one message.
+
+        Args:
+            tension: T [N], (M,).
+            length: Raw l [m], (M,).
+            dt: Time since the previous message [s].
+            theta: Measured θ [rad], (D,), or None.
+        """
         used_length = length * self._used
         sliding = self._direction.step(used_length)
         self._window.append((tension * self._used, used_length, sliding, length))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint angles from the pose of a marker at the end effector, as a camera reports it."""
+"""Compute joint angles from the pose of a marker at the end effector, reported by a camera."""
 
 import pinocchio as pin
 
@@ -8,18 +8,21 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: A pose that the arm cannot reach to within these is that of another marker, or of a camera whose
-#: calibration is wrong.
-MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3  # [m], [rad]
+#: Largest errors of position and orientation [m], [rad]. With larger ones, the pose is that of
+#: another marker, or the camera is not calibrated.
+MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3
 
 
 def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
-    """Return θ that brings the end effector to a pose, NaN for joints that do not move it.
+    """Return θ that brings the end effector to a pose [rad], (D,).
 
     Args:
         robot: The nominal body.
-        pose: In the frame of the root link.
-        start: θ where the search begins [rad], (D,).
+        pose: Pose in the frame of the root link.
+        start: θ at which the search starts [rad], (D,).
+
+    Returns:
+        θ, with NaN for joints that do not move the end effector.
 
     Raises:
         MessageError: If the pose is out of reach.
@@ -27,6 +30,8 @@ def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
     posture = inverse_kinematics(robot, pose, start)
     if posture.distance > MARKER_DISTANCE or posture.angle > MARKER_ANGLE:
         raise MessageError(
-            'out of reach', f'{posture.distance:.3f} m and {posture.angle:.2f} rad are left'
+            'out of reach',
+            f'the nearest posture is {posture.distance:.3f} m and {posture.angle:.2f} rad away; '
+            f'legal: at most {MARKER_DISTANCE:g} m and {MARKER_ANGLE:g} rad',
         )
     return posture.observed_theta

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-SILENCE = 1.0  # time without a message after which the status is a warning [s]
+SILENCE = 1.0  # [s] without a message, after which the status is a warning
 
 
 def report(core: Estimator, now: float) -> Report:
@@ -42,19 +42,19 @@ def report(core: Estimator, now: float) -> Report:
         return Report('warn', 'no muscle_states', {**values, 'state': 'no_muscle_states'})
     if core.calibration is not None:
         progress = core.calibration.progress
-        text = f'finding the length zeros: {progress}'
+        text = f'calibrating the lengths: {progress}'
         return Report('warn', text, {**values, 'state': 'calibrating'})
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:
-        drifting = (
-            f'{core.robot.muscles[muscle]}: its module {how}'
-            for muscle, how in core.heat.changed.items()
+        changes = (
+            f'{core.robot.muscles[muscle]}: its module {change}'
+            for muscle, change in core.heat.changed.items()
         )
-        text = f'anomaly of a cool muscle: {"; ".join(drifting)}'
+        text = f'thermal drift of a cool module: {"; ".join(changes)}'
         return Report('warn', text, {**values, 'state': 'thermal_drift'})
     if core.body.isolated:
-        without = core.robot.names(core.body.isolated)
-        text = f'estimating{calibrated} without {without}'
+        isolated = core.robot.names(core.body.isolated)
+        text = f'estimating{calibrated} without {isolated}'
         return Report('warn', text, {**values, 'state': 'isolated'})
     return Report('ok', f'estimating{calibrated}', {**values, 'state': 'estimating'})
 
@@ -115,12 +115,12 @@ def _offsets(core: Estimator) -> dict[str, str]:
     offsets, values = core.body.offsets, dict[str, str]()
     if not offsets.known:
         unknown = np.flatnonzero(~(offsets.deviation < KNOWN))
-        values['unknown length zeros'] = core.robot.names(unknown)
+        values['unknown length offsets'] = core.robot.names(unknown)
     if not offsets.offset.any():
         return values
     rows = zip(core.robot.muscles, 1e3 * offsets.offset, 1e3 * offsets.deviation)
     each = (f'{name} {offset:.1f} ± {deviation:.1f} mm' for name, offset, deviation in rows)
-    return {**values, 'length zeros': ', '.join(each)}
+    return {**values, 'length offsets': ', '.join(each)}
 
 
 def _familiarity(core: Estimator) -> dict[str, str]:

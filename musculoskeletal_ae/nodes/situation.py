@@ -238,9 +238,9 @@ class Situation:
         values, parts = self._values('estimator'), []
         if isolated := values.get('isolated muscles'):
             parts.append(f'isolated: {isolated}')
-        zeros = 'unknown length zeros'
+        zeros = 'unknown length offsets'
         if unknown := values.get(zeros) or self._values('controller').get(zeros):
-            parts.append(_with_remedy(f'length zeros unknown: {unknown}', ZERO))
+            parts.append(_with_remedy(f'length offsets unknown: {unknown}', ZERO))
         return parts
 
     @property

@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.estimation import length_calibration
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.length_calibration import LARGEST_LEFT, LengthCalibration
+from musculoskeletal_ae.estimation.length_calibration import LARGEST_RESIDUAL, LengthCalibration
 from musculoskeletal_ae.estimation.length_moments import WINDOW
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
@@ -121,7 +121,7 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
         if n > 200:
             tension = tension * (np.arange(6) != 2)
         elif n == 200:
-            assert 'finding the length zeros' in str(estimator.report(now))
+            assert 'calibrating the lengths' in str(estimator.report(now))
         estimate = estimator.step(states(tension, length + OFFSET), now, now)
         detected += [n] * bool(estimate is not None and estimate.detected)
     assert detected and detected[0] > 240 and estimator.cause.startswith(robot.muscles[2])
@@ -151,7 +151,7 @@ def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
     found = run(calibration, lambda _: (theta, *standing), 2.0, sees=False)
     assert found.is_done
     off = np.abs(found.offsets.offset - OFFSET)
-    assert off[3] < found.offsets.deviation[3] == LARGEST_LEFT
+    assert off[3] < found.offsets.deviation[3] == LARGEST_RESIDUAL
     assert np.delete(off, 3).max() < 1e-3
 
 
@@ -172,14 +172,14 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
         _, tension, length = moment(0.01 * n)
         estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
     reported = str(estimator.report(4.0))
-    assert re.search('finding the length zeros: [1-4] of', reported)
+    assert re.search('calibrating the lengths: [1-4] of', reported)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == reported
     estimator.use(mae)  # another network, for all it knows
-    assert 'finding the length zeros: 0 of' in str(estimator.report(4.0))
+    assert 'calibrating the lengths: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):
         _, tension, length = moment(0.01 * n)
         estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
-    assert re.search('finding the length zeros: [1-4] of', str(estimator.report(8.0)))
+    assert re.search('calibrating the lengths: [1-4] of', str(estimator.report(8.0)))
     estimator.isolate((3,))
-    assert 'finding the length zeros: 0 of' in str(estimator.report(8.0))
+    assert 'calibrating the lengths: 0 of' in str(estimator.report(8.0))

@@ -202,15 +202,15 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
     situation = Situation('')
     situation.diagnosed(said('/sim', 'slow', DiagnosticStatus.WARN))
     assert (situation.level(), situation.trouble()) == ('warn', 'warning: /sim: slow')
-    body = {'state': 'isolated', 'isolated_muscles': 'biceps', 'unknown_length_zeros': 'triceps'}
+    body = {'state': 'isolated', 'isolated_muscles': 'biceps', 'unknown_length_offsets': 'triceps'}
     situation.diagnosed(said('/estimator', 'estimating', DiagnosticStatus.WARN, **body))
     assert situation.trouble() == (
-        'isolated: biceps, length zeros unknown: triceps (to go on: call estimator/zero), '
+        'isolated: biceps, length offsets unknown: triceps (to go on: call estimator/zero), '
         'warning: /sim: slow'
     )
     situation.diagnosed(said('/estimator', finding='none', state='estimating'))
-    situation.diagnosed(said('/controller', mode='idle', unknown_length_zeros='triceps'))
-    assert situation.trouble().startswith('length zeros unknown: triceps (to go on: ')
+    situation.diagnosed(said('/controller', mode='idle', unknown_length_offsets='triceps'))
+    assert situation.trouble().startswith('length offsets unknown: triceps (to go on: ')
     situation.diagnosed(said('/controller', mode='idle'))
     several = {'several_publishers': 'joint_states come from a and b', 'finding': 'none'}
     situation.diagnosed(said('/estimator', 'two', DiagnosticStatus.ERROR, **several))

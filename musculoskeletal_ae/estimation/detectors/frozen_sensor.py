@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a sensor that reads exactly the same while the other muscles show that its muscle moves.
+"""Detect a sensor whose reading stays exactly the same while its muscle moves.
 
-Such a sensor is broken, however little that disturbs the estimate. A sensor that works is noisy.
+A working sensor has noise, so such a sensor is faulty even if the estimate is hardly disturbed. The
+other muscles show whether the muscle moves.
 """
 
 import numpy as np
@@ -13,30 +14,30 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
 FROZEN_TIME = 1.0  # [s] of identical readings
-MOVED = 0.006  # [m] that the muscle moves by meanwhile, according to the others
+MOVED = 0.006  # [m] by which the muscle moves meanwhile, according to the other muscles
 
 
 class FrozenSensor(Detector):
-    """Compares the length that the other muscles make likely with a sensor that does not change."""
+    """Predicts the length of a muscle with a constant reading from the other muscles."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
         self._mae: Mae | None = None
-        self._last: Array | None = None  # l and T as they were read last, (2, M)
+        self._last: Array | None = None  # last readings of l and T, (2, M)
         self._unchanged_time: Array = np.zeros((2, robot.muscle_count))  # [s] of l and of T
-        self._reduced_mae: Mae | None = None  # without the muscle that is watched
-        self._shortest, self._longest = np.inf, -np.inf  # likely lengths of that muscle [m]
+        self._reduced_mae: Mae | None = None  # without the observed muscle
+        self._shortest, self._longest = np.inf, -np.inf  # predicted lengths of that muscle [m]
 
     def use(self, mae: Mae) -> None:
         """Use this network."""
         self._mae, self._robot = mae, self._complete_robot.without(mae.isolated)
-        self._watch_nobody()
+        self._stop_observing()
 
     def reset(self) -> None:
-        """Begin to measure times again."""
+        """Restart the measurement of times."""
         self._last = None
         self._unchanged_time[:] = 0.0
-        self._watch_nobody()
+        self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
@@ -48,11 +49,10 @@ class FrozenSensor(Detector):
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same
         is_calibrated = mae is not None and mae.anomaly is not None and mae.anomaly.calibrated
         if self._unchanged_time.max() < FROZEN_TIME or not is_calibrated:
-            self._watch_nobody()
+            self._stop_observing()
             return None
         assert mae is not None
-        # Slack tendons have a rule of their own. A module that is paid out may report T_bias
-        # exactly.
+        # `slack_tendon.py` handles slack tendons. A simple module may report T_bias exactly.
         slack = LIMITS.slack_share * robot.tension.bias
         by_length, by_tension = self._unchanged_time
         differs_from_bias = np.abs(tension - robot.tension.bias) > slack
@@ -60,20 +60,21 @@ class FrozenSensor(Detector):
         time = time * (robot.used & (tension > slack))
         muscle = int(time.argmax())
         if time[muscle] < FROZEN_TIME or not observation.lengths_known:
-            self._watch_nobody()
+            self._stop_observing()
             return None
         isolated = tuple(sorted((*robot.isolated, muscle)))
         if self._reduced_mae is None or self._reduced_mae.isolated != isolated:
-            self._watch_nobody()
+            self._stop_observing()
             self._reduced_mae = mae.without(isolated)
         theta = self._reduced_mae.estimate(sample.bone_tension, sample.length).theta
         pull = np.minimum(sample.bone_tension, robot.tension.limit)
-        likely = float(self._reduced_mae.lengths(theta, pull)[muscle])
-        self._shortest, self._longest = min(likely, self._shortest), max(likely, self._longest)
+        predicted = float(self._reduced_mae.lengths(theta, pull)[muscle])
+        self._shortest = min(predicted, self._shortest)
+        self._longest = max(predicted, self._longest)
         if self._longest - self._shortest <= MOVED:
             return None
         return Finding(muscle, Kind.SENSOR_FROZEN, 'a sensor is frozen while the arm moves')
 
-    def _watch_nobody(self) -> None:
+    def _stop_observing(self) -> None:
         self._reduced_mae = None
         self._shortest, self._longest = np.inf, -np.inf

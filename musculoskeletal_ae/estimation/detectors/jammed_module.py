@@ -3,7 +3,7 @@
 
     |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
 
-The readings of a jammed module may agree with a posture. Therefore the residuals need not show it.
+The readings of a jammed module may be consistent with a posture, so residuals may not reveal it.
 """
 
 import numpy as np
@@ -13,25 +13,25 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Obser
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-STANDS = 0.001  # [m] that the winch moves by at most
+STANDS = 0.001  # [m] motion below which the winch counts as stationary
 JAM_TIME = 1.0  # [s]
-JAM, JAM_SHARE = 50.0, 0.3  # [N], and as a share of T_ref, since tension sensors differ in gain
+JAM, JAM_SHARE = 50.0, 0.3  # [N], and as a share of T_ref because the gain of sensors varies
 
 
 class JammedModule(Detector):
-    """Measures for how long each winch has stood although it should have moved."""
+    """Measures how long each winch has been stationary although it should move."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
         self._time: Array = np.zeros(robot.muscle_count)  # [s]
-        self._length: Array = np.zeros(robot.muscle_count)  # where the winch stands [m]
+        self._length: Array = np.zeros(robot.muscle_count)  # l when the winch moved last [m]
 
     def use(self, mae: Mae) -> None:
-        """Judge the muscles that are not isolated in this network."""
+        """Monitor the muscles that are not isolated in this network."""
         self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
-        """Begin to measure times again."""
+        """Restart the measurement of times."""
         self._time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
@@ -53,4 +53,4 @@ class JammedModule(Detector):
         if self._time.max() < JAM_TIME or not observation.lengths_known:
             return None
         muscle = int(self._time.argmax())
-        return Finding(muscle, Kind.JAMMED_MODULE, 'its winch stands, whatever is commanded')
+        return Finding(muscle, Kind.JAMMED_MODULE, 'its winch does not follow the commands')

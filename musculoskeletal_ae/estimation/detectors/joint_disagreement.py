@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect that lengths and joint sensors no longer tell the same posture.
+"""Detect that muscle lengths and joint sensors indicate different postures.
 
-    g = l − ①(θ, T_end),   θ by joint sensors; g is the median of SPAN seconds
-    Δ = g − what g usually is
+    g = l − ①(θ, T_end),   θ from joint sensors; g is the median over COUNT · SPACING seconds
+    Δ = g − g_usual,       g_usual: median of g in healthy messages
 
-Where all joints are measured, g says of every single muscle by how much its length is off. On a
-healthy arm g is small, and changes little from posture to posture. Lengths of modules that lost
-their count change it by as much as they are off, whether they jump or drift.
+If all joints are measured, g is the error of every muscle's length. On a healthy arm it is small
+and changes little with the posture. When a module loses its length offset, by a jump or a drift,
+g changes by the same amount.
 
-A joint sensor that is off changes g as well, but only as another posture would: Δ = −G δθ. Muscles
-outnumber joints, and lengths that are off by chance are no other posture. Therefore whoever is
-outvoted is not believed: if a δθ explains most of Δ, the lengths agree with each other and with the
-network, and the joint sensor with the largest δθ is named. If not, the lengths are wrong.
+A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ. Because
+muscles outnumber joints, arbitrary errors of lengths rarely have this form. If a δθ explains most
+of Δ, the joint sensor with the largest δθ is reported; otherwise the lengths are.
 """
 
 from collections import deque
@@ -25,37 +24,37 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-SPACING, COUNT = 0.1, 10  # [s] between values of g, and values that its median spans
-LASTING = 1.0  # [s] for which Δ has to be too large
+SPACING, COUNT = 0.1, 10  # [s] between values of g, and number of values in its median
+LASTING = 1.0  # [s] for which Δ has to exceed its limits
 
 
 class Largest(NamedTuple):
-    """What is too large of Δ, or of g itself while it is unknown what is usual."""
+    """Limits of Δ, or of g itself while g_usual is unknown."""
 
     single: float  # of one muscle [m]
     all: float  # root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return by what share a change [m] (M,) is beyond that."""
+        """Return a change [m] (M,) relative to the limits; above 1 it exceeds one of them."""
         size = float(np.sqrt(np.square(change[used]).mean())) if used.any() else 0.0
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
 
-# Healthy arms of Musashi, half of them `foreign`, exploring, some with 3.6 kg and pushed: networks
-# of the geometric model changed by 0.036 m and 0.019 m from posture to posture, and were 0.051 m
-# and 0.029 m off; those that had learned for 20 to 60 s changed by 0.032 m and 0.013 m.
+# Measured on healthy exploring Musashi arms, half of them of emulator model `foreign`, some with a
+# load of 3.6 kg and pushed. With initial networks, Δ reached 0.036 m and 0.019 m, and g 0.051 m and
+# 0.029 m; with networks that had learned for 20 to 60 s, Δ reached 0.032 m and 0.013 m.
 CHANGE_YOUNG, GAP_YOUNG = Largest(0.06, 0.028), Largest(0.08, 0.045)
-# By networks that have learned the arm for long enough to calibrate the detector of the residual:
-# both were 0.013 m and 0.006 m at most. One muscle that is 0.05 m off is found in every posture.
+# With networks whose detector of the residual is calibrated, both reached 0.013 m and 0.006 m. An
+# error of 0.05 m of a single muscle is detected in every posture.
 CHANGE_LEARNED, GAP_LEARNED = Largest(0.035, 0.016), Largest(0.035, 0.016)
-#: [s] between healthy messages that tell what g usually is, and how many are kept and are enough
+#: [s] between the healthy messages for g_usual, their largest number, and the number required
 HEALTHY_SPACING, HEALTHY_COUNT, ENOUGH = 1.0, 60, 5
-CLEARLY = 0.5  # of what is too large, up to which a message is healthy: what drifts is not usual
-EXPLAINED = 0.5  # share of Δ that a wrong joint sensor leaves unexplained at most
+CLEARLY = 0.5  # relative Δ up to which a message counts as healthy, so that g_usual never drifts
+EXPLAINED = 0.5  # share of Δ that may stay unexplained if a joint sensor is reported
 
 
 class JointDisagreement(Detector):
-    """Compares the lengths with those of the measured posture.
+    """Compares the lengths with those at the measured posture.
 
     Attributes:
         gap: g [m], (M,); None without measurements.
@@ -66,10 +65,10 @@ class JointDisagreement(Detector):
         self._mae: Mae | None = None
         self._used: Bools = np.ones(robot.muscle_count, dtype=bool)
         self.gap: Array | None = None
-        #: θ, T_end and l of healthy messages, which tell what g usually is with any network
+        #: θ, T_end and l of healthy messages, from which g_usual of any network follows
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
-        self._usual: Array | None = None
-        self._healthy_time = 0.0  # [s] since the last of them
+        self._usual: Array | None = None  # g_usual [m], (M,)
+        self._healthy_time = 0.0  # [s] since the last of these messages
         self.reset()
 
     def use(self, mae: Mae) -> None:
@@ -77,21 +76,21 @@ class JointDisagreement(Detector):
         self._mae = mae
         self._used = ~np.isin(np.arange(self._robot.muscle_count), mae.isolated)
         self.reset()
-        self._find_usual()
+        self._compute_usual()
 
     def reset(self) -> None:
-        """Forget the last messages. What is usual stays: nobody declares wrong lengths healthy."""
+        """Forget the last messages, but keep g_usual, which a reset does not make wrong."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Forget what is usual, too: lengths are measured from other offsets."""
+        """Forget g_usual as well, because the length offsets change."""
         self.reset()
         self._healthy.clear()
         self._usual = None
 
-    def _find_usual(self) -> None:
+    def _compute_usual(self) -> None:
         if len(self._healthy) < ENOUGH or self._mae is None:
             return
         theta, tension, length = map(np.array, zip(*self._healthy))
@@ -99,7 +98,7 @@ class JointDisagreement(Detector):
 
     @property
     def agrees(self) -> bool:
-        """Whether the lengths are those of the measured posture; no without measurements."""
+        """Whether the lengths agree with the measured posture; false without measurements."""
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
@@ -110,7 +109,7 @@ class JointDisagreement(Detector):
         dt, self._since = self._since, 0.0
         if observation.measured is None:
             self._unmeasured += dt
-            if self._unmeasured > COUNT * SPACING:  # of another posture by now
+            if self._unmeasured > COUNT * SPACING:  # earlier values are out of date
                 self._recent.clear()
                 self.gap, self._beyond = None, 0.0
             return None
@@ -133,10 +132,10 @@ class JointDisagreement(Detector):
         if self._healthy_time >= HEALTHY_SPACING - 1e-9:
             self._healthy_time = 0.0
             self._healthy.append((theta, sample.bone_tension, sample.length))
-            self._find_usual()
+            self._compute_usual()
 
     def _change(self, gap: Array) -> tuple[Array, Largest]:
-        """Return Δ [m] (M,), and how large it may be."""
+        """Return Δ [m] (M,) and its limits."""
         assert self._mae is not None
         statistics = self._mae.anomaly
         has_learned = statistics is not None and statistics.calibrated
@@ -158,20 +157,16 @@ class JointDisagreement(Detector):
         jacobian = self._mae.muscle_jacobian(observation.measured, tension)
         jacobian = jacobian * self._used[:, None]
         shift = np.linalg.lstsq(jacobian, -change)[0]
-        left = change + jacobian @ shift
+        unexplained = change + jacobian @ shift
         size = float(np.sqrt(np.square(change[self._used]).mean()))
-        figures = (
-            f'{1e3 * change[muscle]:.0f} mm, limit {1e3 * largest.single:.0f} mm, and all by '
-            f'{1e3 * size:.0f} mm, limit {1e3 * largest.all:.0f} mm'
+        evidence = (
+            f'its length differs from that at the measured posture by '
+            f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * largest.single:.0f} mm), and all '
+            f'lengths by {1e3 * size:.0f} mm (limit {1e3 * largest.all:.0f} mm)'
         )
-        if np.linalg.norm(left) <= EXPLAINED * np.linalg.norm(change):
-            radian = self._robot.kinematics.radian
-            j = int(np.abs(shift / radian).argmax())
-            evidence = (
-                f'its length is off from that of the measured posture by {figures}, as if joint '
-                f'sensor {self._robot.joints[j]} read {shift[j]:.2f} {self._robot.units[j].theta} '
-                'too much'
-            )
-            return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, evidence)
-        evidence = f'its length is off from that of the measured posture by {figures}'
-        return Finding(muscle, Kind.LENGTHS_DISAGREE, evidence)
+        if np.linalg.norm(unexplained) > EXPLAINED * np.linalg.norm(change):
+            return Finding(muscle, Kind.LENGTHS_DISAGREE, evidence)
+        j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
+        offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
+        cause = f'as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
+        return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f'{evidence}, {cause}')

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect that lengths jumped and stayed at another level, as of modules that lost their count.
+"""Detect lengths that jumped and stayed there, for example because modules lost their offsets.
 
-`signals/muscle_stream.py` rejects messages with a jump. It accepts the new level once it has
-lasted, and says so in the sample.
+`signals/muscle_stream.py` rejects messages with a jump. If the new lengths persist, it accepts them
+and names the muscles in the sample.
 """
 
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
 
 
 class LengthJump(Detector):
-    """Reports the muscles that the muscle stream names."""
+    """Reports the muscles that the muscle stream has named."""
 
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
@@ -20,8 +20,8 @@ class LengthJump(Detector):
 
 
 def finding_of(jumped: tuple[int, ...]) -> Finding:
-    """Return the finding of muscles whose lengths have jumped, one or several."""
+    """Return the finding for one or several muscles whose lengths have jumped."""
     if len(jumped) == 1:
         return Finding(jumped[0], Kind.LENGTH_JUMP, 'its length jumped')
-    evidence = f'its length jumped, and {len(jumped) - 1} others'
+    evidence = f'its length and {len(jumped) - 1} others jumped'
     return Finding(jumped[0], Kind.LENGTHS_JUMPED, evidence)

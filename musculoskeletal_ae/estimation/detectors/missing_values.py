@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a muscle whose sensors report no number (NaN) for a while.
+"""Detect a muscle whose sensors report NaN for some time.
 
-Messages with NaN are rejected, and nothing is estimated meanwhile. If all of the NaN are those of
-one muscle, its sensor is broken, and there is nothing to verify.
+Messages with NaN are rejected, so that nothing is estimated meanwhile. If only one muscle has NaN,
+its sensor is faulty, and a verification is not necessary.
 """
 
 import math
@@ -12,15 +12,15 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind
 
-SILENT = 0.15  # [s] that all messages have to lack a number of the same muscle
+SILENT = 0.15  # [s] during which all messages have NaN for the same muscle
 
 
 class MissingValues(Detector):
-    """Measures for how long the same muscle has had no number."""
+    """Measures how long the same muscle has reported NaN."""
 
     def __init__(self) -> None:
         self._muscle: int | None = None
-        self._since = self._last = -math.inf  # when it began, and the last message [s]
+        self._since = self._last = -math.inf  # times of the first and the last such message [s]
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
         """Take the readings of every message; see `Detector`."""

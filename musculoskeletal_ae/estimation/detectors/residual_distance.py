@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect that the body is not the one that the network knows, by what the network leaves.
+"""Detect an anomaly by the Mahalanobis distance of the network's residual.
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),  e = (T_est − T, l_est − l)      (arXiv 2407.08050)
 
-A, the size of e, is published as it is. Its healthy value differs from posture to posture.
-Therefore the decision rests on d, which measures the residual of every muscle in units of its
-healthy spread. The healthy statistics μ, Σ come from the real arm. Those of the geometric model
-would call most healthy postures anomalous: without calibrated ones nothing is decided by d.
+A, the size of e, is published, but its healthy value varies with the posture. The decision is based
+on d instead, which relates the residual of every muscle to its healthy spread. The healthy
+statistics μ and Σ have to be measured on the real arm: with those of the geometric model, most
+healthy postures would count as anomalous. Without calibrated statistics, d is not evaluated.
 
-The threshold of d widens with the distance to the nearest calibrated posture (`unfamiliarity`),
-where the network restores worse, and in proportion to a tension beyond T_limit, of which networks
-have learned little. A ruptured muscle has no tension anywhere: while a tendon is slack, nothing
-widens.
+Threshold. It grows with the distance to the nearest calibrated posture (`unfamiliarity`), where the
+network is less accurate, and in proportion to a tension above T_limit, which networks have rarely
+learned. While a tendon is slack the threshold does not grow, because a ruptured muscle has no
+tension in any posture.
 
-d tells that something is wrong, but all muscles share it. The suspect is the muscle without which
+Suspect. An anomaly affects the residuals of all muscles. The suspect is the muscle without which
 the remaining residual is most likely.
 
-While slack is being wound in, d waits as long as that muscle reads longer than ② restores it: a
-slack tendon is too long, and the rest of a ruptured one is too short.
+Slack. While a slack tendon is being wound in, its length reads longer than ② restores it, and
+messages do not count. The length of a ruptured tendon reads shorter.
 
-If the parameter `anomaly_threshold` is set, A decides against it.
+If the parameter `anomaly_threshold` is set, A is compared with it, and d is not used.
 """
 
 import math
@@ -40,47 +40,47 @@ from musculoskeletal_ae.signals.limits import LIMITS
 #: Names of the thresholds of d and A among those of the checkpoint.
 DISTANCE, NORM = 'distance', 'norm'
 
-IN_A_ROW = 5  # consecutive messages beyond the threshold that make a finding
-#: From NEAR on, a share of the joint ranges, the threshold grows with the distance to calibrated
-#: postures, to WIDEST times at most. So it does with the highest tension, from T_limit on.
-NEAR, WIDEST = 0.25, 3.0
+IN_A_ROW = 5  # consecutive messages above the threshold that make a finding
+NEAR = 0.25  # distance to a calibrated posture above which the threshold grows [joint ranges]
+WIDEST = 3.0  # largest factor of the threshold
 
 
 class Reading(NamedTuple):
-    """What the detector computed from the last message."""
+    """Results of one message."""
 
     distance: float  # d, in healthy standard deviations; NaN without statistics
     suspect: int  # the most suspect muscle
 
 
 class ResidualDistance(Detector):
-    """Decides by d and names the most suspect muscle.
+    """Compares d with its threshold and names the most suspect muscle.
 
-    A subclass may decide by another statistic of the residual.
+    A subclass may use another statistic of the residual.
 
     Attributes:
-        symbol: Of the statistic that decides, for people to read.
-        threshold_name: Of its threshold among those of the checkpoint.
-        threshold: As it is in the checkpoint, if that is calibrated; ∞ otherwise.
-        reading: Of the last message; None before the first.
+        symbol: Symbol of the statistic, for messages.
+        threshold_name: Name of its threshold in the checkpoint.
+        threshold: Threshold of the checkpoint; ∞ if it is not calibrated.
+        reading: Results of the last message; None before the first.
     """
 
     symbol, threshold_name = 'd', DISTANCE
 
     def __init__(self, robot: Robot, settings: Detection, slack: SlackTendon | None = None) -> None:
-        """Begin.
+        """Start without a network.
 
         Args:
             robot: The nominal body.
-            settings: With the threshold of A, if the user has set one.
-            slack: Says which tendons are being taken up, so that d waits; None: it never waits.
+            settings: Settings with the threshold of A.
+            slack: The detector that knows which slack tendons are being wound in; None: messages
+                always count.
         """
         self._robot = self._complete_robot = robot
         self._settings, self._slack = settings, slack
         self._mae: Mae | None = None
         self._statistics: AnomalyStatistics | None = None
         self.threshold = np.inf
-        self._beyond = 0  # consecutive messages beyond the threshold
+        self._beyond = 0  # consecutive messages above the threshold
         self.reading: Reading | None = None
 
     @property
@@ -108,7 +108,7 @@ class ResidualDistance(Detector):
         self._beyond = 0
 
     def forget_reading(self) -> None:
-        """Forget the last message, as when lengths are measured from other offsets."""
+        """Forget the last message, for example when the length offsets change."""
         self.reading = None
 
     def step(self, observation: Observation) -> Finding | None:
@@ -127,7 +127,7 @@ class ResidualDistance(Detector):
         slack_count = int(np.count_nonzero(is_slack))
         waits = False
         if slack_count:
-            # The suspect is a muscle without tension, whatever the residuals of the others are.
+            # A muscle without tension is more suspect than any other.
             score = np.where(is_slack, score + score.sum() + 1.0, score)
             if self._slack is not None:
                 reads_longer = share[muscle_count:] < 0.0
@@ -136,7 +136,7 @@ class ResidualDistance(Detector):
         evidence = ''
         if observation.lengths_known:
             evidence = self._evidence(observation, distance, slack_count > 0, waits)
-        # Where one tendon has ruptured, another may be slack for a moment.
+        # After a rupture, another tendon may be slack for a moment.
         is_first = evidence and self._beyond == IN_A_ROW
         if is_first and self.is_calibrated and slack_count != 1:
             candidates = is_slack if slack_count else self._robot.used
@@ -147,7 +147,7 @@ class ResidualDistance(Detector):
     def unfamiliarity(self, theta: Array) -> float:
         """Return the distance of θ [rad] (D,) to the nearest calibrated posture, over NEAR.
 
-        Beyond 1 the posture is unfamiliar.
+        A posture with a value above 1 is unfamiliar.
         """
         postures = None if self._statistics is None else self._statistics.postures
         if postures is None or not len(postures):
@@ -163,13 +163,13 @@ class ResidualDistance(Detector):
         return self.threshold * float(factor)
 
     def statistic(self, observation: Observation, distance: float) -> float:  # noqa: ARG002
-        """Return what decides: d."""
+        """Return the statistic that is compared with the threshold: d."""
         return distance
 
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
     ) -> str:
-        """Count messages beyond the threshold; return the figures once they are enough, or ''."""
+        """Count messages above the threshold; return the evidence after IN_A_ROW of them, or ''."""
         limit, value, name = self._settings.anomaly_threshold, observation.estimate.anomaly, 'A'
         where = ''
         if limit <= 0.0:
@@ -182,7 +182,7 @@ class ResidualDistance(Detector):
                 wider = self.limit(theta, tension)
                 if wider > limit:
                     limit = wider
-                    where = ', wider in an unfamiliar posture or beyond tension.limit,'
+                    where = ' (raised for an unfamiliar posture or a tension above tension.limit)'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''

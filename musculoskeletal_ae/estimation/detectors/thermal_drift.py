@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a module whose thermal constants drift: its drag, cooling or tension sensor has changed.
+"""Detect a muscle module whose drag, cooling or tension sensor has changed, by its thermal model.
 
-`heat.py` estimates the constants. Only a module with a hot winding is a finding. A cool one is
-named in /diagnostics, but the arm is not stopped for it.
+`heat.py` estimates the constants of the model. Only a module with a hot winding is a finding; a
+cool one is reported in /diagnostics without stopping the arm.
 """
 
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
 from musculoskeletal_ae.signals.heat import Heat
 
-COOL = 60.0  # [°C] of the winding
+COOL = 60.0  # largest temperature of a cool winding [°C]
 
 
 class ThermalDrift(Detector):
@@ -25,7 +25,7 @@ class ThermalDrift(Detector):
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002 (heat has it)
         """Take a message."""
-        for muscle, how in self._heat.changed.items():
+        for muscle, change in self._heat.changed.items():
             if self._heat.core[muscle] > COOL:
-                return Finding(muscle, Kind.THERMAL_DRIFT, f'its module {how}')
+                return Finding(muscle, Kind.THERMAL_DRIFT, f'its module {change}')
         return None
