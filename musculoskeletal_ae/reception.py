@@ -29,6 +29,8 @@ class Reception:
         self.commands: set[str] = set()
         self._refusal = '', -math.inf  # text of the last refusal, and its time [s]
         self._received: Counter[str] = Counter()
+        self._started_at = time.monotonic()
+        self._used_at: dict[str, float] = {}  # time of the last used message by topic [s]
         #: sequence number of the newest message by topic; 0: unknown
         self.numbers: Counter[str] = Counter()
         #: how often the sequence number decreased, by topic: once when a publisher restarts,
@@ -77,13 +79,23 @@ class Reception:
                 except MusculoskeletalError as error:
                     self.reject(topic, error.reason, str(error))
                 else:
-                    self._received[topic] += is_used_at_once
+                    if is_used_at_once:
+                        self.note_used(topic)
 
         return receive
 
     def note_used(self, topic: str) -> None:
-        """Count a message that was used later than it was received."""
+        """Count a message that was used, perhaps later than it was received."""
         self._received[topic] += 1
+        self._used_at[topic] = time.monotonic()
+
+    def silence(self, topic: str) -> float:
+        """Return the time since the last used message of a topic, or since the start [s]."""
+        return time.monotonic() - self._used_at.get(topic, self._started_at)
+
+    def was_used(self, topic: str) -> bool:
+        """Whether any message of a topic was used."""
+        return topic in self._used_at
 
     def reject(self, source: str, reason: str, detail: str) -> bool:
         """Count a rejected message or request; return whether it is the first for this reason."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach
+from musculoskeletal_ae.control import reach, stops
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.methods import Solution
@@ -40,17 +40,19 @@ def report(core: Controller, now: float) -> Report:
         'preset': core.settings.preset,
     }
     warnings = _warnings(core, values)
-    condition = supervisor.condition
+    condition, present = supervisor.condition, core.conditions(now)
     if condition is not None:
+        # Name every cause that is present, with its present details, because each refuses a reset.
+        causes = {condition.cause: condition} | {each.cause: each for each in present}
+        text = '; also '.join(map(str, causes.values()))
         values |= {
             'stop cause': condition.cause.identifier,
-            'stop': str(condition),
-            'remedy': condition.cause.remedy,
+            'stop': text,
+            'remedy': stops.remedy([*causes]),
         }
         if supervisor.is_latched:
-            return Report('error', f'stopped: {condition}', values)
-        return Report('warn', f'paused: {condition}', values)
-    present = core.conditions(now)
+            return Report('error', f'stopped: {text}', values)
+        return Report('warn', f'paused: {text}', values)
     if present:
         values['waits for'] = present[0].cause.identifier
         return Report('warn', f'waiting: {present[0]}', values)

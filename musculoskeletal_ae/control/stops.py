@@ -7,6 +7,7 @@ The reference page on stops is generated from this table. Programs compare the s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
@@ -207,6 +208,13 @@ class Condition(NamedTuple):
 
     def __str__(self) -> str:
         return f'{self.cause.text}: {self.detail}' if self.detail else self.cause.text
+
+
+def remedy(causes: Sequence[StopCause]) -> str:
+    """Return the remedies of all causes in their order; each step once, and the reset last."""
+    steps = dict.fromkeys(step for cause in causes for step in cause.remedy.split('; '))
+    final = [step for step in steps if step.startswith((RESET, EXPLORE))]
+    return '; '.join([*(step for step in steps if step not in final), *final])
 
 
 def table() -> str:

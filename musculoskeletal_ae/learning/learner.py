@@ -41,9 +41,6 @@ from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 from musculoskeletal_ae.signals.pairing import Paired
 
-#: [s] by which a message is ahead of the last poll if the clock was set back since
-CLOCK_SET_BACK = 1.0
-
 
 class Learner:
     """Learns the body of one arm.
@@ -91,8 +88,9 @@ class Learner:
         """
         self.robot = robot
         self.enabled = True
-        self._waiting_since = math.inf  # time of the first poll, or after a jump of the clock [s]
-        self._polled_at = math.inf
+        #: time of the last poll [s], and of the last one that found new usable data
+        self._polled_at = self._progress_at = math.inf
+        self._used_at = -math.inf  # time of the newest usable message at the last poll [s]
         self.trainer = trainer(robot, preset, seed)
         own_preset = self.trainer.preset
         radian = robot.kinematics.radian
@@ -293,8 +291,10 @@ class Learner:
 
     def poll(self, now: float) -> bytes | None:
         """Begin and finish updates at `now` [s]; return a checkpoint if one is due."""
-        self._waiting_since = min(self._waiting_since, now)
         self._polled_at = now
+        if self.collector.used_at != self._used_at:
+            self._used_at, self._progress_at = self.collector.used_at, now
+        self._progress_at = min(self._progress_at, now)  # the clock may have been set back
         is_learning = self.enabled and not self.collector.is_anomaly
         if is_learning and self.trainer.ready and self.scheduler.is_due(now, len(self.samples)):
             healthy = self.collector.healthy
@@ -415,14 +415,10 @@ class Learner:
 
     @property
     def idle_time(self) -> float:
-        """Time since the last message that could be learned from [s]; 0 before the first poll."""
-        used_at = self.collector.used_at
-        # Messages may arrive after the last poll; a time far ahead of it means that the clock has
-        # been set back.
-        if used_at > self._polled_at + CLOCK_SET_BACK:
-            used_at = -math.inf
-        since = max(used_at, self._waiting_since)
-        return max(0.0, self._polled_at - since) if math.isfinite(since) else 0.0
+        """Time without a message that could be learned from [s]; 0 before the first poll."""
+        if self.collector.used_at != self._used_at or math.isinf(self._polled_at):
+            return 0.0
+        return self._polled_at - self._progress_at
 
     def report(self) -> Report:
         """Return the learner's status for /diagnostics."""

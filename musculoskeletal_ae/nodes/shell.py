@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -46,7 +47,14 @@ from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, Chec
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, check_names
-from musculoskeletal_ae.nodes.sources import AUTHORS, LOOK_PERIOD, SEVERAL, Sources, Twins
+from musculoskeletal_ae.nodes.sources import (
+    AUTHORS,
+    LOOK_PERIOD,
+    SEVERAL,
+    SILENT_TOPIC,
+    Sources,
+    Twins,
+)
 from musculoskeletal_ae.parameters import Parameter
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -74,6 +82,12 @@ QOS_REMEDIES = {
     ('subscriber asks', QoSPolicyKind.DURABILITY): 'subscribe volatile',
 }
 MANY_REPORTS = QoSProfile(depth=50)  # all nodes of the graph report on one topic
+#: needed topics that are published continually, so that their silence is an error
+STREAMS = frozenset(['muscle_states', 'estimated_joint_states'])
+#: [s] without a usable message after which a stream is silent
+SILENCE = 1.0
+#: [s] between two reports; more means that this node itself has paused, and messages wait unread
+LONGEST_PERIOD = 1.5
 
 
 class Shell(Node):
@@ -134,6 +148,7 @@ class Shell(Node):
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
+        self._reported_at = math.inf  # [s]
         self.checkpoint_version: int | None = None  # of the network in use
         self.needed: list[str] = []  # topics that the node needs to work
         backward = JumpThreshold(
@@ -530,6 +545,27 @@ class Shell(Node):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
+    def _with_silence(self, report: Report) -> Report:
+        """Return a report that also names a stream on which no usable message arrives."""
+        now = time.monotonic()
+        has_paused, self._reported_at = now - self._reported_at > LONGEST_PERIOD, now
+        silent = None if has_paused else next(filter(self._is_silent, self.needed), None)
+        if silent is None:
+            return report
+        text = (
+            f'no usable {silent} for {self._reception.silence(silent):.0f} s: check that '
+            f'{AUTHORS[silent]} is running'
+        )
+        values = {**report.values, SILENT_TOPIC: text}
+        return Report('error', f'{report.message}; {text}', values)
+
+    def _is_silent(self, topic: str) -> bool:
+        """Whether a stream was received or is published, but no usable message arrives."""
+        reception = self._reception
+        if topic not in STREAMS or reception.silence(topic) <= SILENCE:
+            return False
+        return reception.was_used(topic) or self.count_publishers(topic) > 0
+
     def _log_waiting(self, missing: list[str]) -> None:
         """Log the needed topics without messages, and the reason, whenever they change."""
         reasons = [
@@ -557,6 +593,7 @@ class Shell(Node):
         if (intruders := self.intruders) and report.level != 'error':
             text = f'{SEVERAL}: {intruders}; {self.sources.remedy()}'
             report = Report('error', text, {**report.values, SEVERAL: intruders})
+        report = self._with_silence(report)
         received = self._diagnostics.tell(report)
         self._log_waiting([topic for topic in self.needed if topic not in received])
 

@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from musculoskeletal_ae.control.stops import EXPLORE, REPAIR, ZERO, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
-from musculoskeletal_ae.nodes.sources import SEVERAL
+from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
 from musculoskeletal_ae.report import Level
 
 OLD = 1.0  # [s] age at which a moving value is no longer shown
@@ -163,6 +163,8 @@ class Situation:
             if _is_own(name) or node.level == DiagnosticStatus.OK:
                 continue
             if self._is_shown(name, node):
+                if silent := node.values.get(SILENT_TOPIC):
+                    errors.append(f'{name}: {silent}')
                 if refused := node.values.get('refused'):
                     warnings.append(f'warning: {name}: refused {refused}')
                 continue

@@ -45,6 +45,7 @@ AUTHORS = {
 }
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
 SEVERAL = 'several publishers'  # rejection reason
+SILENT_TOPIC = 'silent topic'  # key of a value in reports
 
 LOOK_PERIOD = 0.1  # [s] between checks of the graph
 LOOKS, TURNS = 20, 3  # TURNS turns within LOOKS checks mean two publishers of one name

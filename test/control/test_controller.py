@@ -13,6 +13,7 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.feedback import REPLAN
 from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -278,6 +279,20 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     reported = status.report(core, 12.0)
     assert reported.level == 'warn'
     assert robot.muscles[strongest] in reported.values['tension limited by heat']
+
+
+def test_a_stop_is_reported_with_every_cause_that_refuses_the_reset():
+    bench = Bench()
+    bench.core.stop(StopCause.OPERATOR)
+    bench.core.watchdog.second_publisher = 'two estimators'
+    bench.now += 10.0  # nothing is received
+    reported = bench.report()
+    assert reported.values['stop cause'] == 'operator_stop'
+    assert 'also several publishers: two estimators; also muscle_states' in reported.message
+    remedy = reported.values['remedy']
+    assert 'check that the driver is running; check that the estimator is running' in remedy
+    assert remedy.endswith('call controller/reset')
+    assert bench.core.reset(bench.now).cause.identifier == 'second_publisher'
 
 
 def test_a_new_network_keeps_the_correction_of_rest_feedback():

@@ -435,6 +435,15 @@ def test_messages_after_the_last_poll_are_no_silence(learner, stage):
     assert learner.report().level == 'ok'
 
 
+def test_messages_stamped_in_the_future_are_no_silence(learner, stage):
+    sample = stage.sample()
+    learner.poll(0.0)
+    for time in np.arange(0.0, 8.0, DT):
+        learner.step(time + 30.0, sample.theta, sample.tension, sample.length)
+        learner.poll(time)
+    assert learner.report().level == 'ok'
+
+
 def test_silence_is_reported_as_nothing_to_learn_from(learner):
     learner.poll(100.0)
     assert learner.report().level == 'ok'

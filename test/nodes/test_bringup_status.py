@@ -11,6 +11,7 @@ from sensor_msgs.msg import JointState
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.nodes.sources import SILENT_TOPIC
 
 
 def said(
@@ -224,6 +225,14 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
     assert situation.trouble() == f'STOPPED: {stop} (to go on: end it), warning: /sim: slow'
     situation.diagnosed(said('/bringup_status', 'the same again', DiagnosticStatus.ERROR))
     assert 'the same again' not in situation.trouble()
+
+
+def test_a_silent_topic_is_shown_beside_a_stop_of_another_cause():
+    situation, silent = Situation('/left'), 'no usable muscle_states for 3 s: check the driver'
+    reported = stopped(StopCause.OPERATOR)
+    reported.status[0].values.append(KeyValue(key=SILENT_TOPIC, value=silent))
+    situation.diagnosed(reported)
+    assert situation.trouble().endswith(f'{RESET}, /left/controller: {silent}')
 
 
 def test_a_refused_command_is_shown_beside_a_stop():

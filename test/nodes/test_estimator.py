@@ -266,3 +266,22 @@ def test_the_covariance_of_the_network_is_published(graph, arm26, trained_file, 
     message = graph.wait(lambda: reported and reported[-1], 'the covariance')
     np.testing.assert_array_equal(np.reshape(message.data, (2, 2)), covariance)
     assert '0.020' in node.report().values['joint uncertainty']
+
+
+def test_silence_of_the_driver_is_an_error_also_for_a_node_that_has_just_started(
+    estimator, healthy
+):
+    def reported(level):
+        report = estimator.report('estimator')
+        named = 'no usable muscle_states' in report.message
+        assert named == ('silent topic' in report.values)
+        return report.level == level and named == (level == 'error')
+
+    estimator.wait(lambda: reported('error'), 'the error without any message')
+
+    def is_heard():
+        estimator.muscles.publish(healthy)
+        return reported('ok')
+
+    estimator.wait(is_heard, 'the end of the error')
+    estimator.wait(lambda: reported('error'), 'the error after the last message')
