@@ -41,7 +41,9 @@ doc/howto/your_robot.md leads from a robot of your own to one that learns.
                              the hand, or nothing (then the first network takes 20 samples, some two
                              minutes); the status line shows the emulator's own angles
                              (default: sensor)
-  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml
+  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml; of a
+                             ros2_control robot, how its motors are connected
+                             (doc/howto/ros2_control.md)
   -p NODE:NAME:=VALUE        one parameter of one node, such as -p estimator:on_anomaly:=isolate;
                              this and --params-file may be given several times, and win over all else
   --namespace NS             run everything under /NS
@@ -330,9 +332,13 @@ common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
   -p "checkpoint:=$(quoted "$checkpoint")")
 if [ -n "$bag" ] || [ $own_clock = true ]; then common+=(-p use_sim_time:=true); fi
 
+# Tools need them as well: they say how the motors of a ros2_control robot are connected.
+files=()
+for file in "${parameter_files[@]}"; do files+=(--params-file "$file"); done
+
 if [ $hardware = true ]; then
   # Nothing that could move the arm is there before its driver says what it must.
-  check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)")
+  check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)" "${files[@]}")
   [[ ! $(chosen_value zero_at_start) =~ ^([Tt]rue|yes|on)$ ]] || check+=(--unzeroed)
   launch check_driver "${check[@]}" --ros-args "${under[@]}"
   wait_for check_driver || exit 1
@@ -357,10 +363,10 @@ if [ $learner = true ]; then
   [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/learner")")
   start_node learner "${kept[@]}" -p "joint_source:=$joint_source"
 fi
-[ -z "$record" ] || start record -o "$record" --ros-args "${under[@]}"
+[ -z "$record" ] || start record -o "$record" "${files[@]}" --ros-args "${under[@]}"
 if [ -n "$bag" ]; then
   # A recording brings its own time and its own commands: no controller.
-  start replay "$bag" --clock --ros-args "${under[@]}"
+  start replay "$bag" --clock "${files[@]}" --ros-args "${under[@]}"
 elif [ $controller = true ]; then
   [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
   moving=(-p "explore:=$explore")
@@ -371,7 +377,8 @@ elif [ $controller = true ]; then
   start_node $name "${moving[@]}"
 fi
 if [ $view = true ]; then
-  start view --robot "$robot" --port "$port" "${read_only[@]}" --ros-args "${under[@]}"
+  start view --robot "$robot" --port "$port" "${read_only[@]}" "${files[@]}" \
+    --ros-args "${under[@]}"
   # It prints its address once it can be visited.
   tail -n +1 -s 0.2 -f --pid="$!" "$logs/view.log" </dev/null 2>/dev/null |
     sed -un 's/^http:/-- the page is on http:/p' &

@@ -104,6 +104,18 @@ class Parser(argparse.ArgumentParser):
             flag, default=default, help=text, **(kind if flag.startswith('-') else {})
         )
 
+    def add_motors(self) -> None:
+        """Add `--params-file`, from which tools take the motor parameters."""
+        self.add_argument(
+            '--params-file',
+            type=Path,
+            action='append',
+            default=[],
+            metavar='FILE',
+            help='parameters of the nodes, which say how the motors of a ros2_control robot are '
+            'connected (doc/howto/ros2_control.md); may be given several times',
+        )
+
     def add_preset(self, text: str = 'network, learning and solver') -> None:
         """Add `--preset`."""
         self.add_argument('--preset', choices=tuple(PRESETS), default='default', help=text)

@@ -134,3 +134,18 @@ class Reception:
         received = dict(self._received)
         self._received = Counter(dict.fromkeys(received, 0))
         return received
+
+
+class Stamps:
+    """Distinguishes new messages of one publisher from repeated ones, by their stamps."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None  # [ns]
+
+    def is_new(self, stamp: Any) -> bool:
+        """Whether a stamp is later than the previous one, or the clock was set back meanwhile."""
+        time, last = stamp.sec * 1_000_000_000 + stamp.nanosec, self._last
+        if last is not None and last - REORDERING < time <= last:
+            return False
+        self._last = time
+        return True

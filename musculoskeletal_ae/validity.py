@@ -95,7 +95,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
     present but not finite). Velocities and efforts are not checked, because drivers publish NaN for
     quantities that they do not measure.
     """
-    names = _joint_names(message)
+    names = joint_names(message)
     index = {name: i for i, name in enumerate(names)}
     known = [name for name in joints if name in index]
     if len(index) < len(names):
@@ -132,7 +132,7 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
 
     A message without efforts gives efforts of 0.
     """
-    names = _joint_names(message)
+    names = joint_names(message)
     listed = set(joints)
     if unknown := [name for name in names if name not in listed]:
         raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
@@ -152,8 +152,11 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
     return dict(zip(names, zip(message.position, efforts.tolist())))
 
 
-def _joint_names(message: Any) -> list[str]:
-    """Return the joint names of a JointState after checking the lengths of its arrays."""
+def joint_names(message: Any) -> list[str]:
+    """Return the joint names of a JointState after checking the lengths of its arrays.
+
+    Arrays of velocities and efforts may be empty.
+    """
     names = list(message.name)
     counts = len(names), len(message.position), len(message.effort), len(message.velocity)
     if max(counts) > MOST_ENTRIES:

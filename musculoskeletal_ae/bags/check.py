@@ -11,10 +11,11 @@ from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.bags.topics import interface_topics
+from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 # A column counts as misplaced only if another muscle fits it this many times better, because bodies
 # differ from their model and neighbouring muscles are similar.
@@ -36,25 +37,32 @@ class BagCheck:
         return '\n'.join(map(printable, lines))
 
 
-def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:
+def check_bag(
+    path: Path,
+    robot: str | None = None,
+    namespace: str | None = None,
+    motors: MotorSettings = NO_MOTORS,
+) -> BagCheck:
     """Read every message of a recording and report on it.
 
     Args:
         path: The bag.
         robot: A shipped robot or a directory; None: report which of the shipped robots fit.
         namespace: The namespace to check; required only if the bag has several.
+        motors: How the motors of a ros2_control robot are connected.
     """
     check = BagCheck()
     try:
         bag = Bag.open(path)
         check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
         check.lines += _contents(bag)
-        interface_topics(bag, namespace)
+        interface_topics(bag, namespace, motors)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
         return check
     results = {
-        name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
+        name: _fit(bag, name, namespace, motors)
+        for name in ([robot] if robot else shipped_robots())
     }
     fits = [name for name, (faults, _) in results.items() if not faults]
     if robot:
@@ -121,11 +129,13 @@ def _contents(bag: Bag) -> list[str]:
     return [*lines, '']
 
 
-def _fit(bag: Bag, name: str, namespace: str | None) -> tuple[list[str], list[str]]:
+def _fit(
+    bag: Bag, name: str, namespace: str | None, motors: MotorSettings
+) -> tuple[list[str], list[str]]:
     """Return the reasons why a bag does not fit a robot, and notes on unused messages."""
     try:
         robot = Robot.load(name)
-        streams = read_streams(bag, robot, namespace)
+        streams = read_streams(bag, robot, namespace, motors)
     except BagError as error:
         return [f'does not fit {name}: {error}'], []
     except MusculoskeletalError as error:

@@ -4,7 +4,7 @@
 import heapq
 import math
 from array import array
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import chain
@@ -15,11 +15,13 @@ from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.topics import interface_topics
+from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
 from musculoskeletal_ae.validity import (
@@ -109,7 +111,9 @@ class _Stream:
         self.times.append(came)
 
 
-def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Streams:
+def read_streams(
+    bag: Bag, robot: Robot, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
+) -> Streams:
     """Read sensor data and commands of one arm.
 
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
@@ -122,11 +126,13 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         bag: The recording.
         robot: The robot, whose joints and muscles the messages must have.
         namespace: The namespace of the arm; required only if the bag has several.
+        motors: How the motors of a ros2_control robot are connected.
 
     Raises:
         BagError: If no message of a topic fits the robot, or the bag is damaged.
     """
     muscles, joints = robot.muscle_count, robot.joints
+    interface = MotorInterface(motors, robot.muscles)
 
     def isolated_mask(message: Any, _: float) -> Array:
         indices = robot.muscle_indices(read_names(message))
@@ -136,14 +142,14 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
 
     def muscle_states(message: Any, came: float) -> Array:
         muscle_stream.use_body(_body_at(came, muscle_stream.body, isolated, offsets))
-        sample = muscle_stream.take(message, came)
+        sample = muscle_stream.take(interface.reading(message), came)
         has_offsets.append(muscle_stream.body.offsets.known)
         return np.array([sample.length, sample.motor_tension, sample.temperature])
 
     def posture(message: Any, _: float) -> Array:
         theta = read_posture(message, joints, some=True)
         for name in joints_not_finite(message, joints):
-            reception.ignore(recorded['joint_states'], f'position of {name} is not finite')
+            reception.ignore(labels['joint_states'], f'position of {name} is not finite')
         return theta
 
     def rows(count: int) -> Callable[[Any, float], Array]:
@@ -158,30 +164,42 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
         'isolated_muscles': isolated,
         'muscle_length_zeros': offsets,
     }
-    recorded = interface_topics(bag, namespace)
-    topics = {recorded[name]: stream for name, stream in streams.items() if name in recorded}
+    recorded = interface_topics(bag, namespace, motors)
+    used = {name: stream for name, stream in streams.items() if name in recorded}
+    # A topic may carry the angles of joints and of motors. Its messages are then counted twice.
+    topics = defaultdict[str, dict[str, _Stream]](dict)
+    labels = dict[str, str]()
+    for name, stream in used.items():
+        is_shared = list(recorded.values()).count(recorded[name]) > 1
+        labels[name] = f'{recorded[name]} as {name}' if is_shared else recorded[name]
+        topics[recorded[name]][labels[name]] = stream
     start, warnings = bag.start, list[str]()
     late = _bunched(bag, list(topics))
     reception = Reception(warnings.append)
-    receive = dict[tuple[str, ...], Callable[[Any, dict[str, Any]], Any]]()
+    receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
     # The body state is read first, because the recorder may have received it after the readings.
-    early = [name for name, topic in topics.items() if topic is isolated or topic is offsets]
+    early = [recorded[name] for name in ('isolated_muscles', 'muscle_length_zeros') if name in used]
     for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic may have different clocks.
         sender = message.topic, *getattr(decoded, 'name', ())
         if sender not in receive:
-            take = topics[message.topic].take
-            receive[sender] = reception.of(message.topic, take, lambda: 1)
+            receive[sender] = [
+                reception.of(label, stream.take, lambda: 1)
+                for label, stream in topics[message.topic].items()
+            ]
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         came = message.log_time
         if message.topic in late:
             came = message.publish_time + late[message.topic]
-        receive[sender](((came - start) / 1e9, decoded), sent)
-    for topic, stream in topics.items():
-        reasons = [text.partition(f' {topic}: ')[2] for text in warnings if f' {topic}: ' in text]
-        if reasons and not stream.values:
-            problem = f'no message of {topic} fits the robot ({reasons[-1]})'
+        for take in receive[sender]:
+            take(((came - start) / 1e9, decoded), sent)
+    for name, stream in used.items():
+        label = labels[name]
+        reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]
+        is_optional = label == f'{recorded[name]} as joint_states'  # motors, but no joint sensors
+        if reasons and not stream.values and not is_optional:
+            problem = f'no message of {label} fits the robot ({reasons[-1]})'
             raise BagError(bag.path, problem, 'choose the robot that was recorded')
     joint_states, states, lengths, tensions, isolated_series, _ = (
         Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
@@ -189,7 +207,7 @@ def read_streams(bag: Bag, robot: Robot, namespace: str | None = None) -> Stream
     )
     use = np.array(has_offsets, dtype=bool)
     if not use.all():
-        reason = f'{recorded["muscle_states"]}: length offsets unknown'
+        reason = f'{labels["muscle_states"]}: length offsets unknown'
         reception.rejected[reason] += int((~use).sum())
         states = Series(states.time[use], states.values[use])
     series = joint_states, states, lengths, tensions, isolated_series

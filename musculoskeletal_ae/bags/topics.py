@@ -7,6 +7,7 @@ from typing import NamedTuple
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_table
+from musculoskeletal_ae.signals.motor_settings import ARRAY, JOINT_STATE, MotorSettings
 
 
 class Topic(NamedTuple):
@@ -22,27 +23,58 @@ DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
+#: of a robot that publishes muscle_states
+NO_MOTORS = MotorSettings()
 
 
-def interface_topics(bag: Bag, namespace: str | None = None) -> dict[str, str]:
+def topics_with(motors: MotorSettings) -> dict[str, Topic]:
+    """Return the topics of the interface and those of a ros2_control robot, by name."""
+    topics = dict(TOPICS)
+    if motors.motor_state_topic:
+        topics.setdefault(motors.motor_state_topic, Topic(JOINT_STATE, sent=True))
+    if motors.motor_command_topic:
+        # Not `sent`: a replay must not move a robot that is connected.
+        topics.setdefault(motors.motor_command_topic, Topic(ARRAY))
+    return topics
+
+
+def interface_topics(
+    bag: Bag, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
+) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
+
+    The topic of the motors of a ros2_control robot stands for `muscle_states`.
 
     Args:
         bag: The recording.
         namespace: The namespace of the arm; required only if the bag has several.
+        motors: How the motors of a ros2_control robot are connected.
 
     Raises:
-        BagError: If the namespace is ambiguous, or a topic has another type than the interface.
+        BagError: If the namespace is ambiguous, or a topic is missing or has another type than the
+            interface.
     """
-    names = _relative_names(bag, namespace)
-    ours = {relative: name for name, relative in names.items() if relative in TOPICS}
+    names = _relative_names(bag, namespace, motors)
+    topics = topics_with(motors)
+    ours = {relative: name for name, relative in names.items() if relative in topics}
     for relative, name in ours.items():
-        _compare_type(bag, name, relative)
-    return ours
+        _compare_type(bag, name, topics[relative].type)
+    if state_topic := motors.motor_state_topic:
+        if state_topic not in ours:
+            problem = f'topic {state_topic} of the parameter motor_state_topic is not in the bag'
+            raise BagError(bag.path, problem, _topics_of(bag))
+        recorded = ours['muscle_states'] = ours[state_topic]
+        if interface_name(recorded) == 'joint_states':
+            ours.setdefault('joint_states', recorded)
+    return {name: recorded for name, recorded in ours.items() if name in TOPICS}
 
 
 def select(
-    bag: Bag, wanted: Sequence[str], namespace: str | None, keep_names: bool
+    bag: Bag,
+    wanted: Sequence[str],
+    namespace: str | None,
+    keep_names: bool,
+    motors: MotorSettings = NO_MOTORS,
 ) -> dict[str, str]:
     """Select topics to replay; return the name to publish on by recorded name.
 
@@ -52,18 +84,21 @@ def select(
             every topic of the interface, or relative or recorded names of any topics.
         namespace: The namespace of the arm; required only if the bag has several.
         keep_names: Whether to publish on the recorded names.
+        motors: How the motors of a ros2_control robot are connected.
 
     Raises:
         BagError: If the namespace is ambiguous, or a topic is missing or cannot be replayed.
     """
+    topics = topics_with(motors)
     if keep_names and namespace is None:
         # With the recorded names, several namespaces are not ambiguous.
-        names = {name: interface_name(name) for name in bag.topics}
+        names = {name: interface_name(name) for name in bag.topics} | _motor_topics(bag, motors)
     else:
-        names = _relative_names(bag, namespace)
-    topics_of_bag = f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
+        names = _relative_names(bag, namespace, motors)
+    topics_of_bag = _topics_of(bag)
     if list(wanted) in ([DEFAULT], [ALL]):
-        relevant = SENT if wanted[0] == DEFAULT else TOPICS
+        sent = [*SENT, motors.motor_state_topic]
+        relevant = sent if wanted[0] == DEFAULT else [*topics]
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
             problem = f'has no topic to replay by default; {topics_of_bag}'
@@ -74,7 +109,8 @@ def select(
             if one not in {*names, *names.values()}:
                 raise BagError(bag.path, f'topic {one} is not in the bag', topics_of_bag)
     for name in chosen:
-        _compare_type(bag, name, names[name])
+        topic = topics.get(names[name])
+        _compare_type(bag, name, topic.type if topic else bag.topics[name].type)
     return {name: name if keep_names else names[name] for name in chosen}
 
 
@@ -112,11 +148,36 @@ def interface_name(name: str) -> str:
     return max(endings, key=len, default=name)
 
 
-def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
-    """Return the relative name of each recorded name; names outside the namespace stay absolute."""
+def _motor_topics(bag: Bag, motors: MotorSettings) -> dict[str, str]:
+    """Return the topics of motors in a bag: the parameter's value by recorded name.
+
+    Topics that have a name of the interface are left out, unless the parameter has the full name.
+    """
+    stated = [motors.motor_state_topic, motors.motor_command_topic]
+    return {
+        name: topic
+        for name in bag.topics
+        for topic in stated
+        if topic == name or (topic and topic not in TOPICS and name.endswith(f'/{topic}'))
+    }
+
+
+def _topics_of(bag: Bag) -> str:
+    return f'it has: {", ".join(sorted(bag.topics))[:500] or "no topics"}'
+
+
+def _relative_names(
+    bag: Bag, namespace: str | None, motors: MotorSettings = NO_MOTORS
+) -> dict[str, str]:
+    """Return the relative name of each recorded name; names outside the namespace stay absolute.
+
+    A motor topic that the parameter states with its full name stays absolute as well.
+    """
+    motor_topics = _motor_topics(bag, motors)
+    placed = [name for name in bag.topics if name not in motor_topics]
     if namespace is None:
-        namespace, *others = namespaces(bag.topics)
-        if others and (nested := _innermost(bag.topics, [namespace, *others])) is not None:
+        namespace, *others = namespaces(placed)
+        if others and (nested := _innermost(placed, [namespace, *others])) is not None:
             namespace = nested
         elif others:
             several = ', '.join(name or '/' for name in (namespace, *others))
@@ -125,7 +186,7 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
             raise BagError(bag.path, problem, remedy)
     prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
     if not any(name.startswith(prefix) for name in bag.topics):
-        there = ', '.join(name or '/' for name in namespaces(bag.topics)) or 'none'
+        there = ', '.join(name or '/' for name in namespaces(placed)) or 'none'
         raise BagError(bag.path, f'has no topic under {prefix!r}', f'namespaces in it: {there}')
     names = {
         name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics
@@ -136,7 +197,7 @@ def _relative_names(bag: Bag, namespace: str | None) -> dict[str, str]:
             relative = name.removeprefix(f'{outer}/')
             if names[name] == name and relative in TOPICS and relative not in names.values():
                 names[name] = relative
-    return names
+    return names | {name: topic for name, topic in motor_topics.items() if topic == name}
 
 
 def _around(namespace: str) -> list[str]:
@@ -155,9 +216,8 @@ def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
     return innermost if len(ours) == len(set(ours)) else None
 
 
-def _compare_type(bag: Bag, name: str, relative: str) -> None:
+def _compare_type(bag: Bag, name: str, expected: str) -> None:
     topic = bag.topics[name]
-    expected = TOPICS[relative].type if relative in TOPICS else topic.type
     if topic.type != expected:
         problem = f'topic {name} has the type {topic.type[:80]!r}, not {expected!r}'
         raise BagError(bag.path, problem, 'rename the topic before recording')

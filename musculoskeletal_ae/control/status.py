@@ -100,9 +100,14 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
 def _heat_warnings(core: Controller, values: dict[str, str]) -> list[str]:
     robot, heat = core.robot, core.watchdog.heat
     windings = heat.heat.core
-    if np.isfinite(windings).any():
+    is_known = np.isfinite(windings)
+    if is_known.any():
         each = zip(robot.muscles, windings)
-        values['temperature of windings'] = ', '.join(f'{n} {c:.0f} °C' for n, c in each)
+        texts = (f'{n} {c:.0f} °C' if np.isfinite(c) else f'{n} unknown' for n, c in each)
+        values['temperature of windings'] = ', '.join(texts)
+    if not is_known.all():
+        names = 'any muscle' if not is_known.any() else robot.names(np.flatnonzero(~is_known))
+        values['not protected from heat'] = f'no temperature is measured of {names}'
     limits = zip(robot.muscles, heat.planned, robot.tension.limit)
     hot = {name: limit for name, limit, largest in limits if limit < largest}
     if not hot:

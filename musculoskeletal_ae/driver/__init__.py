@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check the driver of a real arm against its contract (doc/howto/your_robot.md), without ROS."""
+"""Check the driver of a real arm against its contract (doc/howto/your_driver.md), without ROS."""

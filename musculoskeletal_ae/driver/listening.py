@@ -21,6 +21,8 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import length_range
+from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.validity import (
     QUANTITIES,
     joints_not_finite,
@@ -59,11 +61,23 @@ UNITS = {
 }
 
 
+MOTOR_NOTE = (
+    'l and T are computed from positions and efforts: correct unit, sign, zero and order by the '
+    'parameters spool_radius, motor_direction, motor_zero, motor_names, tension_per_effort and '
+    'effort_zero'
+)
+
+
 class Listening:
     """Collects messages of a driver and checks them. Times are of one steady clock [s]."""
 
     def __init__(
-        self, robot: Robot, rate: float, posture: Sequence[float] | None = None, zeroed: bool = True
+        self,
+        robot: Robot,
+        rate: float,
+        posture: Sequence[float] | None = None,
+        zeroed: bool = True,
+        motors: MotorInterface | None = None,
     ) -> None:
         """Expect messages of a driver.
 
@@ -72,8 +86,10 @@ class Listening:
             rate: Expected rate of muscle_states [Hz].
             posture: θ [rad] (D,) in which the arm is held; None: use joint_states.
             zeroed: Whether the lengths are calibrated; if not, each may have any constant offset.
+            motors: How the motors of a ros2_control robot are connected; None: muscle_states.
         """
         self._robot, self._zeroed, self._pace = robot, zeroed, Pace(rate)
+        self._motors = motors or MotorInterface(MotorSettings(), robot.muscles)
         self._stated = posture is not None
         self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
@@ -91,7 +107,7 @@ class Listening:
         return self._pace.count
 
     def muscles(self, message: object, now: float, sent: float = math.nan, number: int = 0) -> None:
-        """Take a message of muscle_states.
+        """Take a message of muscle_states, or of the motors.
 
         Args:
             message: The message.
@@ -100,8 +116,10 @@ class Listening:
             number: Sequence number; 0 if unknown.
         """
         self._pace.message(now, sent, number)
-        with self._rejecting('muscle_states'):
-            states = read_muscle_states(message, self._robot.muscle_count)
+        topic = 'motors' if self._motors.is_ros2_control else 'muscle_states'
+        with self._rejecting(topic):
+            reading = self._motors.reading(message)
+            states = read_muscle_states(reading, self._robot.muscle_count)
             self._read.append((states, self._theta))
 
     def joints(self, message: object) -> None:
@@ -137,10 +155,12 @@ class Listening:
         for name, count in self._not_finite.items():
             verdict.failed('joint not finite', name=name, count=count)
         if not self.count:
-            verdict.failed('silent')
+            verdict.failed('silent', topic=self._motors.state_topic)
             return verdict
         states, theta = map(np.array, zip(*self._read)) if self._read else (np.zeros(0),) * 2
         self._pace.judge(verdict, now)
+        if self._motors.is_ros2_control:
+            verdict.notes.append(MOTOR_NOTE)
         self._judge_repetition(verdict, states)
         if len(states) and self._judge_values(verdict, np.median(states, axis=0)):
             self._judge_rest(verdict, np.median(states, axis=0))

@@ -19,14 +19,17 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
     RELIABLE,
+    add_joints,
     array_message,
     is_heard,
     joint_message,
+    motor_message,
 )
 from musculoskeletal_ae.nodes.shell import Shell
-from musculoskeletal_ae.nodes.sources import COMMANDS
+from musculoskeletal_ae.nodes.sources import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
 from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.validity import read_wrench
 
 MARKER_RATE = 10.0  # [Hz]
@@ -118,13 +121,31 @@ class Arm(Shell):
         topic, frame = f'{arm}/external_wrench', self.root_frame
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
+    def follow_length_commands(self, follow: Callable[[Array], object]) -> None:
+        """Pass l_target [m] (M,) to `follow`, from commands to the motors if there are any."""
+        if not self.motors.command_topic:
+            self.follow_muscles('muscle_length_command', follow)
+            return
+        take = self.motors.take_command(follow)
+        self.listen(Float64MultiArray, MOTOR_COMMAND, take, RELIABLE)
+
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
         """Advertise the states under a topic prefix, and `robot_description` if `description`."""
         self._joints = None
         self.sources.watch(f'{prefix}joint_states', f'{prefix}muscle_states')
         if joint_sensors:
             self._joints = self.create_publisher(JointState, f'{prefix}joint_states', RELIABLE)
-        self._muscles = self.create_publisher(Float64MultiArray, f'{prefix}muscle_states', RELIABLE)
+        # Motors may share a topic with the joints, as those of joint_state_broadcaster do.
+        self._motors = self._muscles = None
+        if not prefix and self.motors.is_ros2_control:
+            topic = self.motors.state_topic
+            shares = self._joints is not None and self._joints.topic_name == self.full_name(STATES)
+            self._motors = (
+                self._joints if shares else self.create_publisher(JointState, topic, RELIABLE)
+            )
+        else:
+            topic = f'{prefix}muscle_states'
+            self._muscles = self.create_publisher(Float64MultiArray, topic, RELIABLE)
         if description:
             publisher = self.create_publisher(String, 'robot_description', LATCHED)
             publisher.publish(String(data=self.robot.description.urdf))
@@ -133,9 +154,14 @@ class Arm(Shell):
         self, theta: Array, length: Array, tension: Array, temperature: Array
     ) -> None:
         """Publish θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,)."""
-        if self._joints is not None and is_heard(self._joints):
-            stamp = self.get_clock().now().to_msg()
-            self._joints.publish(joint_message(self.robot.joints, theta, stamp))
-        if is_heard(self._muscles):
+        stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
+        if motors is not None and is_heard(motors):
+            message = motor_message(self.motors, length, tension, stamp)
+            if motors is joints:
+                add_joints(message, self.robot.joints, theta)
+            motors.publish(message)
+        if joints is not None and joints is not motors and is_heard(joints):
+            joints.publish(joint_message(self.robot.joints, theta, stamp))
+        if self._muscles is not None and is_heard(self._muscles):
             rows = np.array([length, tension, temperature])
             self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

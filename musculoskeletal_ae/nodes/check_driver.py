@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool `check_driver`: checks the driver of a real arm against its contract.
 
-It reads muscle_states and joint_states; with --move it publishes muscle_length_command.
+It reads muscle_states and joint_states; with --move it publishes muscle_length_command. Of a
+ros2_control robot it reads the JointState of the motors, and commands their positions.
 """
 
 from __future__ import annotations
@@ -20,16 +21,23 @@ from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message
-from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
+from musculoskeletal_ae.nodes.parameters import motor_settings
+from musculoskeletal_ae.nodes.ros_tool import (
+    ROS_HELP,
+    Spinner,
+    message_class,
+    run_tool,
+    start_ros,
+)
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.stop_signals import import_heavy
 
 if TYPE_CHECKING:  # slow imports, which --help does not need
     from musculoskeletal_ae.driver.verdict import Verdict
     from musculoskeletal_ae.robot.robot import Robot
+    from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
-STATES, JOINTS, COMMAND = 'muscle_states', 'joint_states', 'muscle_length_command'
-TYPE = 'std_msgs/msg/Float64MultiArray'
+JOINTS = 'joint_states'
 DISCOVERY = 1.0  # [s] within which other nodes are discovered
 SILENCE = 1.0  # [s] without messages after which the motion test ends
 TICK = 0.02  # [s]; a late tick shows that this process was paused
@@ -45,11 +53,17 @@ class CheckDriver:
     def __init__(self, robot: Robot, options: Namespace) -> None:
         self.node = Node('check_driver')
         self.robot, self.options = robot, options
-        self.topic, self.command = map(self.node.resolve_topic_name, (STATES, COMMAND))
-        self.muscles: Callable[[Float64MultiArray, dict[str, int]], object] = lambda *_: None
+        self.motors = _motors(robot, options)
+        #: without motor commands, those of the driver's contract
+        self.is_converted = bool(self.motors.command_topic)
+        command = self.motors.command_topic or 'muscle_length_command'
+        resolve = self.node.resolve_topic_name
+        self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
+        self.muscles: Callable[[Any, dict[str, int]], object] = lambda *_: None
         self.joints: Callable[[JointState], object] = lambda _: None
         subscribe: Any = self.node.create_subscription
-        subscribe(Float64MultiArray, STATES, lambda m, info: self.muscles(m, info), SENSOR)
+        kind = message_class(self.motors.state_type)
+        subscribe(kind, self.topic, lambda m, info: self.muscles(m, info), SENSOR)
         subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
         self.on_pause: Callable[[float, float], object] = lambda *_: None
         self._ticked_at = time.monotonic()
@@ -63,16 +77,17 @@ class CheckDriver:
         self._ticked_at = now
 
     def _mistyped(self) -> str:
-        kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(STATES)}
-        return ', '.join(sorted(kinds - {TYPE}))
+        kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(self.topic)}
+        return ', '.join(sorted(kinds - {self.motors.state_type}))
 
     def listen(self) -> Verdict:
         """Wait for a driver, listen to it, and return the verdict."""
         chosen, node = self.options, self.node
         kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
-        listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed)
+        self.motors.reset()
+        listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed, self.motors)
 
-        def take(message: Float64MultiArray, info: dict[str, int]) -> None:
+        def take(message: Any, info: dict[str, int]) -> None:
             sent = 1e-9 * info['source_timestamp'] or math.nan
             number = info['publication_sequence_number']
             listening.muscles(message, time.monotonic(), sent, number)
@@ -87,8 +102,9 @@ class CheckDriver:
             self.spin_until(lambda: False, chosen.seconds)
         verdict: Verdict = listening.verdict(time.monotonic())
         if wrong := self._mistyped():
-            verdict.failed('type', topic=self.topic, type=wrong)
-        elif (publishers := node.count_publishers(STATES)) > 1:
+            expected = self.motors.state_type
+            verdict.failed('type', topic=self.topic, type=wrong, expected=expected)
+        elif (publishers := node.count_publishers(self.topic)) > 1:
             verdict.failed('several', n=publishers, topic=self.topic)
         if not node.count_publishers(JOINTS):
             verdict.notes.append('nobody publishes joint_states, which the learner needs')
@@ -100,7 +116,7 @@ class CheckDriver:
         Raises:
             MusculoskeletalError: If another node publishes commands.
         """
-        if self.node.count_publishers(COMMAND) > own:
+        if self.node.count_publishers(self.command) > own:
             raise MusculoskeletalError(
                 f'{self.command} is published by another node: stop the controller before the '
                 'motion test'
@@ -111,22 +127,24 @@ class CheckDriver:
         """Wind each muscle in slightly, and add what is wrong to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
         read = import_heavy('musculoskeletal_ae.validity').read_muscle_states
-        publisher = self.node.create_publisher(Float64MultiArray, COMMAND, RELIABLE)
+        publisher = self.node.create_publisher(Float64MultiArray, self.command, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():
             verdict.failed('deaf', topic=self.command)
             return
         last, trying = time.monotonic(), ''
 
-        def follow(message: Float64MultiArray, _: dict[str, int]) -> None:
+        def follow(message: Any, _: dict[str, int]) -> None:
             nonlocal last, trying
             now = time.monotonic()
             try:
-                states = read(message, self.robot.muscle_count)
+                states = read(self.motors.reading(message), self.robot.muscle_count)
             except MusculoskeletalError:
                 return
             last, target = now, winding.step(states, now)
             if target is not None:
+                if self.is_converted:
+                    target = self.motors.command(target)
                 publisher.publish(array_message(target, 'muscle'))
             if winding.trying != trying:
                 trying = winding.trying
@@ -141,6 +159,17 @@ class CheckDriver:
         self.spin_until(ended, math.inf)
         if not winding.done:
             verdict.failed('silence', gap=SILENCE)
+
+
+def _motors(robot: Robot, options: Namespace) -> MotorInterface:
+    """Return how the motors are connected.
+
+    Raises:
+        MusculoskeletalError: If a file of parameters cannot be used, or does not fit the muscles.
+    """
+    kind: Any = import_heavy('musculoskeletal_ae.signals.motor_interface').MotorInterface
+    interface: MotorInterface = kind(motor_settings(options.params_file), robot.muscles)
+    return interface
 
 
 def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
@@ -193,6 +222,7 @@ def _parse(arguments: list[str]) -> Namespace:
         ROS_HELP,
     )
     parser.add_robot()
+    parser.add_motors()
     add = parser.add_argument
     add('--seconds', type=positive, default=30.0, metavar='S', help='how long to listen [s]')
     add(

@@ -22,6 +22,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
@@ -30,9 +31,10 @@ from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, array_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.sources import AUTHORS, Stamps
+from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.reception import Stamps
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
@@ -54,7 +56,9 @@ class Controller(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
-        self.recording: StopRecording = StopRecording(self.resolve_topic_name)
+        self.recording: StopRecording = StopRecording(
+            self.resolve_topic_name, topics=topics_with(self.motors.settings)
+        )
         self.recorded: StopCause | None = None  # cause of the last recorded stop
         self.logged: list[str] = []
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
@@ -64,6 +68,9 @@ class Controller(Shell):
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
         }
+        self.motor_commands = None
+        if topic := self.motors.command_topic:
+            self.motor_commands = self.create_publisher(Float64MultiArray, topic, RELIABLE)
         checks = {'joint_stiffness': self._check_stiffness, 'method': self._check_method}
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name), checks.get(name))
@@ -114,6 +121,10 @@ class Controller(Shell):
         return value
 
     def _check_method(self, value: Any) -> Any:
+        if value in BY_TENSION and self.motor_commands is not None:
+            legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
+            problem = f'{value!r}: the motors on {self.motors.command_topic} follow lengths only'
+            raise MusculoskeletalError(f'{problem}; legal: {legal}')
         followed = {
             kind: publisher.get_subscription_count()
             for kind, publisher in self.publishers_of.items()
@@ -225,6 +236,8 @@ class Controller(Shell):
         if command is not None:
             value, offset = command.value, self.body.offsets.offset
             value = value + offset if command.kind == LENGTH else value
+            if self.motor_commands is not None and command.kind == LENGTH:
+                self.motor_commands.publish(array_message(self.motors.command(value), 'motor'))
             message = serialize_message(array_message(value, 'muscle'))
             self.publishers_of[command.kind].publish(message)
             self.core.sent_at = time.monotonic()

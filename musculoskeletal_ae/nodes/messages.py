@@ -17,6 +17,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 # The three qualities of service (doc/reference/topics_and_services.md).
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -46,6 +47,23 @@ def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointStat
     message = JointState(name=joints, position=array('d', theta.tobytes()))
     message.header.stamp = stamp
     return message
+
+
+def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: Time) -> JointState:
+    """Return a joint state of the motors of muscles with l [m] and T [N], (M,) each."""
+    names, position, effort = motors.joint_values(length, tension)
+    message = joint_message(names, position, stamp)
+    message.velocity = array('d', [math.nan] * len(names))
+    message.effort = array('d', effort.tobytes())
+    return message
+
+
+def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None:
+    """Append joints at θ [rad] (D,) to a joint state; their velocity and effort are NaN."""
+    message.name = [*message.name, *joints]
+    message.position.extend(theta.tolist())
+    for unknown in (message.velocity, message.effort):
+        unknown.extend([math.nan] * len(joints))
 
 
 def is_heard(publisher: Publisher) -> bool:

@@ -14,10 +14,14 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from difflib import get_close_matches
+from itertools import chain
+from pathlib import Path
+from typing import Any
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.files import read_yaml
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
@@ -30,10 +34,14 @@ from musculoskeletal_ae.parameters import (
     Parameter,
     parameters_of,
 )
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 FRAME_PREFIX = Parameter('', 'prefix of every published frame name, such as "left/"')
-SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX}
+MOTORS = parameters_of(MotorSettings)
+SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX, **MOTORS}
 NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
+
+ALL_NODES = '/**'  # section of all nodes in a file of parameters
 
 #: by node, then by name
 PARAMETERS: dict[str, dict[str, Parameter]] = {
@@ -206,6 +214,66 @@ def check_names(names: Iterable[str], node: str = '') -> None:
             problem = f'{node} has no parameter {name!r}; {users[0]} has'
         if problem:
             raise MusculoskeletalError(printable(problem))
+
+
+def motor_settings(files: Iterable[Path]) -> MotorSettings:
+    """Return the motor parameters in files of ROS parameters, for tools, which are no nodes.
+
+    Args:
+        files: The files; later ones win.
+
+    Raises:
+        MusculoskeletalError: If a file cannot be read, has a parameter that no node has, or has
+            motor parameters of some nodes only.
+    """
+    values = dict[str, Any]()
+    for file in files:
+        document = read_yaml(file, _unreadable)
+        sections = document if isinstance(document, dict) else {}
+        for node, section in sections.items():
+            if node == ALL_NODES:
+                continue
+            if names := sorted(_keys(section) & MOTORS.keys()):
+                problem = f'{names[0]!r} is under {node!r}; state it under {ALL_NODES!r}, because '
+                raise _unreadable(file, f'{problem}all nodes and tools must use the same value')
+        section = sections.get(ALL_NODES)
+        parameters = section.get('ros__parameters') if isinstance(section, dict) else None
+        if not isinstance(parameters, dict):
+            problem = f'expected parameters of all nodes, {ALL_NODES!r}: ros__parameters: NAME'
+            raise _unreadable(file, f'{problem}: VALUE, as in config/nodes.yaml')
+        try:
+            check_names(map(str, parameters))
+            for name in MOTORS.keys() & parameters.keys():
+                values[name] = _motor_value(name, parameters[name])
+        except MusculoskeletalError as error:
+            raise _unreadable(file, str(error)) from error
+    return MotorSettings(**values)
+
+
+def _motor_value(name: str, value: Any) -> Any:
+    """Return the checked value of a motor parameter, which ROS would check for a node."""
+    parameter = MOTORS[name]
+    is_list = isinstance(parameter.default, tuple)
+    words = value if isinstance(value, list) else [value]
+    if not parameter.is_number_list:
+        legal = 'a list of names' if is_list else 'a name'
+        if isinstance(value, list) != is_list or not all(isinstance(word, str) for word in words):
+            raise MusculoskeletalError(f'parameter {name}: {value!r}; legal: {legal}')
+    try:
+        return parameter.checked(value)
+    except MusculoskeletalError as error:
+        raise MusculoskeletalError(f'parameter {name}: {error}') from error
+
+
+def _keys(value: Any) -> set[str]:
+    """Return the keys of a mapping and of all mappings in it."""
+    if not isinstance(value, dict):
+        return set()
+    return {*map(str, value), *chain.from_iterable(map(_keys, value.values()))}
+
+
+def _unreadable(file: Path, problem: str) -> MusculoskeletalError:
+    return MusculoskeletalError(f'{file}: {problem}')
 
 
 HELP_TAIL = """\

@@ -4,7 +4,7 @@
 import math
 import sys
 import time
-from argparse import ArgumentTypeError, Namespace
+from argparse import Namespace
 from contextlib import suppress
 from copy import copy
 from datetime import datetime
@@ -19,8 +19,10 @@ from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos
 
 from musculoskeletal_ae.bags.metadata import offered_qos
-from musculoskeletal_ae.bags.topics import TOPICS, Topic
+from musculoskeletal_ae.bags.topics import Topic, topics_with
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -39,7 +41,7 @@ DISCOVERY_TIME, CONNECTION_TIME = 0.5, 2.0  # [s]
 class Record(Node):
     """Writes messages to a bag, in their serialized form."""
 
-    def __init__(self, writer: BagWriter, topics: list[str]) -> None:
+    def __init__(self, writer: BagWriter, topics: dict[str, Topic]) -> None:
         super().__init__('record')
         self.writer = writer
         self.received = 0
@@ -49,15 +51,20 @@ class Record(Node):
         self._sim_time = self.get_parameter('use_sim_time').value
         self._subscriptions_of: dict[str, Subscription] = {}  # by the name in the interface
         self._incompatible: dict[str, QoSPolicyKind] = {}  # policy that a publisher does not offer
-        for name in topics:
-            self._subscribe(name, LATCHED if TOPICS[name].latched else LIVE)
+        self._topics = topics
+        recorded = set[str]()
+        for name, topic in topics.items():
+            full = self.resolve_topic_name(name)
+            if full not in recorded:  # `joint_states` and `/joint_states` may be the same
+                recorded.add(full)
+                self._subscribe(name, LATCHED if topic.latched else LIVE)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(FLUSH_PERIOD, self._look_after, clock=steady)
 
     def _subscribe(self, name: str, qos: QoSProfile) -> None:
-        receive = partial(self._receive, self.resolve_topic_name(name), TOPICS[name])
+        receive = partial(self._receive, self.resolve_topic_name(name), self._topics[name])
         self._subscriptions_of[name] = self.create_subscription(
-            message_class(TOPICS[name].type), name, receive, qos, raw=True,
+            message_class(self._topics[name].type), name, receive, qos, raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=lambda event: self._on_incompatible(name, event)
             ),
@@ -171,7 +178,8 @@ def parse(arguments: list[str]) -> Namespace:
     directory_help = 'new directory (default: DATE-TIME_bag)'
     add('directory', nargs='?', type=Path, metavar='DIR', help=directory_help)
     add('-o', '--out', type=Path, metavar='DIR', help='same as DIR')
-    add('--topics', type=_topics, metavar='LIST', help='names separated by commas (default: all)')
+    add('--topics', type=names, metavar='LIST', help='names separated by commas (default: all)')
+    parser.add_motors()
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
     add('--compression', choices=COMPRESSIONS, default='zstd', help='compression of the messages')
     recover_help = (
@@ -186,15 +194,14 @@ def parse(arguments: list[str]) -> Namespace:
         parser.error('--recover copies the whole recording: remove --topics and --duration')
     options.out = options.out or options.directory
     options.are_chosen = bool(options.topics)
-    options.topics = options.topics or list(TOPICS)
+    try:
+        topics = topics_with(motor_settings(options.params_file))
+    except MusculoskeletalError as error:
+        parser.error(f'--params-file: {error}')
+    if unknown := [name for name in options.topics or () if name not in topics]:
+        parser.error(f'--topics: unknown topic {unknown[0]!r}; legal: {", ".join(topics)}')
+    options.topics = {name: topics[name] for name in options.topics or topics}
     return options
-
-
-def _topics(text: str) -> list[str]:
-    listed = names(text)
-    if unknown := [name for name in listed if name not in TOPICS]:
-        raise ArgumentTypeError(f'unknown topic {unknown[0]!r}; legal: {", ".join(TOPICS)}')
-    return listed
 
 
 def _work(options: Namespace, arguments: list[str]) -> int:

@@ -35,6 +35,7 @@ from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
+from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.reception import Reception
@@ -323,7 +324,8 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
         print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
     if options.as_trajectory:
         return _teach(bag, options, arguments)
-    names = select(bag, options.topics, options.from_namespace, options.keep_names)
+    motors = motor_settings(options.params_file)
+    names = select(bag, options.topics, options.from_namespace, options.keep_names, motors)
     if options.loop and not options.clock:
         problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
         print(f'warning: --loop: {problem}', file=sys.stderr)
@@ -357,6 +359,7 @@ def parse(arguments: list[str]) -> Namespace:
         'nodes compute; or names separated by commas'
     )
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
+    parser.add_motors()
     add('--keep-names', action='store_true', help='keep the recorded namespace')
     add('--from-namespace', metavar='NS', help='arm to play, if the bag has several arms')
     rate = 'multiple of the recorded speed; needs --clock'
@@ -384,7 +387,7 @@ def parse(arguments: list[str]) -> Namespace:
         changed = {
             name for name, value in vars(options).items() if value != parser.get_default(name)
         }
-        if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
+        if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace', 'params_file'}):
             parser.error(f'--check plays nothing: remove --{ignored[0].replace("_", "-")}')
     if options.wait is None:
         options.wait = SEND_WAIT if options.as_trajectory else WAIT
@@ -403,7 +406,8 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         # Imported here, because loading the robot model takes a second that playback does not need.
         from musculoskeletal_ae.bags.check import check_bag
 
-        check = check_bag(options.bag, options.robot, options.from_namespace)
+        motors = motor_settings(options.params_file)
+        check = check_bag(options.bag, options.robot, options.from_namespace, motors)
         print(check)
         return 1 if check.faults else 0
     try:

@@ -24,7 +24,9 @@ from rcl_interfaces.msg import (
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSPolicyKind, QoSProfile
@@ -46,10 +48,12 @@ from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
-from musculoskeletal_ae.nodes.parameters import PARAMETERS, check_names
+from musculoskeletal_ae.nodes.parameters import MOTORS, PARAMETERS, check_names
+from musculoskeletal_ae.nodes.ros_arguments import reason
 from musculoskeletal_ae.nodes.sources import (
     AUTHORS,
     LOOK_PERIOD,
+    MOTOR_COMMAND,
     SEVERAL,
     SILENT_TOPIC,
     Sources,
@@ -60,6 +64,8 @@ from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.validity import (
     joints_not_finite,
     read_array,
@@ -123,6 +129,13 @@ class Shell(Node):
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
+        settings = MotorSettings(**{name: self.parameter(name) for name in MOTORS})
+        self.motors = MotorInterface(settings, self.robot.muscles)
+        #: topics of a ros2_control robot, by the names of those whose place they take
+        self._wires = {STATES: self.motors.state_topic, MOTOR_COMMAND: self.motors.command_topic}
+        for name in ('motor_state_topic', 'motor_command_topic'):
+            with _naming_parameter(name):
+                self._check_topic_name(self.parameter(name))
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
@@ -130,7 +143,7 @@ class Shell(Node):
         self._latched: dict[
             str, tuple[Any, Callable[[], Any]]
         ] = {}  # subscription, and how to renew it
-        self.sources = Sources(self, self._reception.turns, self._subscribe_anew)
+        self.sources = Sources(self, self.full_name, self._reception.turns, self._subscribe_anew)
         self.rejected = self._reception.rejected  # messages, by topic and reason
         #: offsets and isolated muscles that the estimator has published
         self.body = BodyState.healthy(self.robot.muscle_count)
@@ -155,7 +168,7 @@ class Shell(Node):
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
         self._jump = self.get_clock().create_jump_callback(
-            backward, post_callback=lambda _: self.clock_jumped_back()
+            backward, post_callback=lambda _: self._on_clock_jump()
         )
 
     # -- methods for subclasses to override -----------------------------------------------------
@@ -168,6 +181,10 @@ class Shell(Node):
         """Forget buffers, rates and filters; latches stay."""
         if self.core:
             self.core.clock_jumped_back()
+
+    def _on_clock_jump(self) -> None:
+        self.motors.reset()
+        self.clock_jumped_back()
 
     # -- errors in callbacks --------------------------------------------------------------------
 
@@ -398,6 +415,20 @@ class Shell(Node):
         """Return the time of the ROS clock [s]."""
         return self.get_clock().now().nanoseconds * 1e-9
 
+    def full_name(self, topic: str) -> str:
+        """Return the full name of a topic, or of the one that takes its place on ros2_control.
+
+        The result is '' for motor commands if there are none.
+        """
+        name = self._wires.get(topic, topic)
+        return self.resolve_topic_name(name) if name else ''
+
+    def _check_topic_name(self, name: str) -> None:
+        try:
+            self.resolve_topic_name(name or STATES)
+        except (InvalidTopicNameException, rclpy_implementation.RCLError) as error:
+            raise MusculoskeletalError(f'{name!r}: {reason(error)}') from error
+
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile
     ) -> None:
@@ -408,16 +439,16 @@ class Shell(Node):
 
         Args:
             kind: Message type.
-            topic: Name of the topic.
+            topic: Name of the topic; `full_name` returns where its messages come from.
             callback: Takes a message; raises a MusculoskeletalError to refuse it.
             qos: Quality of service; LATCHED topics can be resubscribed to.
         """
-        full, recording = self.resolve_topic_name(topic), self.recording
+        wire, full, recording = self._wires.get(topic, topic), self.full_name(topic), self.recording
         if topic in AUTHORS and topic not in self.accepted_from_all:
             self.sources.watch(topic)
             callback = self._from_author(topic, callback, qos is LATCHED)
         if recording is not None:
-            callback = _recorded(recording, topic, kind, callback)
+            callback = _recorded(recording, wire, kind, callback)
 
         def subscribe() -> Any:
             receive = self._reception.of(
@@ -427,7 +458,7 @@ class Shell(Node):
                 is_used_at_once=topic not in (CANDIDATES, ACCEPTED),
             )
             raw = recording is not None
-            return self.create_subscription(kind, topic, receive, qos, raw=raw)
+            return self.create_subscription(kind, wire, receive, qos, raw=raw)
 
         subscription = subscribe()
         if qos is LATCHED:
@@ -476,9 +507,10 @@ class Shell(Node):
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
-    def follow_muscle_messages(self, follow: Callable[[Float64MultiArray], object]) -> None:
-        """Pass unchecked messages of muscle_states to `follow`."""
-        self.listen(Float64MultiArray, 'muscle_states', follow, SENSOR)
+    def follow_muscle_messages(self, follow: Callable[[Any], object]) -> None:
+        """Pass unchecked messages of muscle_states, or those of ros2_control, to `follow`."""
+        kind = JointState if self.motors.is_ros2_control else Float64MultiArray
+        self.listen(kind, STATES, lambda message: follow(self.motors.reading(message)), SENSOR)
 
     def follow_offsets(self, changed: Callable[[], object]) -> None:
         """Keep the estimator's length offsets in `body`; call `changed` when they change.
@@ -564,14 +596,14 @@ class Shell(Node):
         reception = self._reception
         if topic not in STREAMS or reception.silence(topic) <= SILENCE:
             return False
-        return reception.was_used(topic) or self.count_publishers(topic) > 0
+        return reception.was_used(topic) or self.count_publishers(self.full_name(topic)) > 0
 
     def _log_waiting(self, missing: list[str]) -> None:
         """Log the needed topics without messages, and the reason, whenever they change."""
         reasons = [
-            f'{self.resolve_topic_name(topic)}, which nobody publishes'
-            if self.count_publishers(topic) == 0
-            else f'{self.resolve_topic_name(topic)}, on which no usable message has arrived'
+            f'{self.full_name(topic)}, which nobody publishes'
+            if self.count_publishers(self.full_name(topic)) == 0
+            else f'{self.full_name(topic)}, on which no usable message has arrived'
             for topic in missing
         ]
         before, self._waiting = self._waiting, '; '.join(reasons)

@@ -18,6 +18,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE
+from musculoskeletal_ae.nodes.sources import MOTOR_COMMAND
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
@@ -40,9 +41,13 @@ class Sim(Arm):
         self.command = np.full(self.robot.muscle_count, PAID_OUT)
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
-        self.needed.append('muscle_length_command')
+        takes_motor_commands = self.as_robot and self.motors.command_topic
+        self.needed.append(MOTOR_COMMAND if takes_motor_commands else 'muscle_length_command')
         self.follow_accepted_checkpoints(self._use_checkpoint)
-        self.follow_muscles('muscle_length_command', self._command)
+        if self.as_robot:
+            self.follow_length_commands(self._command)
+        else:
+            self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
         if not self.as_robot:  # as the robot, its own sensors have no offsets
             self.follow_offsets(lambda: None)  # `_command` reads `body.offsets`

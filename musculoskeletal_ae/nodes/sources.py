@@ -23,19 +23,20 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from builtin_interfaces.msg import Time
 from rclpy.node import Node
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.reception import REORDERING
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
-#: topics that must have one publisher, with the node that publishes them
+MOTOR_COMMAND = 'motor_command'  # stands for the topic of the parameter motor_command_topic
+#: topics that must have one publisher, with the node that publishes them; `Shell.full_name` returns
+#: the topics of a ros2_control robot that take their place
 AUTHORS = {
     'muscle_states': _DRIVER,
     'joint_states': _DRIVER,
     'muscle_length_command': _CONTROLLER,
     'muscle_tension_command': _CONTROLLER,
+    MOTOR_COMMAND: _CONTROLLER,
     'estimated_joint_states': _ESTIMATOR,
     'muscle_length_zeros': _ESTIMATOR,
     'anomaly_detected': _ESTIMATOR,
@@ -149,22 +150,30 @@ class Twins:
 class Sources:
     """Watches the publishers of all topics that a node uses."""
 
-    def __init__(self, node: Node, turns: Counter[str], renew: Callable[[str], object]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        resolve: Callable[[str], str],
+        turns: Counter[str],
+        renew: Callable[[str], object],
+    ) -> None:
         """Begin without topics.
 
         Args:
             node: Node whose view of the graph is used.
+            resolve: Returns the full name of a topic of `AUTHORS`; '' if there is none.
             turns: Number of turns that publishers of one name took, by topic.
             renew: Resubscribes to a topic; called when it has one publisher again.
         """
-        self._node, self._turns, self._renew = node, turns, renew
+        self._node, self._resolve = node, resolve
+        self._turns, self._renew = turns, renew
         self._authorships: dict[str, Authorship] = {}
         self._to_renew: set[str] = set()
 
     def watch(self, *topics: str) -> None:
         """Watch these topics as well; topics that are not in `AUTHORS` are skipped."""
         for topic in topics:
-            if topic in AUTHORS and topic not in self._authorships:
+            if topic in AUTHORS and topic not in self._authorships and self._resolve(topic):
                 self._authorships[topic] = Authorship()
 
     def check(self, topic: str, is_latched: bool) -> None:
@@ -199,7 +208,7 @@ class Sources:
         topics: dict[str, list[str]] = {}
         for topic, each in self._authorships.items():
             if each.intruders:
-                topics.setdefault(each.intruders, []).append(topic)
+                topics.setdefault(each.intruders, []).append(self._shown(topic))
         return '; '.join(
             f'{", ".join(sorted(names))} come from {nodes}' for nodes, names in topics.items()
         )
@@ -211,26 +220,16 @@ class Sources:
             return 'end one of them'
         return f'end all publishers but {" and ".join(sorted(authors))} of this arm'
 
+    def _shown(self, topic: str) -> str:
+        """Return the name of a topic, or the full name of the topic that takes its place."""
+        full = self._resolve(topic)
+        return topic if full.endswith(f'/{topic}') else full
+
     def _look(self, topic: str) -> None:
-        full, publishers = self._node.resolve_topic_name(topic), list[Publisher]()
+        full, publishers = self._resolve(topic), list[Publisher]()
         if self._node.count_publishers(full) > 1:
             for each in self._node.get_publishers_info_by_topic(full):
                 name = f'{each.node_namespace.rstrip("/")}/{each.node_name}'
                 publishers.append(Publisher(name, bytes(each.endpoint_gid)))
         now = time.monotonic()
         self._authorships[topic].look(publishers, self._turns[topic], now)
-
-
-class Stamps:
-    """Distinguishes new messages of one publisher from repeated ones, by their stamps."""
-
-    def __init__(self) -> None:
-        self._last: int | None = None  # [ns]
-
-    def is_new(self, stamp: Time) -> bool:
-        """Whether a stamp is later than the previous one, or the clock was set back meanwhile."""
-        time, last = stamp.sec * 1_000_000_000 + stamp.nanosec, self._last
-        if last is not None and last - REORDERING < time <= last:
-            return False
-        self._last = time
-        return True

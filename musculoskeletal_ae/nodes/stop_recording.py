@@ -10,6 +10,7 @@ import shutil
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 from rclpy.logging import get_logging_directory
 
 from musculoskeletal_ae.bags.metadata import offered_qos
-from musculoskeletal_ae.bags.topics import TOPICS
+from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
@@ -38,14 +39,20 @@ Heard = tuple[int, str, bytes]
 class StopRecording:
     """Keeps the last seconds of some topics, and writes them on request."""
 
-    def __init__(self, resolve: Any, directory: Path | None = None) -> None:
+    def __init__(
+        self,
+        resolve: Any,
+        directory: Path | None = None,
+        topics: Mapping[str, Topic] = TOPICS,
+    ) -> None:
         """Begin without messages.
 
         Args:
             resolve: Returns the full name of a topic.
             directory: Where bags are written; None: ROS's log directory.
+            topics: The topics that may be kept, by name.
         """
-        self._resolve = resolve
+        self._resolve, self._topics = resolve, topics
         self._directory = directory or Path(get_logging_directory())
         self._recent: deque[Heard] = deque()
         self._recent_size = 0  # [bytes]
@@ -56,7 +63,7 @@ class StopRecording:
         self.saved: Path | None = None  # directory of the last recording
 
     def heard(self, topic: str, data: bytes) -> None:
-        """Keep a message, in CDR, of one of `bags.topics.TOPICS`; count it if it is too large."""
+        """Keep a message, in CDR, of one of the topics; count it if it is too large."""
         if len(data) > LARGEST_MESSAGE:
             self.left_out += 1
             return
@@ -70,7 +77,7 @@ class StopRecording:
         ):
             left = self._recent.popleft()
             self._recent_size -= len(left[2])
-            if TOPICS[left[1]].latched:
+            if self._topics[left[1]].latched:
                 self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
@@ -106,7 +113,7 @@ class StopRecording:
             with BagWriter(bag) as writer:
                 names = {t: self._resolve(t) for t in {topic for _, topic, _ in messages}}
                 for topic, name in names.items():
-                    kind, latched, _ = TOPICS[topic]
+                    kind, latched, _ = self._topics[topic]
                     writer.add_topic(name, kind, [offered_qos(latched)])
                 for when, topic, message in messages:
                     writer.write(names[topic], when, when, message)

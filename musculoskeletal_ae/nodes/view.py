@@ -32,13 +32,15 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, run_tool, start_ros
+from musculoskeletal_ae.nodes.parameters import motor_settings
+from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.stop_signals import STOP, Reaction, import_heavy
 from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
@@ -78,6 +80,7 @@ class View(Node):
                 'the page needs viser; install it by: pip install -r requirements.txt'
             ) from error
         self.robot = robot
+        self.motors = MotorInterface(motor_settings(options.params_file), robot.muscles)
         self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
         self.page = page.Page(robot, *address, options.read_only, request)
@@ -112,7 +115,8 @@ class View(Node):
         robot, joints = self.robot, self.robot.joints
 
         def muscles(message: Any) -> Array:
-            return read_muscle_states(message, robot.muscle_count, self._isolated(), math.nan)
+            reading = self.motors.reading(message)
+            return read_muscle_states(reading, robot.muscle_count, self._isolated(), math.nan)
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, partial(read_posture, joints=joints, some=is_measured))
@@ -120,7 +124,8 @@ class View(Node):
             for is_measured in [arm == 'measured']
         ]
         table += [
-            ('muscles', Float64MultiArray, 'muscle_states', NEWEST, muscles),
+            ('muscles', message_class(self.motors.state_type), self.motors.state_topic, NEWEST,
+             muscles),
             ('played', Float64MultiArray, 'replay/position', NEWEST,
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
@@ -231,7 +236,7 @@ class View(Node):
             figures('measured' in posture, error, anomaly, self.robot.kinematics.distance_unit)
             + distance,
             f'{learned} · {situation.doing or "–"}',
-            'waiting for muscle_states' if states is None else situation.hint(),
+            f'waiting for {self.motors.state_topic}' if states is None else situation.hint(),
         ]
         trouble = self.page.with_buttons(situation.trouble())
         isolated = f'isolated: {self.robot.names(self._isolated())}'
@@ -349,6 +354,7 @@ def _parse(arguments: list[str]) -> Namespace:
     what = 'Shows a running arm on a web page, and lets visitors move it.'
     parser = Parser('view', what, ROS_HELP)
     parser.add_robot()
+    parser.add_motors()
     add = parser.add_argument
     host = 'address to listen on; with 0.0.0.0 the whole network can move the arm'
     add('--port', type=whole(1, 65535), default=8080, metavar='N', help='port of the page')

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.bags.topics import NO_MOTORS
 from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -32,12 +33,14 @@ from musculoskeletal_ae.mae.training import (
     train_on,
 )
 from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions, end_tension
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 HELD_OUT_STATES = 5000
@@ -108,8 +111,10 @@ def train(args: Namespace) -> None:
 def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
     """Learn from recordings in order; print the errors on these and on held-out recordings."""
     # All bags are read first, because training takes minutes and a bag may be unusable.
+    motors = motor_settings(args.params_file)
     recordings = {
-        path: read(path, robot, args.from_namespace) for path in (*args.from_bag, *args.hold_out)
+        path: read(path, robot, args.from_namespace, motors)
+        for path in (*args.from_bag, *args.hold_out)
     }
     if args.checkpoint:
         mae = checkpoint.load(args.checkpoint, robot)
@@ -167,13 +172,16 @@ def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
     return ''
 
 
-def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
+def read(
+    path: Path, robot: Robot, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
+) -> Pairs:
     """Return the paired messages of a bag, and print warnings about unused messages.
 
     Args:
         path: The bag.
         robot: The recorded robot.
         namespace: The namespace of the arm; required only if the bag has several.
+        motors: How the motors of a ros2_control robot are connected.
 
     Raises:
         BagError: If the bag is unusable or has no pair.
@@ -181,7 +189,7 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
     bag = Bag.open(path)
     for reason in bag.unfinished:
         print(f'warning: {path}: unfinished: {reason}', file=sys.stderr)
-    streams = read_streams(bag, robot, namespace)
+    streams = read_streams(bag, robot, namespace, motors)
     for reason, count in streams.rejected.items():
         print(f'warning: {path}: {count} messages rejected, {reason}', file=sys.stderr)
     for note in streams.notes:

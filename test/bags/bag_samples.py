@@ -94,7 +94,8 @@ def write_ours(
     writer = BagWriter(path, compression)
     for i, sample in enumerate(content):
         if sample.topic not in writer.topics:
-            latched = TOPICS[interface_name(sample.topic)].latched
+            topic = TOPICS.get(interface_name(sample.topic))
+            latched = topic is not None and topic.latched
             writer.add_topic(sample.topic, sample.type, [offered_qos(latched)])
         writer.write(sample.topic, *sample[2:])
         if i % 10 == 9:

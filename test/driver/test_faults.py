@@ -164,7 +164,7 @@ def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
     source = Path(validity.__file__).read_text('utf-8')
     readers = {
         'muscle_states': ('read_muscle_states', '_values'),
-        'joint_states': ('read_posture', '_joint_names'),
+        'joint_states': ('read_posture', 'joint_names'),
     }
     for topic, functions in readers.items():
         for name in functions:

@@ -20,9 +20,9 @@ from musculoskeletal_ae.nodes.sources import (
     UNNAMED,
     Authorship,
     Publisher,
-    Stamps,
     Twins,
 )
+from musculoskeletal_ae.reception import Stamps
 
 FIRST, SECOND = Publisher('/estimator', b'1'), Publisher('/estimator', b'2')
 

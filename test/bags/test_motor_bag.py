@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of a ros2_control robot, whose muscles are joints of a JointState."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from bags.arm_bag import ARRAY, JOINTS, PERIOD, Arm, array
+from bags.bag_samples import encode, message_class
+from musculoskeletal_ae.bags.check import check_bag
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.streams import read_streams
+from musculoskeletal_ae.bags.topics import interface_topics, select
+from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
+
+ROBOT = Robot.load('arm26')
+MOTORS = tuple(f'{muscle}_motor' for muscle in ROBOT.muscles)
+RADIUS = 0.01  # [m]
+COUNT = 40
+
+
+def settings(topic='/joint_states'):
+    return MotorSettings(
+        motor_state_topic=topic,
+        motor_command_topic='/tendons/commands',
+        motor_names=MOTORS,
+        spool_radius=(RADIUS,),
+        motor_direction=(-1.0,),
+    )
+
+
+def joint_state(names, position, effort, stamp):
+    time = message_class('builtin_interfaces/msg/Time')(stamp, 0)
+    header = message_class('std_msgs/msg/Header')(time, '')
+    values = np.array(position), np.full(len(names), np.nan), np.array(effort)
+    return encode(message_class(JOINTS)(header, list(names), *values), JOINTS)
+
+
+def recording(path, topic='/joint_states', joints=ROBOT.joints, stamps=range(1, COUNT + 1)):
+    """Write a bag of motors and joints on one topic; return the arm."""
+    arm = Arm(ROBOT, count=COUNT)
+    arm.content.clear()
+    for i, stamp in zip(range(COUNT), stamps):
+        names = [*reversed(MOTORS), *joints]
+        position = [*(-arm.length[i] / RADIUS)[::-1], *arm.theta[i][: len(joints)]]
+        effort = [*arm.tension[i][::-1], *[np.nan] * len(joints)]
+        data = joint_state(names, position, effort, stamp)
+        arm.add(topic, JOINTS, i * PERIOD, data)
+        arm.add('/tendons/commands', ARRAY, i * PERIOD, array(arm.length[i]))
+        arm.add('/muscle_length_command', ARRAY, i * PERIOD, array(arm.length[i]))
+    arm.write(path)
+    return arm
+
+
+@pytest.mark.parametrize(
+    ('topic', 'stated'),
+    [
+        ('/joint_states', '/joint_states'),
+        ('/joint_states', 'joint_states'),
+        ('/joint_state_broadcaster/joint_states', '/joint_state_broadcaster/joint_states'),
+        ('/joint_state_broadcaster/joint_states', 'joint_state_broadcaster/joint_states'),
+        ('/tendons/states', '/tendons/states'),
+    ],
+)
+def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(tmp_path, topic, stated):
+    arm = recording(tmp_path / 'bag', topic)
+    streams = read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=settings(stated))
+    assert_allclose(streams.muscles.values[:, :2], np.stack([arm.length, arm.tension], axis=1))
+    assert np.isnan(streams.muscles.values[:, 2]).all()
+    assert_allclose(streams.length_commands.values, arm.length)
+    assert not streams.rejected
+    if topic.endswith('joint_states'):
+        assert_allclose(streams.pairs().theta, arm.theta)
+
+
+def test_a_robot_without_joint_sensors_is_read_and_what_was_not_used_is_counted(tmp_path):
+    recording(tmp_path / 'bag', joints=(), stamps=[1, 1, 0, *range(2, COUNT - 1)])
+    streams = read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=settings())
+    assert len(streams.muscles.time) == COUNT - 2 and not len(streams.joints.time)
+    assert streams.rejected == {
+        '/joint_states as muscle_states: repeated stamp': 1,
+        '/joint_states as muscle_states: no stamp': 1,
+        '/joint_states as joint_states: missing joint': COUNT,
+    }
+
+
+def test_what_is_recorded_of_another_robot_is_refused_with_the_motors_that_are_missing(tmp_path):
+    recording(tmp_path / 'bag')
+    other = MotorSettings(motor_state_topic='/joint_states')
+    with pytest.raises(BagError, match=r'missing motor: deltoid_anterior, .* the message has '):
+        read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=other)
+    with pytest.raises(BagError, match='/states of the parameter motor_state_topic is not in the'):
+        interface_topics(Bag.open(tmp_path / 'bag'), motors=settings('/states'))
+    assert not check_bag(tmp_path / 'bag', 'arm26', motors=settings()).faults
+    assert check_bag(tmp_path / 'bag', 'arm26', motors=other).faults
+
+
+def test_a_replay_publishes_what_the_motors_measured_and_never_what_moves_them(tmp_path):
+    topic = '/joint_state_broadcaster/joint_states'
+    recording(tmp_path / 'bag', topic)
+    for keep_names in (False, True):
+        chosen = select(Bag.open(tmp_path / 'bag'), ['default'], None, keep_names, settings(topic))
+        assert chosen[topic] == topic and '/tendons/commands' not in chosen
+        assert set(chosen) == {topic, '/muscle_length_command'}
+    named = select(Bag.open(tmp_path / 'bag'), ['/tendons/commands'], None, True, settings(topic))
+    assert set(named) == {'/tendons/commands'}
