@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A ros2_control robot made of messages: it behaves as two controllers of ros2_controllers do.
+
+    python fake_robot.py
+
+The node stands for a controller_manager with the file controllers.yaml beside this one. The
+hardware is an emulated arm whose winches are joints named MUSCLE_motor. Half of the spools wind
+the other way round, and every encoder has a zero of its own. nodes.yaml corrects both.
+doc/howto/ros2_control.md describes the connection.
+"""
+
+import math
+import sys
+import time
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+
+UPDATE_RATE = 100.0  # [Hz] of the controller_manager
+SPOOL_RADIUS = 0.012  # [m]
+
+
+class Hardware:
+    """The hardware component: motors with encoders and torque sensors, and two joint sensors."""
+
+    def __init__(self) -> None:
+        self.robot = Robot.load('arm26')
+        self.arm, self.read_at = EmulatedArm(self.robot, seed=1), time.monotonic()
+        index = np.arange(self.robot.muscle_count)
+        self.motors = [f'{muscle}_motor' for muscle in self.robot.muscles]
+        self.direction = np.where(index % 2, 1.0, -1.0)  # −1: the angle rises as the motor winds in
+        self.zero = 0.5 * index  # [rad] at θ = 0 without tension
+
+    def read(self) -> dict[str, dict[str, float]]:
+        """Return the state interfaces of every joint: angles [rad] and torques [N·m]."""
+        now = time.monotonic()
+        self.arm.step(min(round(now - self.read_at, 3), 0.1))
+        self.read_at = now
+        reading = self.arm.sense()
+        angle = self.direction * reading.length / SPOOL_RADIUS + self.zero
+        torque = -self.direction * reading.tension * SPOOL_RADIUS
+        states = {joint: {'position': q} for joint, q in zip(self.robot.joints, reading.theta)}
+        for motor, q, tau in zip(self.motors, angle, torque):
+            states[motor] = {'position': q, 'effort': tau}
+        return states
+
+    def write(self, angles: dict[str, float]) -> None:
+        """Let each drive follow a spool angle with its stiffness (the MSC law)."""
+        angle = np.array([angles[motor] for motor in self.motors])
+        self.arm.command_length(self.direction * SPOOL_RADIUS * (angle - self.zero))
+
+
+class FakeRobot(Node):
+    """A controller_manager with joint_state_broadcaster and forward_command_controller."""
+
+    def __init__(self) -> None:
+        super().__init__('fake_robot')
+        self.hardware = Hardware()
+        self.joints = sorted(self.hardware.motors)  # parameter `joints` of tendon_controller
+        self.commands: list[float] | None = None
+        self.states = self.create_publisher(JointState, 'joint_states', 10)
+        topic = 'tendon_controller/commands'
+        self.create_subscription(Float64MultiArray, topic, self.on_commands, 10)
+        self.create_timer(1.0 / UPDATE_RATE, self.update)
+
+    def on_commands(self, message: Float64MultiArray) -> None:
+        """Keep a command, as forward_command_controller does, unless a value is not finite."""
+        if all(map(math.isfinite, message.data)):
+            self.commands = list(message.data)
+        else:
+            self.get_logger().warning('Non-finite value received. Dropping message')
+
+    def update(self) -> None:
+        """Read the hardware, publish its state, and write the last command, however old it is."""
+        states = self.hardware.read()
+        message = JointState(name=sorted(states))  # the order means nothing
+        message.header.stamp = self.get_clock().now().to_msg()
+        for field in ('position', 'velocity', 'effort'):  # NaN: the joint has no such interface
+            values = [states[name].get(field, math.nan) for name in message.name]
+            setattr(message, field, values)
+        self.states.publish(message)
+        if self.commands is None:
+            return
+        if len(self.commands) != len(self.joints):
+            sizes = f'command size ({len(self.commands)}), interfaces ({len(self.joints)})'
+            self.get_logger().error(f'{sizes} do not match', throttle_duration_sec=1.0)
+            return
+        self.hardware.write(dict(zip(self.joints, self.commands)))
+
+
+if __name__ == '__main__':
+    rclpy.init()
+    try:
+        rclpy.spin(FakeRobot())
+    except MusculoskeletalError as error:
+        sys.exit(f'error: {error}')
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A ros2_control robot on the graph: its messages reach the nodes, and their commands reach it."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from graph import Process, executable
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.sim import Sim
+
+EXAMPLE = Path(__file__).parents[2] / 'examples' / 'ros2_control'
+NODES = EXAMPLE / 'nodes.yaml'
+PARAMETERS = yaml.safe_load(NODES.read_text(encoding='utf-8'))['/**']['ros__parameters']
+STATES, COMMANDS = PARAMETERS['motor_state_topic'], PARAMETERS['motor_command_topic']
+MOTORS = PARAMETERS['motor_names']
+
+
+def host(graph, kind, **more):
+    return graph.host(kind, robot='arm26', **PARAMETERS, **more)
+
+
+def joint_values(graph, field='position'):
+    """Return the values of the next message of the robot, by joint."""
+    message = graph.next(STATES)
+    return dict(zip(message.name, getattr(message, field)))
+
+
+def start_fake_robot(graph):
+    graph.listen(JointState, STATES)
+    command = [sys.executable, str(EXAMPLE / 'fake_robot.py')]
+    command += ['--ros-args', '-r', f'__ns:={graph.namespace}']
+    graph.processes.append(Process('fake_robot', command))
+    graph.next(STATES)
+
+
+def test_the_files_of_controllers_and_nodes_state_the_same_motors():
+    controllers = yaml.safe_load((EXAMPLE / 'controllers.yaml').read_text(encoding='utf-8'))
+    joints = controllers['tendon_controller']['ros__parameters']['joints']
+    assert PARAMETERS['motor_command_order'] == joints
+
+
+@pytest.mark.parametrize('name', ['controllers.yaml', 'nodes.yaml'])
+def test_the_guide_shows_the_files_of_the_example(name):
+    guide = (EXAMPLE.parents[1] / 'doc' / 'howto' / 'ros2_control.md').read_text(encoding='utf-8')
+    text = (EXAMPLE / name).read_text(encoding='utf-8')
+    assert f'```yaml\n{text}```' in guide
+
+
+def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained_file, arm26):
+    start_fake_robot(graph)
+    estimator = host(graph, Estimator, checkpoint=trained_file)
+    estimates = graph.listen(JointState, 'estimated_joint_states')
+    graph.wait(lambda: estimates, 'an estimate')
+    measured = [joint_values(graph)[joint] for joint in arm26.joints]
+    assert np.linalg.norm(np.subtract(estimates[-1].position, measured)) < 1.0
+    assert not estimator.rejected
+
+    controller = host(graph, Controller, checkpoint=trained_file)
+    commands = graph.listen(Float64MultiArray, COMMANDS)
+    lengths = graph.listen(Float64MultiArray, 'muscle_length_command')
+    before = joint_values(graph, 'effort')
+    targets = graph.publisher(JointState, 'target_joint_states')
+    targets.publish(JointState(name=arm26.joints, position=measured))
+    graph.wait(lambda: commands and lengths, 'a command')
+
+    def pulls():
+        effort = joint_values(graph, 'effort')
+        return max(abs(effort[motor] - before[motor]) for motor in MOTORS) > 0.1  # [N·m], 8 N
+
+    graph.wait(pulls, 'a motor that pulls')
+    converted = controller.motors.command(np.array(lengths[-1].data))
+    assert any(np.allclose(message.data, converted) for message in commands[-5:])
+    assert controller.core.supervisor.is_running
+
+
+def test_check_driver_passes_the_robot_and_moves_it(graph):
+    start_fake_robot(graph)
+    command = [*executable('check_driver'), '--robot', 'arm26', '--params-file', str(NODES)]
+    command += ['--seconds', '2', '--wait', '--move', '--muscles', 'brachialis']
+    process = Process('check_driver', [*command, '--ros-args', '-r', f'__ns:={graph.namespace}'])
+    commands = graph.listen(Float64MultiArray, COMMANDS)
+    graph.wait(lambda: not process.alive(), 'its end')
+    status, output = process.ended()
+    faults = [line.split()[1] for line in output.splitlines() if line.startswith('fault: ')]
+    assert set(faults) <= {'latency', 'rate'} and (status == 0 or faults), output
+    assert commands and len(commands[0].data) == len(MOTORS)
+
+
+def test_the_emulator_plays_the_same_robot(graph, arm26):
+    emulator = host(graph, HardwareEmulator)
+    graph.listen(JointState, STATES)
+    position = joint_values(graph)
+    assert {*MOTORS, *arm26.joints} == position.keys()
+    reading = emulator.motors.reading(graph.next(STATES))
+    rows = np.reshape(reading.data, (3, -1))
+    np.testing.assert_allclose(rows[1], arm26.tension.bias, atol=25.0)
+    commands = graph.publisher(Float64MultiArray, COMMANDS)
+
+    def pulls():
+        wound = emulator.motors.command(rows[0] - 50.0 / arm26.stiffness)
+        commands.publish(Float64MultiArray(data=wound.tolist()))
+        tension = np.reshape(emulator.motors.reading(graph.next(STATES)).data, (3, -1))[1]
+        return (tension > rows[1] + 5.0).all()
+
+    graph.wait(pulls, 'motors that pull')
+
+
+def test_the_simulator_takes_the_place_of_the_robot_with_the_same_messages(
+    graph, trained_file, arm26
+):
+    sim = host(graph, Sim, checkpoint=trained_file, as_robot=True)
+    graph.listen(JointState, STATES)
+    assert {*MOTORS, *arm26.joints} == joint_values(graph).keys()
+    commands = graph.publisher(Float64MultiArray, COMMANDS)
+    wound = np.full(len(MOTORS), -0.02)
+
+    def followed():
+        commands.publish(Float64MultiArray(data=sim.motors.command(wound).tolist()))
+        graph.spin(0.02)
+        return np.allclose(sim.command, wound)
+
+    graph.wait(followed, 'the command')
+
+
+def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, trained_file):
+    estimator = host(graph, Estimator, checkpoint=trained_file)
+    graph.listen(DiagnosticArray, '/diagnostics')
+    states = graph.publisher(JointState, STATES)
+    message = JointState(name=MOTORS, position=[0.0] * 6, effort=[0.5] * 6)
+
+    def counted(reason):
+        def is_counted():
+            states.publish(message)
+            graph.spin(0.05)
+            return estimator.rejected[f'muscle_states: {reason}']
+
+        graph.wait(is_counted, reason)
+
+    counted('no stamp')
+    message.header.stamp.sec = 5
+    counted('repeated stamp')
+    message.name = [*MOTORS[1:], 'elbow']
+    counted('missing motor')
+    graph.wait(
+        lambda: (
+            'missing motor: deltoid_anterior_motor'
+            in graph.report('estimator').values.get('last rejected', '')
+        ),
+        'the report',
+    )
+
+
+def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, trained_file):
+    controller = host(graph, Controller, checkpoint=trained_file)
+    graph.node.create_publisher(Float64MultiArray, COMMANDS, 10)
+    graph.wait(lambda: COMMANDS in controller.core.watchdog.second_publisher, 'its detection')
+
+
+def test_methods_that_command_tensions_are_refused(graph):
+    controller = host(graph, Controller)
+    for method in ('tension', 'float'):
+        result = controller.set_parameters([Parameter('method', value=method)])[0]
+        assert not result.successful and f'{COMMANDS} follow lengths only' in result.reason
+
+
+@pytest.mark.parametrize(
+    ('changes', 'problem'),
+    [
+        ({'motor_names': MOTORS[:5]}, '5 names, expected a motor for each of the 6 muscles'),
+        (
+            {'motor_state_topic': 'joint states'},
+            r"motor_state_topic: 'joint states': .*must not",
+        ),
+    ],
+)
+def test_parameters_that_do_not_fit_end_a_node_with_the_reason(graph, changes, problem):
+    with pytest.raises(MusculoskeletalError, match=problem):
+        graph.host(Estimator, robot='arm26', **{**PARAMETERS, **changes})
