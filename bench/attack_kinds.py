@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Known attacks on an arm, each in several variants, while it holds and while it explores.
 
-Each attack marks the time in which something is wrong (`Scene.wrong`). Afterwards the scene follows
-the advice of the status line literally until the arm moves on.
+Each attack marks the time in which something is wrong (`Scene.wrong`). Afterwards the scene takes
+the steps that /diagnostics advises until the arm moves on.
 """
 
 from __future__ import annotations
 
-import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from bench.attack_graph import NODES, OWN, PATIENCE, Attack, digest, set_request
+from musculoskeletal_ae.control.remedy import Step
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
@@ -31,6 +31,7 @@ MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # [s] duration of an attack
 SAID = 2.0  # [s] after which the status line has to report a problem
 OFFSET = 0.08  # [m] of false length offsets
+STEPS = {step.identifier: step for step in Step}
 
 
 class Scene:
@@ -44,7 +45,7 @@ class Scene:
     # -- the course of an attack ----------------------------------------------------------------
 
     def play(self, kind: str, shape: int, moment: str) -> None:
-        """Bring the arm into a state, attack it, and recover it as the status line advises."""
+        """Bring the arm into a state, attack it, and recover it as /diagnostics advises."""
         self.what = f'{kind}, shape {shape}, {moment}'
         if not self.bring(moment):
             return
@@ -83,16 +84,16 @@ class Scene:
         return True
 
     def recover(self, moment: str) -> None:
-        """Follow the status line until nothing is wrong and the arm is in its previous state."""
-        attack, end, said = self.attack, time.monotonic() + PATIENCE, ''
+        """Follow the advice until nothing is wrong and the arm is in its previous state."""
+        attack, end, trouble = self.attack, time.monotonic() + PATIENCE, ''
         while time.monotonic() < end:
             attack.spin(1.0)
             level = attack.situation.level()
-            said = attack.situation.trouble()
+            trouble = attack.situation.trouble()
             if level != 'error' and self._goes_on(moment):
                 return
-            self.follow_advice(said)
-        attack.found('the advice helps', f'{self.what}: not in {PATIENCE:g} s; last: {said}')
+            self.follow_advice()
+        attack.found('the advice helps', f'{self.what}: not in {PATIENCE:g} s; last: {trouble}')
         attack.end_strangers()
         for name in NODES:
             self.resume(name)
@@ -105,47 +106,54 @@ class Scene:
             return False
         return mode in ('idle', 'holding', 'moving', 'exploring')
 
-    def follow_advice(self, said: str) -> None:
-        """Do literally what a status line advises."""
+    def follow_advice(self) -> None:
+        """Take all steps that the reports on /diagnostics advise, in order."""
         attack = self.attack
-        for node in re.findall(r'/(\w+): no report', said):
+        for name in attack.situation.silent_nodes():
+            node = name.rpartition('/')[2]
             attack.processes[node].kill()
             attack.start(node)
             attack.wait(lambda node=node: node in attack.levels, 'the advice helps', node)
-        for steps in [
-            *re.findall(r'\(to go on: ([^)]*)\)', said),
-            *re.findall(r'(?:end|stop the) [^,;]*', said),
-        ]:
-            for step in steps.split('; '):
-                self._do(step)
+        for identifier in attack.situation.steps():
+            self._take(STEPS[identifier])
 
-    def _do(self, step: str) -> None:
+    def _take(self, step: Step) -> None:
+        """Take one step of a remedy."""
         attack = self.attack
-        service = re.search(r'(controller|estimator|learner)/(\w+)', step)
-        if step.startswith(('end ', 'stop the node')):
+        if step in (Step.STOP_SECOND_PUBLISHER, Step.STOP_OTHER_ROBOT):
             attack.end_strangers()
-        elif step.startswith(('repair', 'free', 'check the sensor')):
+        elif step in (Step.REPAIR_MUSCLE, Step.FREE_ARM, Step.CHECK_SENSOR):
             attack.set_faults([])
             self.set('hardware_emulator', 'ruptured_muscles', [''])
             attack.spin(1.0)
-        elif step.startswith('wait'):
+        elif step is Step.WAIT_UNTIL_COOL:
             attack.spin(3.0)
-        elif step.startswith('check that'):
+        elif step in (Step.CHECK_DRIVER, Step.CHECK_ESTIMATOR):
             for name in ('hardware_emulator', 'estimator'):
                 self.resume(name)
-        elif service and service[0] == 'estimator/zero':
-            # Calibration takes half a minute of gentle motion, and restarts with every call.
-            attack.call(Trigger, service[0])
-            attack.call(Trigger, 'controller/reset')
+        elif step is Step.CALIBRATE_LENGTHS:
+            self._calibrate_lengths()
+        elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY):
             attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
-            end = time.monotonic() + 0.6 * PATIENCE
-            while 'zeros unknown' in attack.situation.trouble() and time.monotonic() < end:
-                attack.spin(1.0)
-        elif service and service[2] in ('explore', 'enable'):
-            attack.call(SetBool, service[0], SetBool.Request(data=True))
-        elif service:
-            attack.call(Trigger, service[0])
+        elif step in (Step.RESET_CONTROLLER, Step.RESET_ESTIMATOR):
+            node = 'controller' if step is Step.RESET_CONTROLLER else 'estimator'
+            attack.call(Trigger, f'{node}/reset')
             attack.spin(0.5)
+
+    def _calibrate_lengths(self) -> None:
+        """Calibrate the lengths, which takes half a minute of gentle motion.
+
+        Every call of the service restarts the calibration, so this waits for the end.
+        """
+        attack = self.attack
+        attack.call(Trigger, 'estimator/zero')
+        attack.call(Trigger, 'controller/reset')
+        attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
+        end = time.monotonic() + 0.6 * PATIENCE
+        is_calibrating = True
+        while is_calibrating and time.monotonic() < end:
+            attack.spin(1.0)
+            is_calibrating = Step.CALIBRATE_LENGTHS.identifier in attack.situation.steps()
 
     # -- actions of the hostile node ------------------------------------------------------------
 

@@ -10,6 +10,7 @@ from musculoskeletal_ae.control import reach, stops
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.methods import Solution
+from musculoskeletal_ae.control.remedy import REMEDY_STEPS, identifiers, sentence
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.report import Report
@@ -30,8 +31,8 @@ DOING = {
 def report(core: Controller, now: float) -> Report:
     """Return the status for /diagnostics: a stop, else why control waits, else all warnings.
 
-    The values `mode` and `stop cause` are stable identifiers for programs. The message and the
-    values `stop` and `remedy` are texts for users.
+    The values `mode`, `stop cause` and `remedy steps` are stable identifiers for programs. The
+    message and the values `stop` and `remedy` are texts for users.
     """
     supervisor = core.supervisor
     values = {
@@ -44,11 +45,12 @@ def report(core: Controller, now: float) -> Report:
     if condition is not None:
         # Name every cause that is present, with its present details, because each refuses a reset.
         causes = {condition.cause: condition} | {each.cause: each for each in present}
-        text = '; also '.join(map(str, causes.values()))
+        text, steps = '; also '.join(map(str, causes.values())), stops.remedy_of(causes)
         values |= {
             'stop cause': condition.cause.identifier,
             'stop': text,
-            'remedy': stops.remedy([*causes]),
+            'remedy': sentence(steps),
+            REMEDY_STEPS: identifiers(steps),
         }
         if supervisor.is_latched:
             return Report('error', f'stopped: {text}', values)

@@ -7,9 +7,11 @@ The reference page on stops is generated from this table. Programs compare the s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from enum import Enum, IntEnum
 from typing import NamedTuple
+
+from musculoskeletal_ae.control.remedy import REPAIR, Step, sentence
 
 
 class Action(IntEnum):
@@ -41,13 +43,11 @@ class Declaration(NamedTuple):
     action: Action
     clears: Clears
     text: str  # what happened, for users
-    remedy: str  # what to do, in this order
+    steps: tuple[Step, ...]  # the remedy
 
 
-RESET = 'call controller/reset'
-REPAIR = 'repair the muscle; call estimator/reset'
-ZERO = 'call estimator/zero'
-EXPLORE = 'call controller/explore to explore again'
+#: steps after all others
+LAST = Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY
 
 
 class StopCause(Enum):
@@ -55,7 +55,12 @@ class StopCause(Enum):
 
     def __init__(self, identifier: str, declaration: Declaration) -> None:
         self.identifier = identifier
-        self.condition, self.action, self.clears, self.text, self.remedy = declaration
+        self.condition, self.action, self.clears, self.text, self.steps = declaration
+
+    @property
+    def remedy(self) -> str:
+        """The remedy as a text for users."""
+        return sentence(self.steps)
 
     OPERATOR = (
         'operator_stop',
@@ -64,7 +69,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'controller/stop was called',
-            RESET,
+            (Step.RESET_CONTROLLER,),
         ),
     )
     CONTROL_FAULT = (
@@ -74,7 +79,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'internal error of the controller',
-            f'report the log; {RESET}',
+            (Step.REPORT_LOG, Step.RESET_CONTROLLER),
         ),
     )
     COMMAND_NOT_FINITE = (
@@ -84,7 +89,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'the computed command is not finite',
-            f'report the log; {RESET}',
+            (Step.REPORT_LOG, Step.RESET_CONTROLLER),
         ),
     )
     UNFIT_CHECKPOINT = (
@@ -94,7 +99,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'unfit checkpoint',
-            f'stop the node that publishes accepted_checkpoint of another robot; {RESET}',
+            (Step.STOP_OTHER_ROBOT, Step.RESET_CONTROLLER),
         ),
     )
     NO_CHECKPOINT = (
@@ -104,7 +109,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'no checkpoint',
-            f'set the parameter checkpoint, or start the learner; {RESET}',
+            (Step.PROVIDE_CHECKPOINT, Step.RESET_CONTROLLER),
         ),
     )
     ANOMALY = (
@@ -114,7 +119,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.VERIFICATION,
             'anomaly detected',
-            f'{REPAIR}; {RESET}',
+            (*REPAIR, Step.RESET_CONTROLLER),
         ),
     )
     LENGTH_OFFSETS_REVOKED = (
@@ -124,7 +129,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'the lengths are unreliable',
-            f'call estimator/zero; {RESET}; {EXPLORE}, gently until the offsets are known',
+            (Step.CALIBRATE_LENGTHS, Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY),
         ),
     )
     SECOND_PUBLISHER = (
@@ -135,7 +140,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'several publishers',
-            f'stop the node that does not belong to this arm; {RESET}',
+            (Step.STOP_SECOND_PUBLISHER, Step.RESET_CONTROLLER),
         ),
     )
     IMPLAUSIBLE_MUSCLE_STATES = (
@@ -145,7 +150,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.VERIFICATION,
             'muscle_states are implausible',
-            f'check the named sensor, or call estimator/zero if lengths are off; {RESET}',
+            (Step.CHECK_SENSOR, Step.RESET_CONTROLLER),
         ),
     )
     IMPLAUSIBLE_ESTIMATE = (
@@ -155,7 +160,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.VERIFICATION,
             'the estimate is implausible',
-            f'check length offsets and checkpoint (estimator/zero); {RESET}',
+            (Step.CHECK_CHECKPOINT, Step.CALIBRATE_LENGTHS, Step.RESET_CONTROLLER),
         ),
     )
     OVERLOAD = (
@@ -165,7 +170,7 @@ class StopCause(Enum):
             Action.RELEASE_AT_ONCE,
             Clears.VERIFICATION,
             'overload',
-            f'free the arm; {RESET}',
+            (Step.FREE_ARM, Step.RESET_CONTROLLER),
         ),
     )
     OVERHEATED = (
@@ -175,7 +180,7 @@ class StopCause(Enum):
             Action.RELEASE,
             Clears.RESET,
             'overheated',
-            f'wait until all windings are below temperature_limit; {RESET}',
+            (Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
         ),
     )
     STALE_MUSCLE_STATES = (
@@ -185,7 +190,7 @@ class StopCause(Enum):
             Action.HOLD,
             Clears.CONDITION,
             'muscle_states are too old',
-            f'check that the driver is running; {RESET}',
+            (Step.CHECK_DRIVER, Step.RESET_CONTROLLER),
         ),
     )
     STALE_ESTIMATE = (
@@ -195,7 +200,7 @@ class StopCause(Enum):
             Action.HOLD,
             Clears.CONDITION,
             'estimated_joint_states are too old',
-            f'check that the estimator is running; {RESET}',
+            (Step.CHECK_ESTIMATOR, Step.RESET_CONTROLLER),
         ),
     )
 
@@ -210,11 +215,10 @@ class Condition(NamedTuple):
         return f'{self.cause.text}: {self.detail}' if self.detail else self.cause.text
 
 
-def remedy(causes: Sequence[StopCause]) -> str:
+def remedy_of(causes: Iterable[StopCause]) -> list[Step]:
     """Return the remedies of all causes in their order; each step once, and the reset last."""
-    steps = dict.fromkeys(step for cause in causes for step in cause.remedy.split('; '))
-    final = [step for step in steps if step.startswith((RESET, EXPLORE))]
-    return '; '.join([*(step for step in steps if step not in final), *final])
+    steps = dict.fromkeys(step for cause in causes for step in cause.steps)
+    return sorted(steps, key=lambda step: step in LAST)
 
 
 def table() -> str:

@@ -6,7 +6,7 @@ python -m musculoskeletal_ae.control.stops_page > doc/reference/stops.md
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.control import stops, supervisor
+from musculoskeletal_ae.control import remedy, stops, supervisor
 
 INTRODUCTION = """\
 # Why the arm stops, and how to continue
@@ -32,6 +32,13 @@ muscles until each exerts T_bias; `release at once` does not wait for `hold_time
 causes begin together, the first one in this table is reported.
 
 {table}
+
+## Steps of remedies
+
+The value `remedy` of the controller in `/diagnostics` is a sentence for people. The value \
+`remedy steps` lists the identifiers of its steps, in order.
+
+{steps}
 """
 
 
@@ -44,6 +51,7 @@ def page() -> str:
         states=_listed(states),
         diagram=supervisor.diagram(),
         table=stops.table(),
+        steps=remedy.table(),
     )
 
 

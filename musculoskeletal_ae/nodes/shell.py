@@ -35,6 +35,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
@@ -89,7 +90,7 @@ QOS_REMEDIES = {
 }
 MANY_REPORTS = QoSProfile(depth=50)  # all nodes of the graph report on one topic
 #: needed topics that are published continually, so that their silence is an error
-STREAMS = frozenset(['muscle_states', 'estimated_joint_states'])
+STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 #: [s] without a usable message after which a stream is silent
 SILENCE = 1.0
 #: [s] between two reports; more means that this node itself has paused, and messages wait unread
@@ -584,11 +585,10 @@ class Shell(Node):
         silent = None if has_paused else next(filter(self._is_silent, self.needed), None)
         if silent is None:
             return report
-        text = (
-            f'no usable {silent} for {self._reception.silence(silent):.0f} s: check that '
-            f'{AUTHORS[silent]} is running'
-        )
-        values = {**report.values, SILENT_TOPIC: text}
+        step = STREAMS[silent]
+        text = f'no usable {silent} for {self._reception.silence(silent):.0f} s: {step.text}'
+        steps = ', '.join(filter(None, [report.values.get(REMEDY_STEPS), step.identifier]))
+        values = {**report.values, SILENT_TOPIC: text, REMEDY_STEPS: steps}
         return Report('error', f'{report.message}; {text}', values)
 
     def _is_silent(self, topic: str) -> bool:
@@ -624,7 +624,9 @@ class Shell(Node):
             report, self._fault = Report('error', self._fault, values), ''
         if (intruders := self.intruders) and report.level != 'error':
             text = f'{SEVERAL}: {intruders}; {self.sources.remedy()}'
-            report = Report('error', text, {**report.values, SEVERAL: intruders})
+            steps = Step.STOP_SECOND_PUBLISHER.identifier
+            values = {**report.values, SEVERAL: intruders, REMEDY_STEPS: steps}
+            report = Report('error', text, values)
         report = self._with_silence(report)
         received = self._diagnostics.tell(report)
         self._log_waiting([topic for topic in self.needed if topic not in received])

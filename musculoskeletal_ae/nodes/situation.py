@@ -11,10 +11,13 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from musculoskeletal_ae.control.stops import EXPLORE, REPAIR, ZERO, StopCause
+from musculoskeletal_ae.control import remedy
+from musculoskeletal_ae.control.remedy import REPAIR, Step
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
 from musculoskeletal_ae.report import Level
@@ -52,6 +55,13 @@ def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> 
     error_text = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} {unit}'
     anomaly_text = 'waits for anomaly' if math.isnan(anomaly) else f'{anomaly:.3f}'
     return f'error {error_text}  A {anomaly_text}'
+
+
+class Trouble(NamedTuple):
+    """One part of the status line."""
+
+    text: str
+    steps: tuple[str, ...] = ()  # identifiers of the remedy's steps
 
 
 class Node:
@@ -157,22 +167,30 @@ class Situation:
 
     def trouble(self) -> str:
         """Return the causes of a stop with their remedies, other errors, and warnings."""
-        parts = [*self._stops(), *self._mismatches(), *self._silent()]
-        errors, warnings = [], []
+        return ', '.join(trouble.text for trouble in self._troubles())
+
+    def steps(self) -> list[str]:
+        """Return the identifiers of the steps that `trouble` advises (`control.remedy.Step`)."""
+        return [step for trouble in self._troubles() for step in trouble.steps]
+
+    def _troubles(self) -> list[Trouble]:
+        others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
+        errors, warnings = list[Trouble](), list[Trouble]()
         for name, node in self._nodes.items():
             if _is_own(name) or node.level == DiagnosticStatus.OK:
                 continue
             if self._is_shown(name, node):
                 if silent := node.values.get(SILENT_TOPIC):
-                    errors.append(f'{name}: {silent}')
+                    errors.append(Trouble(f'{name}: {silent}'))
                 if refused := node.values.get('refused'):
-                    warnings.append(f'warning: {name}: refused {refused}')
+                    warnings.append(Trouble(f'warning: {name}: refused {refused}'))
                 continue
             if node.level == DiagnosticStatus.WARN:
-                warnings.append(f'warning: {name}: {node.message}')
+                warnings.append(Trouble(f'warning: {name}: {node.message}'))
             else:
-                errors.append(f'{name}: {node.message}')
-        return ', '.join([*parts, *errors, *self._body(), *warnings])
+                steps = remedy.parse(node.values.get(remedy.REMEDY_STEPS, ''))
+                errors.append(Trouble(f'{name}: {node.message}', steps))
+        return [*self._stops(), *others, *errors, *self._body(), *warnings]
 
     def _values(self, name: str) -> dict[str, str]:
         node = self._nodes.get(f'{self._here}/{name}')
@@ -193,27 +211,31 @@ class Situation:
             return is_isolating if node.level == DiagnosticStatus.WARN else self.detected
         return False
 
-    def _stops(self) -> list[str]:
-        """Return the anomaly and the stop, each with its remedy."""
+    def _stops(self) -> list[Trouble]:
+        """Return the anomaly and the stop."""
         control = self._values('controller')
         mode, cause = control.get('mode'), control.get('stop cause')
         is_verifying = mode == VERIFYING
         is_stopped_by_anomaly = (
             mode in (STOPPED, VERIFYING) and cause == StopCause.ANOMALY.identifier
         )
-        parts = []
+        troubles = []
         if self.detected and is_verifying:
-            parts.append(f'ANOMALY: {self.suspect} is being verified')
+            troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified'))
         elif self.detected and is_stopped_by_anomaly:
-            parts.append(f'ANOMALY: {self.suspect}')
+            troubles.append(Trouble(f'ANOMALY: {self.suspect}'))
         elif self.detected:
-            parts.append(_with_remedy(f'ANOMALY: {self.suspect}', REPAIR))
+            troubles.append(_with_remedy(f'ANOMALY: {self.suspect}', *REPAIR))
         if mode == STOPPED or (is_verifying and not is_stopped_by_anomaly):
-            remedy = control.get('remedy', '')
+            text, steps = (
+                control.get('remedy', ''),
+                remedy.parse(control.get(remedy.REMEDY_STEPS, '')),
+            )
             if self._has_explored:
-                remedy = f'{remedy}; {EXPLORE}'
-            parts.append(_with_remedy(f'STOPPED: {control.get("stop", cause)}', remedy))
-        return parts
+                text, steps = f'{text}; {Step.EXPLORE.text}', (*steps, Step.EXPLORE.identifier)
+            stop = control.get('stop', cause)
+            troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
+        return troubles
 
     def _mismatches(self) -> list[str]:
         return [
@@ -222,28 +244,35 @@ class Situation:
             if reports >= REPORTS
         ]
 
-    def _silent(self) -> list[str]:
-        """Return the nodes that have stopped reporting, with the time since."""
+    def silent_nodes(self) -> dict[str, float]:
+        """Return the needed nodes that have stopped reporting, and the time since [s]."""
         now = self._ticked_at - self._slept
-        return [
-            f'{name}: no report for {now - node.heard_at:.0f} s: see its log, then restart it'
+        return {
+            name: now - node.heard_at
             for name, node in self._nodes.items()
             if now - node.heard_at > SILENT and _is_needed(name)
+        }
+
+    def _silent(self) -> list[str]:
+        return [
+            f'{name}: no report for {silence:.0f} s: see its log, then restart it'
+            for name, silence in self.silent_nodes().items()
         ]
 
-    def _body(self) -> list[str]:
+    def _body(self) -> list[Trouble]:
         """Return isolated muscles and unknown length offsets.
 
         A restarted estimator starts from the offsets of its first start, which may be wrong. The
         controller then treats them as unknown, although the estimator reports none as unknown.
         """
-        values, parts = self._values('estimator'), []
+        values, troubles = self._values('estimator'), []
         if isolated := values.get('isolated muscles'):
-            parts.append(f'isolated: {isolated}')
-        zeros = 'unknown length offsets'
-        if unknown := values.get(zeros) or self._values('controller').get(zeros):
-            parts.append(_with_remedy(f'length offsets unknown: {unknown}', ZERO))
-        return parts
+            troubles.append(Trouble(f'isolated: {isolated}'))
+        key = 'unknown length offsets'
+        if unknown := values.get(key) or self._values('controller').get(key):
+            text = f'length offsets unknown: {unknown}'
+            troubles.append(_with_remedy(text, Step.CALIBRATE_LENGTHS))
+        return troubles
 
     @property
     def is_stopped(self) -> bool:
@@ -272,5 +301,6 @@ def _is_own(name: str) -> bool:
     return name.rpartition('/')[2] == 'bringup_status'
 
 
-def _with_remedy(trouble: str, remedy: str) -> str:
-    return f'{trouble} (to go on: {remedy})'
+def _with_remedy(text: str, *steps: Step) -> Trouble:
+    names = tuple(step.identifier for step in steps)
+    return Trouble(f'{text} (to go on: {remedy.sentence(steps)})', names)

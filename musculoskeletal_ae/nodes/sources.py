@@ -54,7 +54,7 @@ LOOKS, TURNS = 20, 3  # TURNS turns within LOOKS checks mean two publishers of o
 LEASE = 30.0
 #: [s] for which the graph may know a publisher but not its node
 NAMING = 1.0
-TWIN_SILENCE = 3.0  # [s] without a report after which a second node has ended
+TWIN_SILENCE = 3.0  # [s] without a report after which a second node counts as stopped
 UNNAMED = '_NODE_NAME_UNKNOWN_'
 
 
@@ -217,8 +217,8 @@ class Sources:
         """Return the remedy for several publishers."""
         authors = {AUTHORS[topic] for topic, each in self._authorships.items() if each.intruders}
         if not authors:
-            return 'end one of them'
-        return f'end all publishers but {" and ".join(sorted(authors))} of this arm'
+            return 'stop one of them'
+        return f'stop all of them except {" and ".join(sorted(authors))} of this arm'
 
     def _shown(self, topic: str) -> str:
         """Return the name of a topic, or the full name of the topic that takes its place."""

@@ -8,6 +8,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import JointState
 
+from musculoskeletal_ae.control.remedy import identifiers
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.situation import Situation, figures
@@ -72,6 +73,7 @@ def stopped(cause, mode='stopped'):
         'stop_cause': cause.identifier,
         'stop': str(Condition(cause)),
         'remedy': cause.remedy,
+        'remedy_steps': identifiers(cause.steps),
     }
     return said('/left/controller', f'stopped: {cause.text}', DiagnosticStatus.ERROR, **values)
 
@@ -97,6 +99,7 @@ def test_every_stop_is_shown_with_the_remedy_of_its_cause(cause):
     situation = Situation('/left')
     situation.diagnosed(stopped(cause))
     assert situation.trouble() == f'STOPPED: {cause.text} (to go on: {cause.remedy})'
+    assert situation.steps() == [step.identifier for step in cause.steps]
 
 
 def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
@@ -111,6 +114,7 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
         'call estimator/reset; call controller/reset; call controller/explore to explore again)'
     )
+    assert situation.steps() == ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore']
     situation.diagnosed(said('/left/estimator', finding='none'))
     situation.diagnosed(said('/left/controller', mode='holding'))
     assert situation.trouble() == ''

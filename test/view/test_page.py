@@ -19,7 +19,8 @@ from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
-from musculoskeletal_ae.control.stops import EXPLORE, StopCause
+from musculoskeletal_ae.control.remedy import Step
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED
 
@@ -133,7 +134,7 @@ def test_remedies_name_the_buttons_of_the_page(arm26):
     page = Page(arm26, '127.0.0.1', free_port(), False, lambda *_: None)
     try:
         for cause in StopCause:
-            text = page.with_buttons(f'{cause.remedy}; {EXPLORE}')
+            text = page.with_buttons(f'{cause.remedy}; {Step.EXPLORE.text}')
             assert 'call ' not in text and 'press "Explore"' in text
             assert text.count('Reset after a stop') <= 1
     finally:

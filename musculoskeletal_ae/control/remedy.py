@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declares the steps of remedies: identifiers for programs, and texts for users.
+
+A remedy is a sequence of steps, to be taken in order. /diagnostics has it twice: the value `remedy`
+is a sentence, and `remedy steps` lists the identifiers.
+"""
+
+from collections.abc import Iterable
+from enum import Enum
+
+
+class Step(Enum):
+    """One step of a remedy; the value contains the stable identifier and the text."""
+
+    def __init__(self, identifier: str, text: str) -> None:
+        self.identifier, self.text = identifier, text
+
+    RESET_CONTROLLER = 'reset_controller', 'call controller/reset'
+    RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset'
+    CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero'
+    EXPLORE = 'explore', 'call controller/explore to explore again'
+    EXPLORE_GENTLY = (
+        'explore_gently',
+        'call controller/explore to explore again, gently until the offsets are known',
+    )
+    REPAIR_MUSCLE = 'repair_muscle', 'repair the muscle'
+    FREE_ARM = 'free_arm', 'free the arm'
+    CHECK_SENSOR = (
+        'check_sensor',
+        'check the named sensor, or call estimator/zero if lengths are off',
+    )
+    CHECK_CHECKPOINT = 'check_checkpoint', 'check the checkpoint'
+    CHECK_DRIVER = 'check_driver', 'check that the driver is running'
+    CHECK_ESTIMATOR = 'check_estimator', 'check that the estimator is running'
+    STOP_SECOND_PUBLISHER = (
+        'stop_second_publisher',
+        'stop the node that does not belong to this arm',
+    )
+    STOP_OTHER_ROBOT = (
+        'stop_other_robot',
+        'stop the node that publishes accepted_checkpoint of another robot',
+    )
+    PROVIDE_CHECKPOINT = (
+        'provide_checkpoint',
+        'set the parameter checkpoint, or start the learner',
+    )
+    WAIT_UNTIL_COOL = 'wait_until_cool', 'wait until all windings are below temperature_limit'
+    REPORT_LOG = 'report_log', 'report the log'
+
+
+REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics
+#: remedy for an anomaly
+REPAIR = Step.REPAIR_MUSCLE, Step.RESET_ESTIMATOR
+
+
+def sentence(steps: Iterable[Step]) -> str:
+    """Return a remedy as a text for users."""
+    return '; '.join(step.text for step in steps)
+
+
+def identifiers(steps: Iterable[Step]) -> str:
+    """Return a remedy as the value `remedy steps` of /diagnostics."""
+    return ', '.join(step.identifier for step in steps)
+
+
+def parse(value: str) -> tuple[str, ...]:
+    """Return the identifiers in a value `remedy steps`; unknown ones are kept."""
+    return tuple(filter(None, value.split(', ')))
+
+
+def table() -> str:
+    """Return the steps as a Markdown table."""
+    rows = [f'| `{step.identifier}` | {step.text} |' for step in Step]
+    return '\n'.join(['| identifier | step |', '|---|---|', *rows])
