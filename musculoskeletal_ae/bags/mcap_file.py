@@ -20,6 +20,7 @@ from musculoskeletal_ae.bags.storage import (
     CONVERT,
     LATEST,
     LONGEST_DISORDER,
+    LONGEST_PAUSE,
     BagMessage,
     BagTopic,
     absolute,
@@ -187,7 +188,7 @@ class McapFile:
         if newest - time > LONGEST_DISORDER:
             problem = f'the log times of {topic.name} go back by {(newest - time) / 1e9:.3g} s'
             raise BagError(self.path, problem, _JUMP)
-        if self.end - time > LONGEST_DISORDER:
+        if self.end - time > LONGEST_PAUSE:
             raise BagError(self.path, 'its messages are not in chronological order', CONVERT)
 
 

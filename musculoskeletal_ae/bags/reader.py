@@ -17,7 +17,7 @@ from musculoskeletal_ae.bags import mcap_file, message_types, sqlite3_file
 from musculoskeletal_ae.bags.metadata import FILE, Contents, read_metadata
 from musculoskeletal_ae.bags.storage import (
     LATEST,
-    LONGEST_DISORDER,
+    LONGEST_PAUSE,
     BagMessage,
     BagTopic,
     StorageFile,
@@ -120,14 +120,14 @@ def _open_file(path: Path) -> StorageFile:
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Sort messages, at most LONGEST_DISORDER out of order, by log time."""
+    """Sort messages, at most LONGEST_PAUSE out of order, by log time."""
     waiting: list[tuple[int, int, BagMessage]] = []
     newest = held = 0
     for number, message in enumerate(messages):
         newest = max(newest, message.log_time)
         heapq.heappush(waiting, (message.log_time, number, message))
         held += len(message.data) + _OVERHEAD
-        while waiting[0][0] < newest - LONGEST_DISORDER or held > MOST_HELD:
+        while waiting[0][0] < newest - LONGEST_PAUSE or held > MOST_HELD:
             _, _, earliest = heapq.heappop(waiting)
             held -= len(earliest.data) + _OVERHEAD
             yield earliest

@@ -23,6 +23,8 @@ from musculoskeletal_ae.files import open_regular
 
 # The log times of a topic may go back by this much; more is a jump of the recorder's clock.
 LONGEST_DISORDER = 1_000_000_000  # [ns]
+# A recorder that was paused for this long writes one topic after the other.
+LONGEST_PAUSE = 10_000_000_000  # [ns]
 LATEST = (1 << 63) - 1  # [ns]; the largest ROS time
 
 DAMAGED = 'use a copy or another recording'
@@ -92,7 +94,7 @@ class StorageFile(Protocol):
     ) -> Iterator[BagMessage]:
         """Yield messages of these topics from start to stop [ns], both included.
 
-        They keep the order of the file, which is chronological within LONGEST_DISORDER.
+        They keep the order of the file, which is chronological within LONGEST_PAUSE.
         """
         ...
 

@@ -606,7 +606,8 @@ class Shell(Node):
             else f'{self.full_name(topic)}, on which no usable message has arrived'
             for topic in missing
         ]
-        before, self._waiting = self._waiting, '; '.join(reasons)
+        # A topic may carry both joint angles and motors.
+        before, self._waiting = self._waiting, '; '.join(dict.fromkeys(reasons))
         if self._waiting != before:
             text = f'waiting for {self._waiting}' if reasons else 'receiving all needed topics'
             self.get_logger().info(text)

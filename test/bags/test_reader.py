@@ -156,7 +156,7 @@ def test_messages_are_ordered_by_time_and_equal_times_as_in_the_file(
 
 def test_topics_one_after_the_other_are_refused_and_the_remedy_helps(tmp_path):
     data = [
-        samples.Sample(f'/{a}/anomaly', FLOAT, t * 10**8, 0, ONE) for a in 'lr' for t in range(30)
+        samples.Sample(f'/{a}/anomaly', FLOAT, t * 10**9, 0, ONE) for a in 'lr' for t in range(30)
     ]
     samples.write_mcap(tmp_path / 'a.mcap', data)
     with pytest.raises(BagError, match=r'not in chronological order; .*rosbags-convert'):

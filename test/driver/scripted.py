@@ -13,6 +13,7 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 PERIOD = 0.01  # [s]
 
@@ -27,6 +28,9 @@ class Driver:
         self.take: Callable = lambda target: target
         self.names = robot.joints
         self.angles: Callable = lambda theta: theta  # (D,) as published
+        # Turns rows (3, M) at a time into messages of ros2_control, which `motors` reads.
+        self.message: Callable = lambda rows, _: array(rows)
+        self.motors: MotorInterface | None = None
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
         self._commands: deque = deque()
@@ -61,7 +65,7 @@ class Driver:
         self, seconds: float = 5.0, moved: bool = False, joints: bool = True, zeroed: bool = True
     ) -> Verdict:
         """Return what `Listening` says, of the resting arm or while its hand is pushed about."""
-        listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed)
+        listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)
         for k in range(round(seconds / PERIOD)):
             if moved:
                 self.arm.set_wrench(30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0])))
@@ -69,7 +73,7 @@ class Driver:
                 if joints:
                     angles = self.angles(theta)
                     listening.joints(joint_state(dict(zip(self.names, angles))))
-                listening.muscles(array(rows), self.now)
+                listening.muscles(self.message(rows, self.now), self.now)
         self.arm.set_wrench(np.zeros(6))
         return listening.verdict(self.now)
 

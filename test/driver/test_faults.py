@@ -2,11 +2,12 @@
 """A sound driver is found sound; each thing that a driver may get wrong is found, and named."""
 
 import copy
+import inspect
 import math
 import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+from musculoskeletal_ae.signals import motor_interface
+from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 ROBOT = Robot.load('arm26')
 M, BICEPS = ROBOT.muscle_count, 4
@@ -161,17 +165,59 @@ def test_advice_on_a_rejected_message_is_that_of_its_topic():
 
 
 def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
-    source = Path(validity.__file__).read_text('utf-8')
     readers = {
-        'muscle_states': ('read_muscle_states', '_values'),
-        'joint_states': ('read_posture', 'joint_names'),
+        ('muscle_states', validity): ('read_muscle_states', '_values'),
+        ('joint_states', validity): ('read_posture', 'joint_names'),
+        ('motors', validity): ('read_muscle_states', 'joint_names'),
+        ('motors', motor_interface): ('reading', '_find'),
     }
-    for topic, functions in readers.items():
+    for (topic, module), functions in readers.items():
+        source = inspect.getsource(module)
         for name in functions:
-            text = source.partition(f'def {name}(')[2].partition('\ndef ')[0]
+            text = re.split(r'\n *def ', source.partition(f'def {name}(')[2])[0]
             reasons = re.findall(r"MessageError\(\s*'([^']+)'", text)
             assert reasons
             assert {f'{topic}: {reason}' for reason in reasons} <= FAULTS.keys()
+
+
+def ros2_control(**wrong):
+    """Return a driver of motors, and the settings by which they are read, some of them wrong."""
+    right = MotorSettings(
+        motor_state_topic='joint_states', spool_radius=(0.012,), motor_direction=(-1.0,)
+    )
+    interface, driver = MotorInterface(right, ROBOT.muscles), settled()
+
+    def message(rows, now):
+        names, position, effort = interface.joint_values(rows[0], rows[1])
+        stamp = SimpleNamespace(sec=1 + int(now), nanosec=round(now % 1.0 * 1e9))
+        header = SimpleNamespace(stamp=stamp)
+        arrays = {'position': position, 'velocity': [], 'effort': effort}
+        return SimpleNamespace(header=header, name=list(names), **arrays)
+
+    driver.message = message
+    driver.motors = MotorInterface(replace(right, **wrong), ROBOT.muscles)
+    return driver
+
+
+def test_the_motors_of_ros2_control_are_judged_as_muscles():
+    verdict = ros2_control().listen(5.0, moved=True)
+    assert not verdict.faults and 'nothing protects the motors from heat' in str(verdict)
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'check', 'reported'),
+    [
+        ({'motor_direction': (1.0,)}, 'sign', 'by the parameters spool_radius, motor_direction'),
+        ({'spool_radius': (0.036,)}, 'unit', 'times the change that the route predicts'),
+        ({'motor_zero': (8.0,)}, 'zero', 'from the length that the route predicts'),
+        ({'tension_per_effort': (0.224,)}, 'unit', 'tensions look like'),
+        ({'motor_names': tuple('abcdef')}, 'order', 'correct the parameter motor_names'),
+    ],
+)
+def test_a_wrong_parameter_of_the_motors_is_found(wrong, check, reported):
+    verdict = ros2_control(**wrong).listen(5.0, moved=True)
+    assert check in verdict.wrong, str(verdict)
+    assert reported in str(verdict)
 
 
 def test_one_joint_sensor_without_a_number_is_named():
