@@ -281,6 +281,18 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     assert robot.muscles[strongest] in reported.values['tension limited by heat']
 
 
+def test_a_muscle_without_a_measured_temperature_is_reported_as_not_protected():
+    bench = Bench()
+    bench.step(20)
+    assert 'not protected from heat' not in bench.report().values
+    bench.temperature = np.full(ROBOT.muscle_count, np.nan)
+    bench.step(20)
+    values = bench.report().values
+    assert values['not protected from heat'] == 'no temperature is measured of any muscle'
+    assert 'temperature of windings' not in values
+    assert (bench.core.watchdog.heat.planned == ROBOT.tension.max).all()
+
+
 def test_a_stop_is_reported_with_every_cause_that_refuses_the_reset():
     bench = Bench()
     bench.core.stop(StopCause.OPERATOR)

@@ -6,11 +6,14 @@ import os
 
 import pytest
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.nodes import stop_recording
 from musculoskeletal_ae.nodes.stop_recording import FILE, SECONDS, StopRecording
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 
 @pytest.fixture
@@ -115,3 +118,16 @@ def test_an_incomplete_recording_on_a_full_disk_is_deleted_and_reported(
     recording.close()
     assert not list(tmp_path.iterdir())
     assert recording.saved is None and 'No space left' in recording.problem
+
+
+def test_the_motors_of_ros2_control_are_kept_as_they_were_received(tmp_path):
+    motors = MotorSettings(motor_state_topic='/joint_states')
+    recording = StopRecording(str, tmp_path, topics_with(motors))
+    data = serialize_message(JointState(name=['motor'], position=[0.5]))
+    recording.heard('/joint_states', data)
+    recording.save('a cause', 10)
+    recording.close()
+    bag = Bag.open(recording.saved)
+    (message,) = bag.messages()
+    assert message.topic == '/joint_states' and message.data == data
+    assert bag.topics['/joint_states'].type == 'sensor_msgs/msg/JointState'
