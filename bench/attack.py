@@ -188,14 +188,14 @@ def attack_graph(
             print(f'  episode {episode + 1} of {size.episodes}', flush=True)
         print(f'  messages: {time.monotonic() - begun:.0f} s', flush=True)
         attack.moving()
-    return judged(attack)
+    return evaluate(attack)
 
 
-def judged(attack: 'Attack') -> list[Row]:
+def evaluate(attack: 'Attack') -> list[Row]:
     """Return the promises and their violations, from the recorded data."""
     from bench.attack_graph import LENGTH
 
-    robot, tried, found = attack.robot, attack.tried, attack.findings
+    robot, tried, violations = attack.robot, attack.tried, attack.findings
     fast, wound, count = list[str](), list[str](), 0
     stops = [
         (begin, end, mode)
@@ -236,7 +236,7 @@ def judged(attack: 'Attack') -> list[Row]:
         if most > MOST_MEMORY or max(old) > GROWTH * old[0]:
             fat.append(f'{name} from {old[0]:.0f} to {most:.0f} MB')
     sent = tried['messages'] + tried['requests']
-    take = found.pop
+    take = violations.pop
     return [
         Row('no message, request or event ends a node', sent, take('no node ends', [])),
         Row('every node goes on and reports', sent, silent + take('every node goes on', [])),
@@ -251,7 +251,7 @@ def judged(attack: 'Attack') -> list[Row]:
         Row(
             'the arm moves again afterwards',
             tried['attacks'] + tried['events'],
-            [what for broken in found.values() for what in broken],
+            [what for broken in violations.values() for what in broken],
         ),
     ]
 

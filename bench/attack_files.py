@@ -309,11 +309,11 @@ def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
             assert child.stdout is not None and child.stderr is not None
             begun, last = done, ''
             for line in child.stdout:
-                said = json.loads(line)
-                if said[0] == 'begun':
-                    last = f'file {said[1]}, {said[2]}'
+                event = json.loads(line)
+                if event[0] == 'begun':
+                    last = f'file {event[1]}, {event[2]}'
                     continue
-                result, done = Attempt(*said), done + 1
+                result, done = Attempt(*event), done + 1
                 outcomes[f'{result.kind}: {result.outcome.split(":")[0]}'] += 1
                 if result.broken:
                     findings.append(f'{last}: {result}')

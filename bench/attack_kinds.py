@@ -29,7 +29,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_mess
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # [s] duration of an attack
-SAID = 2.0  # [s] after which the status line has to report a problem
+REPORT_TIME = 2.0  # [s] after which the status line has to report a problem
 OFFSET = 0.08  # [m] of false length offsets
 STEPS = {step.identifier: step for step in Step}
 
@@ -38,7 +38,7 @@ class Scene:
     """An arm that holds or explores, attacked in one known way."""
 
     def __init__(self, attack: Attack) -> None:
-        """Attack the system of `attack`."""
+        """Use a running system and the hostile node of `attack`."""
         self.attack, self.rng = attack, attack.rng
         self.what = ''  # present attack, for findings
 
@@ -62,7 +62,7 @@ class Scene:
         silent = [
             at
             for at, level, _ in self.attack.status
-            if begin + SAID < at < time.time() and level == 'ok'
+            if begin + REPORT_TIME < at < time.time() and level == 'ok'
         ]
         self.attack.tried['status'] += 1
         if silent:

@@ -89,14 +89,14 @@ class Command(NamedTuple):
 
 def commands(page: Path) -> list[Command]:
     """Return the commands of a page in their order."""
-    found = []
+    commands = []
     for mark, block in _blocks(page):
         reason = 'only without a ros2 command' if mark == ROS2 else mark.removeprefix('skip ')
         for command in _joined(block.splitlines()):
             line = re.sub(r'\s+#.*', '', command)
             if line:
-                found.append(Command(line, BACKGROUND in command, reason))
-    return found
+                commands.append(Command(line, BACKGROUND in command, reason))
+    return commands
 
 
 def _blocks(page: Path) -> list[tuple[str, str]]:

@@ -124,9 +124,9 @@ class EagerSimulation:
     def _lengths(self, theta: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
         """Return l (N, M), and Gᵀ T (N, D), of the network."""
         angles, muscles = theta.detach().requires_grad_(), tension.shape[1]
-        given = torch.cat((angles, tension, torch.zeros_like(tension)), dim=1)
+        inputs = torch.cat((angles, tension, torch.zeros_like(tension)), dim=1)
         mask = torch.zeros(len(theta), dtype=torch.long)
-        restored = self.network(given * self.scale, mask) / self.scale
+        restored = self.network(inputs * self.scale, mask) / self.scale
         length = restored[:, -muscles:]
         return length.detach(), torch.autograd.grad(length, angles, tension)[0]
 

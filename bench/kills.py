@@ -112,7 +112,7 @@ class Child:
         assert self._process.stderr is not None
         return self._process.stderr.read()
 
-    def said(self, word: str) -> list[int]:
+    def numbers_after(self, word: str) -> list[int]:
         """Return the numbers that were reported after a word."""
         return [int(line[1]) for line in self.lines if line[0] == word and len(line) > 1]
 
@@ -138,9 +138,9 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
             child.up.wait(DEADLINE)
         time.sleep(max(0.0, begun + wanted - time.monotonic()))
         child.kill()
-        versions = child.said('published')
-        if found := child.said('found'):
-            fitting = [store for store in possible if digest(store) == found[0]]
+        versions = child.numbers_after('published')
+        if digests := child.numbers_after('found'):
+            fitting = [store for store in possible if digest(store) == digests[0]]
             if not fitting:
                 lost.append(f'life {life}: the samples found are not those accepted before')
                 break

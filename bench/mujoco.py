@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learns MuJoCo models of others, and says what became of them.
+"""Learns published MuJoCo models, and prints the results for each individual.
 
     python -m bench mujoco NAME=FILE[:joints=A,B][:without=C,D][:end=E] … --out DIR [--minutes 10]
 
-The models are public ones that you have fetched; nothing of them is part of this repository:
+You have to fetch the models yourself; this repository does not contain them:
 
     arm26           google-deepmind/mujoco, model/tendon_arm/arm26.xml (Apache-2.0)
     elbow           MyoHub/myo_sim, elbow/myoelbow_2dof6muscles.xml (Apache-2.0)
@@ -11,13 +11,17 @@ The models are public ones that you have fetched; nothing of them is part of thi
     aero_hand       google-deepmind/mujoco_playground, aero_hand/xmls/right_hand.xml, a hand of
                     TetherIA (Apache-2.0), with its meshes of mujoco_menagerie
 
-Each seed is an individual that deviates from the file (`emulator/deviation.py`). A row says: the
-error of the estimate on the held-out motion before and after learning, preset `paper` beside it
-[rad, norm over the joints]; how many ruptures were detected and named; the error while the arm
-follows trajectories of 2 s between holdable postures [rad]; by how much moment arms of the exported
-model are off from those of the learned network, and how large these are [mm, median of the
-muscles]; how many seconds of the model a core computes in a second; and how long the initial
-training took on a core [s].
+Each seed is an emulated individual that deviates from the file (`emulator/deviation.py`). The
+columns of a row are
+
+- the estimation error on the held-out motion before learning, after learning with preset `paper`,
+  and after learning with preset `default` [rad, norm over the joints],
+- the numbers of ruptures that were detected, and attributed to the right muscle,
+- the error while the arm follows trajectories of 2 s between holdable postures [rad],
+- the error of the moment arms of the exported model relative to the learned network, and the size
+  of these moment arms [mm, median over the muscles],
+- the number of seconds of the model that one core computes in a second, and
+- the duration of the initial training on one core [s].
 """
 
 import time
@@ -53,7 +57,7 @@ LISTS = 'joints', 'muscles', 'without'
 
 
 class Individuals(Study):
-    """Individuals of a MuJoCo file, instead of one of the package's own bodies."""
+    """A study of individuals of a MuJoCo file instead of a shipped robot."""
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
         """Return an individual at rest."""
@@ -61,7 +65,7 @@ class Individuals(Study):
 
 
 def parse(text: str) -> tuple[str, Path, dict[str, Any]]:
-    """Return name, file and what is to be kept of a model."""
+    """Return the name and file of a model, and the arguments that select a part of it."""
     name, _, rest = text.partition('=')
     file, *options = rest.split(':')
     chain: dict[str, Any] = {}
@@ -72,27 +76,27 @@ def parse(text: str) -> tuple[str, Path, dict[str, Any]]:
 
 
 def speed(arm: Arm) -> float:
-    """Return how many seconds of an arm a core computes in a second."""
+    """Return the number of seconds of an arm that one core computes in a second."""
     arm.step(0.2)
     start = time.process_time()
     arm.step(2.0)
     return 2.0 / (time.process_time() - start)
 
 
-def followed(study: Study, seed: int) -> float:
-    """Return the mean error on the way between holdable postures [rad]."""
+def tracking_error(study: Study, seed: int) -> float:
+    """Return the mean error while the arm moves between holdable postures [rad]."""
     robot, rng, mae = study.robot, np.random.default_rng([seed, 0x307]), study.network(seed)
     arm = study.arm(seed)
     postures = robot.random_postures(TRIES, rng)
     held = holdable_postures(robot, postures, MOTIONS + 1, arm.individual.muscle_jacobian)
-    ways = [theta for theta, _ in held]
-    loop = motion.loop_at(study.arm(seed), mae, ways[0], motion.OURS, DURATION)
-    runs = [motion.follow(loop, a, b, motion.OURS, DURATION) for a, b in pairwise(ways)]
+    targets = [theta for theta, _ in held]
+    loop = motion.loop_at(study.arm(seed), mae, targets[0], motion.OURS, DURATION)
+    runs = [motion.follow(loop, a, b, motion.OURS, DURATION) for a, b in pairwise(targets)]
     return float(np.concatenate([run.error for run in runs]).mean())
 
 
-def measured(study: Study, name: str, seed: int, training: float) -> list[str]:
-    """Return the cells of one individual."""
+def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
+    """Return the cells of one individual; `training` is the duration of its training [s]."""
     robot = study.robot
     held_out = record(study.arm(seed), study.network(None), 0xB0 + seed, study.held_out_time)
     cells = [name, str(seed), str(robot.joint_count), str(robot.muscle_count)]
@@ -102,29 +106,32 @@ def measured(study: Study, name: str, seed: int, training: float) -> list[str]:
         online_learning.teach(learner, online_learning.explore(loop, learner, 60.0 * study.minutes))
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         cells.append(f'{estimation_error(learner.mae, held_out):.4f}')
-    cells += [*detected(study, seed), attempt(lambda: f'{followed(study, seed):.4f}')]
+    cells += [*rupture_cells(study, seed), attempt(lambda: f'{tracking_error(study, seed):.4f}')]
     out = study.folder / f'model_{seed}'
     report = export(robot, study.network(seed), out)
     cells += [f'{1e3 * np.median(part):.2f}' for part in (report.arms, report.arm_size)]
     return [*cells, f'{speed(study.arm(seed)):.1f}', f'{training:.0f}']
 
 
-def detected(study: Study, seed: int) -> list[str]:
-    """Return how many ruptures of muscles that carried tension were detected, and rightly named."""
+def rupture_cells(study: Study, seed: int) -> list[str]:
+    """Return how many ruptures were detected, and attributed to the right muscle.
+
+    Only ruptures of muscles that carried tension count.
+    """
     robot, mae = study.robot, study.network(seed)
     plan = GraspAndRupture(robot, study.held_out_time, seed)
-    plan.grasp = -1.0  # never: the printed dumbbell weighs more than some of these arms
-    driven = study.network(None)
-    cut = record(study.arm(seed), driven, 0xC0 + seed, plan.duration, plan)
-    well = record(study.arm(seed), driven, 0xD0 + seed, study.held_out_time)
-    seen, healthy = run_detector(robot, mae, cut), run_detector(robot, mae, well)
-    found = detection(robot, plan, seen, healthy, mae)
-    count = found['counted_cuts']
-    return [f'{round(found[k] * count)} of {count}' for k in ('detected_share', 'named_share')]
+    plan.grasp = -1.0  # never: the dumbbell of the paper is too heavy for some of these arms
+    initial = study.network(None)
+    with_ruptures = record(study.arm(seed), initial, 0xC0 + seed, plan.duration, plan)
+    healthy = record(study.arm(seed), initial, 0xD0 + seed, study.held_out_time)
+    runs = (run_detector(robot, mae, recording) for recording in (with_ruptures, healthy))
+    result = detection(robot, plan, *runs, mae)
+    count = result['counted_cuts']
+    return [f'{round(result[k] * count)} of {count}' for k in ('detected_share', 'named_share')]
 
 
 def attempt(cell: Callable[[], str]) -> str:
-    """Return a cell, or why there is none."""
+    """Return a cell, or the error that prevented it."""
     try:
         return cell()
     except MusculoskeletalError as error:
@@ -147,7 +154,7 @@ def model_rows(
     training = time.process_time() - start
     online_learning.train_initial(study, AS_PRINTED)
     for seed in args.seeds:
-        yield measured(study, name, seed, training)
+        yield table_row(study, name, seed, training)
 
 
 def main(argv: list[str]) -> None:

@@ -111,21 +111,21 @@ def rows(head: str, lines: Iterable[Iterable[object]]) -> str:
 
 def core(measured: Iterable[timings.Timed]) -> str:
     """Return the table of core steps."""
-    said = []
+    cells = []
     for row in measured:
         ratio = f'{row.torch_eager / row.ours:.1f}' if row.torch_eager else ''
         numbers = (f'{v:.1f}' if v else '' for v in (row.ours, row.torch_eager, row.bound))
-        said.append((row.name, BEFORE_CORE.get(row.name, ''), *numbers, ratio))
+        cells.append((row.name, BEFORE_CORE.get(row.name, ''), *numbers, ratio))
     head = '| before [µs] | now [µs] | torch eager [µs] | bound [µs] | times faster'
-    return rows(head, said)
+    return rows(head, cells)
 
 
 def wire(seconds: float) -> dict[tuple[str, float, str], Wire]:
     """Measure the running system; return the results by robot, rate and kind of nodes."""
     return {
-        (robot, rate, kind): found
+        (robot, rate, kind): result
         for robot in SIZES
-        for rate, kind, found in systems(
+        for rate, kind, result in systems(
             robot, RATES, KINDS if robot == ARM else ('nodes', 'with learner'), seconds
         )
     }
@@ -133,29 +133,29 @@ def wire(seconds: float) -> dict[tuple[str, float, str], Wire]:
 
 def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
     """Return the table of the running system."""
-    said = []
-    for (robot, rate, kind), found in measured.items():
-        latency = ' / '.join(f'{value:.1f}' for value in found.latency)
+    cells = []
+    for (robot, rate, kind), result in measured.items():
+        latency = ' / '.join(f'{value:.1f}' for value in result.latency)
         # The earlier values were measured with the learner, except those at 500 Hz.
         same = 'nodes' if rate == max(RATES) else 'with learner'
         known = BEFORE_WIRE[rate] if (robot, kind) == (ARM, same) else ('', '')
-        lost = f'{found.late:.1f}', f'{found.missed:.1f}'
-        cost = known[1], f'{sum(found.cpu.values()):.0f}'
-        said.append((robot, f'{rate:.0f}', kind, known[0], latency, *lost, *cost))
+        lost = f'{result.late:.1f}', f'{result.missed:.1f}'
+        cost = known[1], f'{sum(result.cpu.values()):.0f}'
+        cells.append((robot, f'{rate:.0f}', kind, known[0], latency, *lost, *cost))
     head = (
         'robot | rate [Hz] | nodes | before: 50 % / 99 % / largest [ms] | now [ms] | late [%] | '
         'missed [%] | CPU before [%] | now [%]'
     )
-    return rows(head, said)
+    return rows(head, cells)
 
 
 def goals(numbers: dict[str, tuple[float, str, float]]) -> str:
     """Return the table of goals: measured value, ≤ or ≥, and limit of each."""
-    said = []
+    cells = []
     for name, (value, sign, limit) in numbers.items():
         met = value <= limit if sign == '≤' else value >= limit
-        said.append((name, f'{sign} {limit:g}', f'{value:.3g}', 'met' if met else '**missed**'))
-    return rows('| goal | now |', said)
+        cells.append((name, f'{sign} {limit:g}', f'{value:.3g}', 'met' if met else '**missed**'))
+    return rows('| goal | now |', cells)
 
 
 def resident(pid: int) -> tuple[float, float]:
@@ -184,7 +184,7 @@ def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, flo
 
 def starting(used: dict[str, float], held: dict[str, tuple[float, float]], network: Path) -> str:
     """Return the table of start-up times and memory."""
-    said = (
+    cells = (
         (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
     )
     system = System(ARM, network, FLAME_RATE, KINDS['messages alone'])
@@ -194,7 +194,7 @@ def starting(used: dict[str, float], held: dict[str, tuple[float, float]], netwo
     finally:
         system.end()
     head = 'node | CPU until the first command [s] | memory before [MB] | now [MB]'
-    return rows(head, (*said, ('messages alone', '', '', f'{floor:.0f}')))
+    return rows(head, (*cells, ('messages alone', '', '', f'{floor:.0f}')))
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:

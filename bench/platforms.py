@@ -266,8 +266,8 @@ def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
     lines = []
     for line in file.read_text('utf-8').splitlines():
         requirement, _, condition = line.partition(';')
-        found = re.match(r'([\w-]+)==', requirement)
-        if found and (not names or found[1] in names):
+        match = re.match(r'([\w-]+)==', requirement)
+        if match and (not names or match[1] in names):
             is_old = version == '3.10'
             if not condition or ('<' in condition) == is_old:
                 lines.append(requirement.strip())

@@ -115,8 +115,10 @@ def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
             kept = np.append(kept[1:], rng.integers(count))  # each update has a new sample
             part = exploring.part(kept)
             none = np.zeros_like(part.tension)
-            seen = Observations(part.theta_sensor, part.tension, part.length, none, none == 0.0)
-            job = Job(seen, Healthy(messages, 600.0, 100), True, STEPS)
+            observations = Observations(
+                part.theta_sensor, part.tension, part.length, none, none == 0.0
+            )
+            job = Job(observations, Healthy(messages, 600.0, 100), True, STEPS)
             begun = time.process_time()
             updater.update(job)
             times.append(time.process_time() - begun)

@@ -80,7 +80,7 @@ class RareTrainer(Trainer):
         return self.samples >= min(self.every, 1 + len(self.seconds) // 4)
 
 
-def judged(worst: float, filled: float, most: float, times: list[float]) -> list[str]:
+def failures_of(worst: float, filled: float, most: float, times: list[float]) -> list[str]:
     """Return descriptions of the violated limits.
 
     Args:
@@ -164,6 +164,6 @@ def main(argv: list[str]) -> int:
                 flush=True,
             )
             reported = len(trainer.seconds)
-    problems = judged(worst, filled, most, trainer.seconds)
+    problems = failures_of(worst, filled, most, trainer.seconds)
     print('; '.join(problems) or 'all within the limits')
     return int(bool(problems))

@@ -140,11 +140,11 @@ def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Ex
     return observed.excess, stops
 
 
-def line(seed: int, what: str, found: Excess, stops: int, rest: str = '') -> str:
+def line(seed: int, what: str, excess: Excess, stops: int, rest: str = '') -> str:
     """Return a line of the table."""
     return (
-        f'{seed:>5} {what:<12} {found.highest:>9.3f} {found.longest:>8.2f} {found.allowed:>7.2f} '
-        f'{found.limit:>7.2f} {stops:>5}{rest}'
+        f'{seed:>5} {what:<12} {excess.highest:>9.3f} {excess.longest:>8.2f} '
+        f'{excess.allowed:>7.2f} {excess.limit:>7.2f} {stops:>5}{rest}'
     )
 
 
@@ -179,19 +179,19 @@ def main(argv: list[str]) -> int:
         results = []
         if options.seconds * share >= SAMPLE_TIME:
             arm = make_arm(robot, seed, options.reality)
-            found, stops, samples, error = explore(
+            excess, stops, samples, error = explore(
                 arm, initial, seed, share * options.seconds, held_out
             )
             rows.append((samples, error))
-            results.append(('exploring', found, stops, f' {samples:>7} {error:>7.3f}'))
+            results.append(('exploring', excess, stops, f' {samples:>7} {error:>7.3f}'))
         for method in methods:
             arm = make_arm(robot, seed, options.reality)
             count = max(1, round(share * TARGETS))
             results.append((method, *go(arm, initial, seed, method, count), ''))
-        for what, found, stops, rest in results:
-            print(line(seed, what, found, stops, rest), flush=True)
-            failures += (found.longest > LONGEST) + stops
-            worst = Excess(*np.maximum(worst, found))
+        for what, excess, stops, rest in results:
+            print(line(seed, what, excess, stops, rest), flush=True)
+            failures += (excess.longest > LONGEST) + stops
+            worst = Excess(*np.maximum(worst, excess))
     samples, error = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
     print(line(-1, 'worst, mean', worst, failures, f' {samples:>7.0f} {error:>7.3f}'))
     return int(failures > 0)

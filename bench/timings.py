@@ -71,8 +71,8 @@ def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
         total -= last.shape[1] * (len(last) - muscles) if lengths else 0
         if mask is not None:
             first, *rest = (weight for weight, _ in mae.encoder[g * depth : (g + 1) * depth])
-            seen = int(visible(mask, len(group.joints), muscles).sum())
-            total += len(first) * seen + sum(weight.size for weight in rest)
+            visible_count = int(visible(mask, len(group.joints), muscles).sum())
+            total += len(first) * visible_count + sum(weight.size for weight in rest)
     return total
 
 
@@ -307,8 +307,8 @@ def show(robot: Robot, preset: str, device: str | None = None) -> None:
     print(f'{"":<64}{"ours":>10}{"torch eager":>14}{"bound":>10}')
     for row in measure(robot, preset, device):
         numbers = zip((row.ours, row.torch_eager, row.bound), (10, 14, 10))
-        told = (f'{f"{value:.1f}" if value else "":>{width}}' for value, width in numbers)
-        print(f'{row.name:<64}{"".join(told)}')
+        cells = (f'{f"{value:.1f}" if value else "":>{width}}' for value, width in numbers)
+        print(f'{row.name:<64}{"".join(cells)}')
 
 
 def main(argv: list[str]) -> None:

@@ -146,18 +146,18 @@ class System:
         from musculoskeletal_ae.nodes.executor import make_executor
 
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
-        given = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
-        for name in given:
+        assignments = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
+        for name in assignments:
             if name != 'hardware_emulator':
-                given[name].append(f'checkpoint:={network}')
+                assignments[name].append(f'checkpoint:={network}')
             if name in ('controller', 'combined'):
                 # A pause of a busy machine must not stop the emulated arm.
-                given[name] += ['explore:=true', 'max_age:=1.0']
+                assignments[name] += ['explore:=true', 'max_age:=1.0']
             if name == 'learner':
-                given[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
+                assignments[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
         quiet: dict[str, Any] = {'stdout': subprocess.DEVNULL}
         for name in names:
-            values = [word for value in given[name] for word in ('-p', value)]
+            values = [word for value in assignments[name] for word in ('-p', value)]
             command = [str(folder / name), '--ros-args', *values]
             if name == 'plain':
                 command = [sys.executable, '-c', PLAIN, str(network)]

@@ -93,21 +93,21 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
     arm.set_length_offset(offset)
     loop, posture = Loop(robot, mae, arm, seed), tuple[float, ...]()
     if how == 'posture':
-        told = arm.theta + rng.normal(0.0, STATED, robot.joint_count)
-        posture = tuple(np.clip(told, robot.lower, robot.upper).tolist())
+        stated = arm.theta + rng.normal(0.0, STATED, robot.joint_count)
+        posture = tuple(np.clip(stated, robot.lower, robot.upper).tolist())
     loop.estimator.calibrate_lengths(posture)
     if not posture:
         loop.controller.explore(True)
-    speed, pull, last, seen = 0.0, 0.0, None, list[Array]()
+    speed, pull, last, postures = 0.0, 0.0, None, list[Array]()
     while loop.time < LONGEST and not loop.estimator.body.offsets.known:
         muscles = loop.step(how == 'sensors')
-        seen.append(arm.theta)
+        postures.append(arm.theta)
         if muscles is None:
             continue
         length = muscles.length_read
-        if last is not None and len(seen) % 10 == 0:
+        if last is not None and len(postures) % 10 == 0:
             speed = max(speed, float(np.abs(length - last).max()) / (10 * SAMPLE_TIME))
-        last = length if len(seen) % 10 == 0 or last is None else last
+        last = length if len(postures) % 10 == 0 or last is None else last
         pull = max(pull, float(muscles.motor_tension.max()))
     zeros, took, alarms = loop.estimator.body.offsets, loop.time, loop.alarms
     part = held_out.part(np.s_[::5])
@@ -130,7 +130,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
         'stopped': str(loop.controller.supervisor.condition or ''),
         'fastest_m_s': speed,
         'highest_n': pull,
-        'range_rad': float(np.ptp(seen, axis=0).mean()),
+        'range_rad': float(np.ptp(postures, axis=0).mean()),
     }
 
 

@@ -101,9 +101,9 @@ def _first(node: ast.AST) -> str:
 
 
 def _signature(node: ast.FunctionDef, name: str) -> str:
-    given = ast.unparse(node.args).removeprefix('self').removeprefix('cls').removeprefix(', ')
+    arguments = ast.unparse(node.args).removeprefix('self').removeprefix('cls').removeprefix(', ')
     returned = f' -> {ast.unparse(node.returns)}' if node.returns and name == node.name else ''
-    return f'`{name}({given}){returned}`'
+    return f'`{name}({arguments}){returned}`'
 
 
 def _class(node: ast.ClassDef) -> list[str]:
@@ -132,9 +132,9 @@ def api() -> str:
         tree = ast.parse((PACKAGE / file).read_text(encoding='utf-8'))
         module = f'musculoskeletal_ae.{file.removesuffix(".py").replace("/", ".")}'
         lines += [f'## {module}', '', _first(tree), '']
-        found = {node.name: node for node in tree.body if hasattr(node, 'name')}
+        nodes = {node.name: node for node in tree.body if hasattr(node, 'name')}
         for name in names:
-            node = found[name]
+            node = nodes[name]
             if isinstance(node, ast.ClassDef):
                 lines += _class(node)
             else:

@@ -102,7 +102,7 @@ class ControlledArm:
             return self.controller.report()
         return self.graph.report(node)
 
-    def said(self, key):
+    def value_of(self, key):
         """Return a value of the controller's diagnostics, once it is there."""
         self.says(key)
         return self.state().values[key]
@@ -110,8 +110,8 @@ class ControlledArm:
     def says(self, words, node='controller'):
         """Wait until the node's diagnostics contain words."""
 
-        def said():
+        def is_reported():
             state = self.state(node)
             return words in f'{state.message} {state.values}'
 
-        self.graph.wait(said, repr(words))
+        self.graph.wait(is_reported, repr(words))

@@ -23,13 +23,13 @@ def steps(value, number=NUMBER, eased=NEVER):
 
 def test_commands_that_change_too_fast_are_found():
     ramp = np.stack([RATE * TIME, -RATE * TIME], axis=1)
-    judged = steps(ramp)
-    assert judged.too_fast == []
-    assert judged.largest_in == pytest.approx(0.001) == judged.largest_out
+    changes = steps(ramp)
+    assert changes.too_fast == []
+    assert changes.largest_in == pytest.approx(0.001) == changes.largest_out
     jump = ramp.copy()
     jump[20:, 1] -= 0.01
-    (found,) = steps(jump).too_fast
-    assert 'muscle 1 by -11.0 mm' in found
+    (violation,) = steps(jump).too_fast
+    assert 'muscle 1 by -11.0 mm' in violation
     assert steps(jump).largest_in == pytest.approx(0.011)
     # Of a message that was missed the change is known, the tick's is not.
     assert steps(jump, NUMBER + (NUMBER >= 20)).largest_in == pytest.approx(0.001)
@@ -40,8 +40,8 @@ def test_only_paying_out_a_muscle_that_pulls_too_much_may_be_faster():
     out, load = np.zeros((50, 2)), [(t, np.array([50.0, 300.0 * (t > 0.15)])) for t in TIME]
     out[20:] += 0.02
     eased = attack.relieved(TIME, load, 200.0, 2)
-    (found,) = steps(out, eased=eased).too_fast
-    assert 'muscle 0' in found
+    (violation,) = steps(out, eased=eased).too_fast
+    assert 'muscle 0' in violation
     assert len(steps(-out, eased=eased).too_fast) == 2
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans trajectories that the arm can follow from targets, poses and twists.
+"""Plans trajectories that the arm can follow, from target postures, poses and twists.
 
 Each method returns a plan, or raises a MessageError with the reason and changes nothing. A plan
-stays within the joint limits, ends in a holdable posture, and is slowed for the muscle modules.
+stays within the joint limits, ends in a holdable posture, and respects the speed of the modules.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
 ROUNDING = 1e-6  # distance by which a point may exceed a joint limit [rad]
-SAME = 1e-6  # poses that differ by less are equal
+SAME = 1e-6  # difference below which two poses are equal
 
 
 class Plan(NamedTuple):
@@ -32,7 +32,7 @@ class Plan(NamedTuple):
 
     Attributes:
         trajectory: The trajectory, already slowed.
-        unreachable_reason: Why it does not end at the requested target, or ''.
+        unreachable_reason: Reason why it does not end at the requested target, or ''.
     """
 
     trajectory: Trajectory
@@ -76,7 +76,7 @@ class Planner:
         return Plan(planned)
 
     def to_rest(self, start: Setpoint) -> Plan:
-        """Plan to come to rest within `trajectory.STOPPING`."""
+        """Plan to come to rest within `trajectory.STOPPING` seconds."""
         return Plan(Trajectory.stopping(start, self._robot))
 
     def to_pose(self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float) -> Plan:
@@ -104,7 +104,7 @@ class Planner:
         return same and trajectory is followed
 
     def repeat_pose(self, now: float) -> None:
-        """Record that the last pose was received again at `now` [s]."""
+        """Note that the last pose was received again at `now` [s]."""
         self._hand.again(now)
 
     def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
@@ -112,13 +112,16 @@ class Planner:
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return a posture that is holdable without the isolated muscles, and why it is not θ.
+        """Return a posture that is holdable without the isolated muscles, and a reason.
 
         Args:
             mae: The network in use.
             start: Present posture [rad], (D,).
             theta: Target posture [rad], (D,).
             nearest: Whether to return the nearest holdable posture if θ is not holdable.
+
+        Returns:
+            θ and '', or another posture and the reason why θ is not holdable.
 
         Raises:
             MessageError: If θ is not holdable and `nearest` is false.

@@ -241,9 +241,9 @@ class Listening:
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
         """Compare l with the model at θ (N, D), or blame θ if that explains faults of several l."""
-        judged = Verdict(self._robot)
-        misfit = self._judge_lengths(judged, theta, length, tension)
-        if sum(len(fault.muscles) for fault in judged.faults) > 1:
+        lengths_verdict = Verdict(self._robot)
+        misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
+        if sum(len(fault.muscles) for fault in lengths_verdict.faults) > 1:
             best, explanation = JOINTS_BETTER * misfit, None
             for what, names, meant in self._angles(theta):
                 other = Verdict(self._robot)
@@ -256,7 +256,7 @@ class Listening:
                 what, names = explanation
                 verdict.failed(what, names=', '.join(names))
                 return
-        verdict.add(judged)
+        verdict.add(lengths_verdict)
 
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
         """Yield possible corrections of θ (N, D), each with its fault and joints.

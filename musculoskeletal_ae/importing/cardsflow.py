@@ -155,7 +155,7 @@ def _endless(*ends: str | None) -> bool:
 
 
 def _read_urdf(
-    file: Path, root: ET.Element, given: tuple[Limits, str] = ({}, '')
+    file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
     """Return links and joints of a URDF, by pinocchio, and each link's centre of mass."""
     for joint in root.findall('joint'):
@@ -170,7 +170,7 @@ def _read_urdf(
         ET.SubElement(joint, 'limit', lower='0', upper='0', effort='1', velocity='1')
     text = ET.tostring(root, encoding='unicode')
     source = Source(safe_name(root.get('name'), 'robot'), read_urdf(file, text))
-    source.given_limits, source.limits_file = given
+    source.given_limits, source.limits_file = limits_and_file
     model = source.model
     source.links = [str(frame.name) for frame in body_frames(model)]
     if shaped := [link for link in root.findall('link') if link.find('visual') is not None]:
@@ -195,7 +195,7 @@ def _read_urdf(
 
 
 def _read_sdf(
-    file: Path, root: ET.Element, given: tuple[Limits, str] = ({}, '')
+    file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
     """Return the first model of an SDF as `_read_urdf` does."""
     model = root.find('.//model')
@@ -206,7 +206,7 @@ def _read_sdf(
     version = [int(part) for part in root.get('version', '1.6').split('.')]
     frame_of_axis = '1' if version < [1, 5] else '0'  # the model's before 1.5, then the joint's
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
-    source.given_limits, source.limits_file = given
+    source.given_limits, source.limits_file = limits_and_file
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
             problem = f'{element.tag} with {element.attrib}: only what SDF 1.6 knows is read'

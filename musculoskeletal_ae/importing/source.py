@@ -292,8 +292,8 @@ def cut(
     locked = [i for i in range(1, model.njoints) if model.names[i] not in kept]
     at_rest = pin.integrate(model, pin.neutral(model), velocity)
     source.model = reduced(model, locked, at_rest)
-    for option, given in (('--muscles', muscles), ('--without', without)):
-        if unknown := [name for name in given if name not in source.routes]:
+    for option, names in (('--muscles', muscles), ('--without', without)):
+        if unknown := [name for name in names if name not in source.routes]:
             legal = ', '.join(source.routes)
             raise SourceError(f'{option} {unknown[0]}: no such muscle; muscles: {legal}')
     for name, route in list(source.routes.items()):

@@ -22,17 +22,17 @@ from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-SECONDS = 10.0  # length of a recording
-MOST = 50_000  # messages of a recording
-MOST_BYTES = 32 << 20  # total size of these messages
-LARGEST_MESSAGE = 4 << 20  # [bytes] of one recorded message; a typical network has half a MB
-FILE = 'cause.txt'  # why the node stopped, in the bag's directory; written last
-#: pattern of the bags' directories, including bags that a kill left incomplete
+SECONDS = 10.0  # duration of a recording [s]
+MOST = 50_000  # largest number of messages in a recording
+MOST_BYTES = 32 << 20  # largest total size of these messages
+LARGEST_MESSAGE = 4 << 20  # largest recorded message [bytes]; a typical network has half a MB
+FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
+#: pattern of the bags' directories, including bags that are incomplete because of a kill
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
 
 
-#: Time of arrival [ns], topic, and bytes of a message. Bytes, because Python's garbage collector
-#: would traverse tens of thousands of message objects, and delay a command by 10 ms.
+#: Time of arrival [ns], topic, and serialized message. Python's garbage collector would traverse
+#: tens of thousands of message objects, and delay a command by 10 ms.
 Heard = tuple[int, str, bytes]
 
 
@@ -59,7 +59,7 @@ class StopRecording:
         self._latched: dict[str, Heard] = {}  # last latched messages before `_recent`
         self._writing: threading.Thread | None = None
         self.left_out = 0  # number of messages that were too large
-        self.problem = ''  # why the last recording could not be written
+        self.problem = ''  # error of the last recording, or ''
         self.saved: Path | None = None  # directory of the last recording
 
     def heard(self, topic: str, data: bytes) -> None:

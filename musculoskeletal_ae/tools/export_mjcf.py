@@ -12,9 +12,9 @@ def main(argv: list[str] | None = None) -> int:
     """Export one checkpoint; exit status 0 if the model was written and loads."""
     parser = Parser(
         'export_mjcf',
-        'Writes the body that a checkpoint has learned as an MJCF model: links, joints, limits and '
-        'masses of the robot, attachment points, springs and friction as learned. A report says '
-        'how far its lengths, moment arms and gravity torques are from those of the network.',
+        'Writes the body model of a checkpoint as an MJCF model. Links, joints, limits and masses '
+        'are those of the robot; route points, series elastic elements and friction are learned. '
+        'A report compares lengths, moment arms and gravity torques with those of the network.',
     )
     parser.add_argument('checkpoint', type=Path, metavar='CHECKPOINT', help='.safetensors file')
     parser.add_robot(default=None)

@@ -72,13 +72,13 @@ def test_damage_is_never_read_without_a_word(recording, content, tmp_path):
         for name, data in files.items():
             (tmp_path / name).write_bytes(damage(data, rng) if name == victim else data)
         try:
-            bag, found = read(tmp_path)
+            bag, messages = read(tmp_path)
         except BagError:
             continue
         if all(file.has_checksums for file in bag.files):
-            assert found == (expected[: len(found)] if bag.unfinished else expected), trial
+            assert messages == (expected[: len(messages)] if bag.unfinished else expected), trial
         else:  # what nothing protects may be changed, but not lost
-            assert bag.unfinished or len(found) == len(expected), trial
+            assert bag.unfinished or len(messages) == len(expected), trial
 
 
 def test_a_file_cut_anywhere_is_read_up_to_there_and_says_so(content, tmp_path):
@@ -88,10 +88,10 @@ def test_a_file_cut_anywhere_is_read_up_to_there_and_says_so(content, tmp_path):
     expected = [(sample.topic, sample.log_time, sample.data) for sample in content]
     for size in range(100, len(whole), len(whole) // 60):
         file.write_bytes(whole[:size])
-        bag, found = read(file)
+        bag, messages = read(file)
         assert f'at byte {size}' in bag.unfinished[0]
-        assert found == expected[: len(found)]
-    assert len(found) == len(expected)  # only the summary was cut off
+        assert messages == expected[: len(messages)]
+    assert len(messages) == len(expected)  # only the summary was cut off
 
 
 def test_no_flipped_bit_changes_what_is_read(content, tmp_path):
@@ -105,10 +105,10 @@ def test_no_flipped_bit_changes_what_is_read(content, tmp_path):
         changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
         file.write_bytes(changed)
         try:
-            bag, found = read(file)
+            bag, messages = read(file)
         except BagError:
             continue
-        assert found == (expected[: len(found)] if bag.unfinished else expected)
+        assert messages == (expected[: len(messages)] if bag.unfinished else expected)
 
 
 @pytest.mark.parametrize(

@@ -59,8 +59,8 @@ def test_after_a_long_stop_of_the_process_it_goes_on_instead_of_catching_up():
 
 def test_a_lap_is_everything_from_start_to_stop_in_order(bag, content):
     opened = Bag.open(bag)
-    found = list(lap(opened, opened.topics, opened.start, opened.end))
-    assert [message.data for message in found] == [sample.data for sample in content]
+    played = list(lap(opened, opened.topics, opened.start, opened.end))
+    assert [message.data for message in played] == [sample.data for sample in content]
 
 
 def test_a_window_lies_within_the_bag(bag, content):
@@ -81,11 +81,11 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
     )  # fmt: skip
     assert latched_topics(opened) == {f'/left_arm/{name}' for name in names}
     last = [next(s for s in content[39::-1] if s.topic.endswith(name)) for name in names]
-    found = list(lap(opened, opened.topics, content[40].log_time, opened.end))
-    assert sorted(m.data for m in found[: len(names)]) == sorted(sample.data for sample in last)
+    played = list(lap(opened, opened.topics, content[40].log_time, opened.end))
+    assert sorted(m.data for m in played[: len(names)]) == sorted(sample.data for sample in last)
     # They are due at once, and do not turn back recorded time.
-    assert {m.log_time for m in found[: len(names)]} == {content[40].log_time - 1}
-    assert [m.data for m in found[len(names) :]] == [sample.data for sample in content[40:]]
+    assert {m.log_time for m in played[: len(names)]} == {content[40].log_time - 1}
+    assert [m.data for m in played[len(names) :]] == [sample.data for sample in content[40:]]
 
 
 def motion(tmp_path, times, first=()):
@@ -109,15 +109,15 @@ def test_what_was_shown_is_of_the_joints_that_most_messages_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('times', 'told'),
+    ('times', 'problem'),
     [
         ([0.1 * k for k in range(20)] + [14.0, 14.1], 'has no message for 12.1 s after 1.9 s'),
         ([0.9 * k for k in range(600)], 'lasts 539 s; a trajectory may last 500 s'),
         ([0.1, 0.2], 'no motion of at least'),
     ],
 )
-def test_a_motion_that_no_controller_could_follow_is_refused(tmp_path, times, told):
-    with pytest.raises(BagError, match=told):
+def test_a_motion_that_no_controller_could_follow_is_refused(tmp_path, times, problem):
+    with pytest.raises(BagError, match=problem):
         motion(tmp_path, times)
 
 

@@ -76,8 +76,8 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tool, graph, tmp_path):
     recorder.end(signal.SIGKILL)
     bag = Bag.open(tmp_path / 'bag')
     assert bag.unfinished
-    found = list(bag.messages([f'{graph.namespace}/muscle_states']))
-    assert sent[-1] - found[-1].publish_time < 1e9
+    recorded = list(bag.messages([f'{graph.namespace}/muscle_states']))
+    assert sent[-1] - recorded[-1].publish_time < 1e9
     assert bag.topics[f'{graph.namespace}/robot_description'].message_count == 1
 
     kept = [(message.topic, message.data) for message in bag.messages()]
@@ -102,12 +102,12 @@ def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
             clock.publish(Clock(clock=Time(sec=1000)))
         graph.spin(0.1)
     output = recorder.end(signal.SIGINT)
-    told = re.search(r'(\d+) messages came before the first /clock', output)
-    assert told, output
+    match = re.search(r'(\d+) messages came before the first /clock', output)
+    assert match, output
     bag = Bag.open(tmp_path / 'bag')
     assert bag.start == bag.end == 1000 * 10**9
     # A busy recorder may hear the clock late, and miss some of what is published.
-    assert 2 <= bag.message_count <= 31 - int(told[1]), output
+    assert 2 <= bag.message_count <= 31 - int(match[1]), output
 
 
 def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp_path):
@@ -196,17 +196,17 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
 def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_path, start):
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
-    told = graph.listen(Float64MultiArray, 'replay/position')
+    positions = graph.listen(Float64MultiArray, 'replay/position')
     graph.listen(DiagnosticArray, '/diagnostics')
     begin = '--start', str(start * length)
     tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *begin, *ros(graph))
-    graph.wait(lambda: told, 'where it is')
-    where, whole = read_array(told[-1], 1, 2)  # as the page's timeline does
+    graph.wait(lambda: positions, 'where it is')
+    where, whole = read_array(positions[-1], 1, 2)  # as the page's timeline does
     assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
     graph.wait(lambda: graph.report('replay').message == 'paused', 'its diagnostics')
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
     assert good, reason
-    graph.wait(lambda: told[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
+    graph.wait(lambda: positions[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
     assert not graph.set_parameter('replay', 'position', length + 1.0)[0]
 
 

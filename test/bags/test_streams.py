@@ -28,15 +28,15 @@ def streams(arm, robot, tmp_path):
 
 def test_streams_are_what_was_recorded(arm, robot, tmp_path):
     arm.add('/muscle_length_command', ARRAY, 0.5, array(arm.length[0]))
-    found = streams(arm, robot, tmp_path)
-    assert_array_equal(found.joints.values, arm.theta)
-    assert_array_equal(found.muscles.values[:, 0], arm.length)
-    assert_array_equal(found.muscles.values[:, 1], arm.tension)
-    assert_allclose(found.muscles.time, arm.time, atol=1e-9)
-    assert_allclose(found.length_commands.time, [0.5], atol=1e-9)
-    assert_array_equal(found.length_commands.values, [arm.length[0]])
-    assert found.tension_commands.values.shape == (0, robot.muscle_count)
-    assert not found.rejected
+    result = streams(arm, robot, tmp_path)
+    assert_array_equal(result.joints.values, arm.theta)
+    assert_array_equal(result.muscles.values[:, 0], arm.length)
+    assert_array_equal(result.muscles.values[:, 1], arm.tension)
+    assert_allclose(result.muscles.time, arm.time, atol=1e-9)
+    assert_allclose(result.length_commands.time, [0.5], atol=1e-9)
+    assert_array_equal(result.length_commands.values, [arm.length[0]])
+    assert result.tension_commands.values.shape == (0, robot.muscle_count)
+    assert not result.rejected
 
 
 def test_two_motions_at_the_same_times_are_no_recording(arm, tmp_path):
@@ -55,18 +55,18 @@ def test_theta_is_paired_with_the_nearest_muscle_state(arm, robot, tmp_path):
 
 @pytest.mark.parametrize(('late', 'paired'), [(0.0049, 20), (0.006, 19), (0.051, 15)])
 def test_pairs_are_no_further_apart_than_half_a_period(late, paired, robot, tmp_path):
-    found = streams(Arm(robot, count=20, late=late), robot, tmp_path)
-    pairs = found.pairs()
+    result = streams(Arm(robot, count=20, late=late), robot, tmp_path)
+    pairs = result.pairs()
     assert len(pairs.time) == paired
-    nearest = np.abs(found.joints.time[:, None] - pairs.time).min(axis=0)
+    nearest = np.abs(result.joints.time[:, None] - pairs.time).min(axis=0)
     assert (nearest <= 0.005).all()
 
 
 def test_without_joint_sensors_there_are_no_pairs(arm, robot, tmp_path):
     arm.content = [sample for sample in arm.content if sample.type != JOINTS]
-    found = streams(arm, robot, tmp_path)
-    assert len(found.muscles.time) == 200
-    assert found.pairs().theta.shape == (0, robot.joint_count)
+    result = streams(arm, robot, tmp_path)
+    assert len(result.muscles.time) == 200
+    assert result.pairs().theta.shape == (0, robot.joint_count)
 
 
 def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_path):
@@ -77,33 +77,33 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     # Joints of another arm on the same topic, and any order, are legal.
     names = ['other', *reversed(robot.joints)]
     arm.add('/joint_states', JOINTS, 0.0054, joints(names, [9.0, *arm.theta[0, ::-1]]))
-    found = streams(arm, robot, tmp_path)
-    assert found.rejected == {
+    result = streams(arm, robot, tmp_path)
+    assert result.rejected == {
         '/muscle_states: not finite': 1,
         '/muscle_states: wrong length': 1,
         '/joint_states: missing joint': 1,
     }
-    assert len(found.muscles.time) == 200
-    assert_array_equal(found.joints.values[1], arm.theta[0])
+    assert len(result.muscles.time) == 200
+    assert_array_equal(result.joints.values[1], arm.theta[0])
 
 
 def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robot, tmp_path):
     offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
     for at, zeros, spread in ((0.5, 0.0 * offset, surely + 1.0), (1.0, offset, surely)):
         arm.add('/muscle_length_zeros', ARRAY, at - 0.001, array([zeros, spread]))
-    found = streams(arm, robot, tmp_path)
-    assert found.rejected == {'/muscle_states: length offsets unknown': 50}
-    assert_allclose(found.muscles.time, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
-    assert_array_equal(found.muscles.values[:50, 0], arm.length[:50])
-    assert_allclose(found.muscles.values[50:, 0], arm.length[100:] - offset)
+    result = streams(arm, robot, tmp_path)
+    assert result.rejected == {'/muscle_states: length offsets unknown': 50}
+    assert_allclose(result.muscles.time, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
+    assert_array_equal(result.muscles.values[:50, 0], arm.length[:50])
+    assert_allclose(result.muscles.values[50:, 0], arm.length[100:] - offset)
 
 
 def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_path):
     offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
     arm.add('/muscle_length_zeros', ARRAY, 0.501, array([offset, surely]))
-    found = streams(arm, robot, tmp_path)
-    assert not found.rejected
-    assert_allclose(found.muscles.values[:, 0], arm.length - offset)
+    result = streams(arm, robot, tmp_path)
+    assert not result.rejected
+    assert_allclose(result.muscles.values[:, 0], arm.length - offset)
 
 
 def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path):
@@ -115,9 +115,9 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
         arm.content[i] = arm.content[i]._replace(data=array(rows))
     arm.add('/isolated_muscles', STRING, 0.501, string(first))  # as latched: heard late
     arm.add('/isolated_muscles', STRING, 0.999, string(second))
-    found = streams(arm, robot, tmp_path)
-    assert not found.rejected
-    pairs = found.pairs()
+    result = streams(arm, robot, tmp_path)
+    assert not result.rejected
+    pairs = result.pairs()
     assert_array_equal(pairs.isolated[:, :3], [[1, 0, 0]] * 100 + [[0, 1, 0]] * 100)
     assert (pairs.tension[:100, 0] == 0.0).all() and (pairs.tension[100:, 1] == 0.0).all()
     assert_array_equal(pairs.tension[:100, 1:], arm.tension[:100, 1:])
@@ -155,9 +155,9 @@ def test_a_recording_of_another_arm_is_refused(arm, tmp_path):
 
 def test_muscles_in_another_order_are_named(robot, tmp_path):
     order = [1, 0, *range(2, robot.muscle_count)]
-    found = streams(Arm(robot, order=order), robot, tmp_path)
+    result = streams(Arm(robot, order=order), robot, tmp_path)
     names = robot.muscles
-    assert misplaced_muscles(found.pairs(), robot) == [(names[0], names[1]), (names[1], names[0])]
+    assert misplaced_muscles(result.pairs(), robot) == [(names[0], names[1]), (names[1], names[0])]
 
 
 def test_muscles_in_their_order_are_not_doubted_for_noise_and_offsets(arm, robot, tmp_path):
@@ -209,9 +209,9 @@ def test_who_publishes_some_joints_has_a_clock_of_its_own(robot, tmp_path):
             arm.content[i] = sample._replace(data=one)
             behind = sample._replace(data=other, publish_time=sample.publish_time - 20_000_000)
             arm.content.append(behind)
-    found = streams(arm, robot, tmp_path)
-    assert not found.rejected
-    assert np.isfinite(found.joints.values).sum(axis=0).tolist() == [200, 200]
+    result = streams(arm, robot, tmp_path)
+    assert not result.rejected
+    assert np.isfinite(result.joints.values).sum(axis=0).tolist() == [200, 200]
 
 
 @pytest.mark.parametrize('period', [0.5, 0.2])
@@ -225,8 +225,8 @@ def test_a_recorder_that_wrote_in_bunches_costs_no_pairs(robot, tmp_path, period
 
     content = [bunched(sample) for sample in arm.content]
     samples.write_ours(tmp_path / 'bunched', content, 'zstd', True)
-    found = read_streams(Bag.open(tmp_path / 'bunched'), robot)
-    assert any('in bunches' in note for note in found.notes)
-    pairs = found.pairs()
+    result = read_streams(Bag.open(tmp_path / 'bunched'), robot)
+    assert any('in bunches' in note for note in result.notes)
+    pairs = result.pairs()
     assert len(pairs.time) >= len(regular.time) - 1
     assert_allclose(np.diff(pairs.time), 0.01, atol=1e-6)

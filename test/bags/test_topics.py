@@ -56,10 +56,10 @@ def test_the_topics_are_those_of_the_interface():
         'utf-8'
     )
     table = text.partition('| topic | type |')[2].partition('\n\n')[0]
-    told = {
+    documented = {
         name for row in table.splitlines()[2:] for name in re.findall('`(.*?)`', row.split('|')[1])
     }
-    assert told - LEFT_OUT == {*TOPICS}
+    assert documented - LEFT_OUT == {*TOPICS}
 
 
 @pytest.mark.parametrize(

@@ -431,8 +431,8 @@ def test_a_long_trajectory_is_slowed_as_a_short_one_is(bench):
     theta = np.vstack([REST, np.tile([OTHER, REST], (3, 1))])  # waits, then moves
     slowed, still = [], np.zeros_like(theta)
     for late in (0.0, 500.0):
-        given = Points(np.array([0, 1]), late + 0.3 * np.arange(1.0, 8.0), theta, still, still)
-        trajectory = Trajectory.through(Setpoint.resting(REST), given)
+        points = Points(np.array([0, 1]), late + 0.3 * np.arange(1.0, 8.0), theta, still, still)
+        trajectory = Trajectory.through(Setpoint.resting(REST), points)
         slowed.append(slowness(ROBOT, bench.mae, trajectory, bench.core.settings))
     assert slowed[0] > 1.2
     assert slowed[1] == pytest.approx(slowed[0], rel=0.05)
@@ -463,8 +463,8 @@ def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apar
     goals = np.stack([np.array(REST), np.array(OTHER)])
     bench.core.trajectory(Points(np.arange(2), np.array([1.0, 1.0 + apart]), goals, None, None))
     follower = bench.core.activities.follower
-    said = status.slowed(follower)
-    assert f'takes {follower.latest.duration:.3g} s' in said, said
+    text = status.slowed(follower)
+    assert f'takes {follower.latest.duration:.3g} s' in text, text
 
 
 def test_a_target_just_beyond_a_limit_is_refused_in_numbers_that_differ(bench):

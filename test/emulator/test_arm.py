@@ -44,8 +44,8 @@ def test_tension_from_elongation_inverts_the_elongation(tension, force, rate, st
     elastic = SeriesElastic(np.array([force]), np.array([rate]), np.array([stretch]))
     elongation = elastic.elongation(np.array([1.0]), np.array([tension]))[0]
     if rate * elongation < 6.0:  # the cut-off of the compiled inverse
-        found = tension_from_elongation(elongation, force, rate, stretch)
-        assert found == pytest.approx(tension, rel=1e-6, abs=1e-6)
+        solved = tension_from_elongation(elongation, force, rate, stretch)
+        assert solved == pytest.approx(tension, rel=1e-6, abs=1e-6)
 
 
 def test_at_rest_the_muscles_hold_the_weight(robot, nominal):

@@ -124,7 +124,7 @@ def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot,
     shortest = int((length[-1] - length[0]).argmin())
     length = length[:, shortest]
     assert (np.diff(length) < 0.0).all() and length[0] - length[-1] > Detection().slack_length
-    tension, found = np.full(6, 60.0), set()
+    tension, kinds = np.full(6, 60.0), set()
     tension[shortest] = 0.0
     for n in range(steps):
         at = theta[n] if moves else theta[0]
@@ -132,12 +132,12 @@ def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot,
         each[shortest] = length[n]
         watched.demand = robot.demanded(each, each - 0.01)
         _, _, finding = watched.step((tension, each), State(at, tension, each))
-        found.add(finding and finding.kind)
-    assert found == ({None} if moves else {None, Kind.SLACK_TENDON})
+        kinds.add(finding and finding.kind)
+    assert kinds == ({None} if moves else {None, Kind.SLACK_TENDON})
 
 
 @pytest.mark.parametrize(
-    ('away', 'most', 'cut', 'found'),
+    ('away', 'most', 'cut', 'is_expected'),
     [
         (0.0, 0.5, 0, True),
         (0.5, 0.5, 0, False),
@@ -147,7 +147,7 @@ def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot,
     ],
 )
 def test_the_distance_counts_less_far_from_calibrated_postures_except_for_a_slack_muscle(
-    robot, calibrated, watch, healthy, away, most, cut, found
+    robot, calibrated, watch, healthy, away, most, cut, is_expected
 ):
     tension = np.where(np.arange(6) == 0, most * robot.tension.limit, healthy.tension)
     message = healthy._replace(tension=tension * (1.0 - cut * np.eye(6)[2]))
@@ -157,7 +157,7 @@ def test_the_distance_counts_less_far_from_calibrated_postures_except_for_a_slac
     statistics = replace(calibrated.anomaly, postures=known, thresholds={DISTANCE: 0.8 * distance})
     watched = watch(replace(calibrated, anomaly=statistics))
     assert (watched.health.residual.unfamiliarity(state.theta) > 1.0) == bool(away)
-    assert any(watched.findings(message, IN_A_ROW)) == found
+    assert any(watched.findings(message, IN_A_ROW)) == is_expected
 
 
 @pytest.mark.parametrize('known', [True, False])
@@ -179,7 +179,7 @@ def test_preset_paper_decides_by_a_alone_once_it_is_calibrated(
 @pytest.mark.parametrize('kind', ['length', 'tension'])
 @pytest.mark.parametrize('wound', [-0.01, 0.01])
 def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, wound, kind):
-    watched, rng, found = watch(mae), np.random.default_rng(0), []
+    watched, rng, findings = watch(mae), np.random.default_rng(0), []
     theta, tension = np.array([0.1, -1.0]), np.where(np.arange(6) == 3, 100.0, 60.0)
     state = State(theta, tension, mae.lengths(theta, tension))
     reported = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
@@ -192,7 +192,7 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, w
             watched.demand = robot.demanded(length, length - (reported - 30.0) / 1e4)
         _, _, finding = watched.step((tension, length), state)
         if finding is not None and finding.kind is Kind.JAMMED_MODULE:
-            found.append((n, finding.muscle))
-    assert found
-    assert {muscle for _, muscle in found} == {3}
-    assert 95 <= found[0][0] <= 110
+            findings.append((n, finding.muscle))
+    assert findings
+    assert {muscle for _, muscle in findings} == {3}
+    assert 95 <= findings[0][0] <= 110

@@ -23,8 +23,8 @@ def verdict(tension, length, likely=0.0):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.003)
         demand = BIAS + max(0.0, -STIFFNESS * command)
         pull, wound = tension(demand, shake), length(n, stir)
-        if found := watched.step(pull, wound, command, likely, DT):
-            return found
+        if result := watched.step(pull, wound, command, likely, DT):
+            return result
     raise AssertionError('no answer')
 
 
@@ -37,7 +37,7 @@ def still(_, stir):
 
 
 @pytest.mark.parametrize(
-    ('tension', 'length', 'likely', 'found'),
+    ('tension', 'length', 'likely', 'expected'),
     [
         (follows, still, 0.004, Outcome.HEALTHY),
         (lambda _, __: 0.0, lambda _, stir: -0.15 + stir, 0.0, Outcome.RUPTURED),
@@ -53,9 +53,9 @@ def still(_, stir):
     ],
 )  # fmt: skip
 def test_verification_recognises_the_fault_by_the_response_to_winding_in(
-    tension, length, likely, found
+    tension, length, likely, expected
 ):
-    assert verdict(tension, length, likely).outcome is found
+    assert verdict(tension, length, likely).outcome is expected
 
 
 def test_a_suspect_that_is_not_wound_in_stays_isolated():
@@ -237,7 +237,7 @@ def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
     watched = Verification(0, scale * BIAS, scale * STIFFNESS)
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0004), 0.006)
-        found = watched.step(scale * (BIAS + shake), stir, command, 0.0, DT)
-        if found:
+        result = watched.step(scale * (BIAS + shake), stir, command, 0.0, DT)
+        if result:
             break
-    assert found.outcome is Outcome.JAMMED
+    assert result.outcome is Outcome.JAMMED

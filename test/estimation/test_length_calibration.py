@@ -65,31 +65,33 @@ def run(calibration, moment, seconds, sees, begin=0.0):
 
 
 def test_length_offsets_are_found_with_joint_sensors(robot, mae, moment):
-    found = run(LengthCalibration(robot, mae), moment, 40.0, sees=True)
-    assert found.is_done and found.time < 30.0
-    np.testing.assert_allclose(found.offsets.offset, OFFSET, atol=1e-3)
+    calibration = run(LengthCalibration(robot, mae), moment, 40.0, sees=True)
+    assert calibration.is_done and calibration.time < 30.0
+    np.testing.assert_allclose(calibration.offsets.offset, OFFSET, atol=1e-3)
 
 
 @pytest.mark.usefixtures('seldom')
 def test_length_offsets_are_found_without_joint_sensors(robot, mae, moment):
-    found = run(LengthCalibration(robot, mae), moment, 90.0, sees=False)
-    assert found.is_done and found.time < 60.0
-    np.testing.assert_allclose(found.offsets.offset, OFFSET, atol=3e-3)
+    calibration = run(LengthCalibration(robot, mae), moment, 90.0, sees=False)
+    assert calibration.is_done and calibration.time < 60.0
+    np.testing.assert_allclose(calibration.offsets.offset, OFFSET, atol=3e-3)
 
 
 def test_length_offsets_are_found_from_a_stated_posture_if_the_arm_stands(robot, mae, moment):
     theta, *standing = moment(3.0)
     moved = run(LengthCalibration(robot, mae, theta), moment, 5.0, sees=False, begin=3.0)
     assert not moved.is_done and 'call estimator/zero again' in moved.progress
-    found = run(LengthCalibration(robot, mae, theta), lambda _: (theta, *standing), 2.0, sees=False)
-    assert found.is_done
-    np.testing.assert_allclose(found.offsets.offset, OFFSET, atol=1e-3)
+    calibration = run(
+        LengthCalibration(robot, mae, theta), lambda _: (theta, *standing), 2.0, sees=False
+    )
+    assert calibration.is_done
+    np.testing.assert_allclose(calibration.offsets.offset, OFFSET, atol=1e-3)
 
 
 def test_a_standing_arm_does_not_determine_the_length_offsets(robot, mae, moment):
-    found = run(LengthCalibration(robot, mae), lambda _: moment(3.0), 5.0, sees=False)
-    assert found.offsets is not None and not found.offsets.known
-    assert f'0 of {length_calibration.ENOUGH:.0f} s of gentle motion' in found.progress
+    calibration = run(LengthCalibration(robot, mae), lambda _: moment(3.0), 5.0, sees=False)
+    assert calibration.offsets is not None and not calibration.offsets.known
+    assert f'0 of {length_calibration.ENOUGH:.0f} s of gentle motion' in calibration.progress
 
 
 def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
@@ -139,19 +141,19 @@ def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibratio
         tension[3], length[3] = rng.uniform(0.0, 300.0), rng.uniform(-5.0, 5.0)
         return theta, tension, length
 
-    found = run(LengthCalibration(robot, mae.without((3,))), disturbed, 120.0, sees)
-    assert found.is_done
+    calibration = run(LengthCalibration(robot, mae.without((3,))), disturbed, 120.0, sees)
+    assert calibration.is_done
     others = np.arange(6) != 3
-    np.testing.assert_allclose(found.offsets.offset[others], OFFSET[others], atol=4e-3)
+    np.testing.assert_allclose(calibration.offsets.offset[others], OFFSET[others], atol=4e-3)
 
 
 def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
     theta, *standing = moment(3.0)
     calibration = LengthCalibration(robot, mae.without((3,)), theta)
-    found = run(calibration, lambda _: (theta, *standing), 2.0, sees=False)
-    assert found.is_done
-    off = np.abs(found.offsets.offset - OFFSET)
-    assert off[3] < found.offsets.deviation[3] == LARGEST_RESIDUAL
+    calibration = run(calibration, lambda _: (theta, *standing), 2.0, sees=False)
+    assert calibration.is_done
+    off = np.abs(calibration.offsets.offset - OFFSET)
+    assert off[3] < calibration.offsets.deviation[3] == LARGEST_RESIDUAL
     assert np.delete(off, 3).max() < 1e-3
 
 
@@ -160,8 +162,8 @@ def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
 def test_length_calibration_of_an_arm_without_weight_stays_finite(mae):
     robot = Robot.load('arm26')
     robot.kinematics.model.gravity.linear = np.zeros(3)  # as with upright axes
-    found = run(LengthCalibration(robot, mae), swinging(robot, mae), 60.0, sees=False)
-    assert np.isfinite(found.offsets.offset).all()
+    calibration = run(LengthCalibration(robot, mae), swinging(robot, mae), 60.0, sees=False)
+    assert np.isfinite(calibration.offsets.offset).all()
 
 
 def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(robot, mae, moment):

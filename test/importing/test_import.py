@@ -97,11 +97,11 @@ def test_a_point_on_the_rim_of_what_it_wraps_round_is_tied_to_it(mjcf, tmp_path)
 
 def test_the_report_judges_moment_arms_and_their_signs(mjcf, tmp_path, capsys):
     assert main([str(mjcf), '--out', str(tmp_path / 'right')]) == 0
-    said = 'largest moment arm error over 200 postures: 0.000 mm; all signs agree'
-    assert said in capsys.readouterr().out
+    verdict = 'largest moment arm error over 200 postures: 0.000 mm; all signs agree'
+    assert verdict in capsys.readouterr().out
     wrong = convert.Comparison({'bend': 0.3}, {'bend': 0.04}, {'bend': 0.1})
-    said = 'largest moment arm error over 200 postures: 40.000 mm; worst [mm]: bend 40.00; '
-    assert convert.arm_verdict(wrong) == f'{said}wrong sign: bend in 10 % of postures'
+    verdict = 'largest moment arm error over 200 postures: 40.000 mm; worst [mm]: bend 40.00; '
+    assert convert.arm_verdict(wrong) == f'{verdict}wrong sign: bend in 10 % of postures'
 
 
 def test_the_hand_is_the_tip_of_the_last_geometry_or_a_site(mjcf, tmp_path, capsys):

@@ -142,10 +142,10 @@ def test_a_relearned_muscle_takes_a_new_offset_and_the_others_keep_theirs(arm26,
         shift = 0.01 * (np.arange(6) == 2)
         store.add(sample._replace(length=sample.length + shift))
     fit_body(body, store.observations())
-    (found,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
+    (predicted,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
     # Over 24 drawn bodies it is off by 0.2 mm (one standard deviation).
-    assert abs((found - known)[:, 2].mean() - 0.01) < 0.001
-    np.testing.assert_allclose(found[:, 0], known[:, 0], atol=5e-4)
+    assert abs((predicted - known)[:, 2].mean() - 0.01) < 0.001
+    np.testing.assert_allclose(predicted[:, 0], known[:, 0], atol=5e-4)
 
 
 def test_a_muscle_without_samples_gets_a_large_noise(arm26, stage):

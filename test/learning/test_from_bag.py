@@ -119,6 +119,6 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
     assert anomaly_in(arm26, recording, initial, 'default') == ''
     monkeypatch.setattr(initial_training, 'HealthMonitor', Monitor)
-    told = anomaly_in(arm26, recording, initial, 'default')
-    assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s into it' in told
-    assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in told
+    text = anomaly_in(arm26, recording, initial, 'default')
+    assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s into it' in text
+    assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text

@@ -123,8 +123,8 @@ def test_two_centimetres_of_a_prismatic_joint_are_another_posture(tmp_path):
     for k in range(1200):  # it rests, slides at 5 mm/s as its wires do not tell, and rests
         theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (400 <= k < 800)]
         learner.step(DT * k, theta, pull, length)
-    found = [sample.theta[-1] for sample in learner.samples.samples]
-    np.testing.assert_allclose(found, [0.01, 0.03], atol=1e-4)
+    angles = [sample.theta[-1] for sample in learner.samples.samples]
+    np.testing.assert_allclose(angles, [0.01, 0.03], atol=1e-4)
 
 
 def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner, stage):

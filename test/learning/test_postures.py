@@ -65,8 +65,8 @@ def errors(arm26, observed, truth) -> tuple[float, float]:
     """Return how far postures are off before and after the fit [rad]."""
     rng = np.random.default_rng(1)
     guess = truth + rng.normal(0.0, 0.15, truth.shape)
-    found = fit_body(CalibratedBody(arm26), observed, guess=guess).theta
-    return tuple(float(np.linalg.norm(t - truth, axis=1).mean()) for t in (guess, found))
+    fitted = fit_body(CalibratedBody(arm26), observed, guess=guess).theta
+    return tuple(float(np.linalg.norm(t - truth, axis=1).mean()) for t in (guess, fitted))
 
 
 def test_postures_are_found_from_the_muscles_alone(arm26, observed):
@@ -119,15 +119,15 @@ def test_each_additional_sensor_improves_the_postures(arm26, observed):
 
 def test_a_joint_sensor_offset_is_not_taken_for_an_error_of_the_body(arm26, observed):
     off = replace(observed, theta=observed.theta + [0.03, 0.0])
-    found = fit_body(CalibratedBody(arm26), off).theta
-    left = np.abs(found - observed.theta).mean(axis=0)
+    fitted = fit_body(CalibratedBody(arm26), off).theta
+    left = np.abs(fitted - observed.theta).mean(axis=0)
     assert left[0] < 0.03
     assert left[1] < 0.01
 
 
 def test_measured_joint_angles_stay_where_they_were_measured(arm26, observed):
-    found = fit_body(CalibratedBody(arm26), observed).theta
-    assert np.abs(found - observed.theta).max() < 0.03
+    fitted = fit_body(CalibratedBody(arm26), observed).theta
+    assert np.abs(fitted - observed.theta).max() < 0.03
 
 
 def test_measured_positions_of_a_prismatic_joint_stay_where_they_were_measured(tmp_path):

@@ -25,13 +25,13 @@ def reading(theta, length):
 
 
 def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=lambda _: True):
-    found = []
+    rests = []
     for n in range(round(seconds / DT)):
         angle = theta(n * DT) if measured(n) else np.nan
         rest = detector.step(reading(angle, length(n * DT)), DT)
         if rest is not None:
-            found.append(rest)
-    return found
+            rests.append(rest)
+    return rests
 
 
 def each_some(t, still=True):
@@ -42,16 +42,16 @@ def each_some(t, still=True):
 
 
 def test_joint_angles_published_by_two_nodes_are_averaged():
-    (found, *_) = run(RestDetector(DEFAULT), 3.5, each_some)
-    np.testing.assert_allclose(found.theta, [0.3, 0.3])
+    (rest_sample, *_) = run(RestDetector(DEFAULT), 3.5, each_some)
+    np.testing.assert_allclose(rest_sample.theta, [0.3, 0.3])
     assert run(RestDetector(DEFAULT), 3.5, lambda t: each_some(t, still=False)) == []
 
 
 def test_a_still_arm_gives_its_mean_once_a_second():
-    found = run(RestDetector(DEFAULT), 3.5, lambda _: 0.3, lambda _: 0.01)
-    assert len(found) == 3
-    np.testing.assert_allclose(found[0].theta, 0.3)
-    np.testing.assert_allclose(found[0].length, 0.01)
+    rest_sample = run(RestDetector(DEFAULT), 3.5, lambda _: 0.3, lambda _: 0.01)
+    assert len(rest_sample) == 3
+    np.testing.assert_allclose(rest_sample[0].theta, 0.3)
+    np.testing.assert_allclose(rest_sample[0].length, 0.01)
 
 
 def test_a_moving_joint_or_tendon_is_no_rest():
@@ -65,13 +65,13 @@ def test_a_rest_does_not_depend_on_what_was_before_it(before):
         return max(0.0, 0.5 - t) + max(0.0, t - 1.4)
 
     def rest(detector, before):
-        (found,) = run(detector, before + 3.0, *[lambda t: theta(t - before)] * 2)
-        return found
+        (rest_sample,) = run(detector, before + 3.0, *[lambda t: theta(t - before)] * 2)
+        return rest_sample
 
     used = RestDetector(DEFAULT)
     for _ in range(2):
-        found, expected = rest(used, before), rest(RestDetector(DEFAULT), 0.0)
-        np.testing.assert_allclose(found.length, expected.length, atol=1e-9)
+        rest_sample, expected = rest(used, before), rest(RestDetector(DEFAULT), 0.0)
+        np.testing.assert_allclose(rest_sample.length, expected.length, atol=1e-9)
         used.reset()
 
 
@@ -81,21 +81,21 @@ def test_a_prismatic_joint_at_a_centimetre_a_second_is_no_rest():
 
 
 def test_a_rest_that_ends_early_still_counts():
-    found = run(RestDetector(DEFAULT), 2.0, theta=lambda t: max(0.0, t - 0.6))
-    assert len(found) == 1
-    np.testing.assert_allclose(found[0].theta, 0.0, atol=0.01)
+    rests = run(RestDetector(DEFAULT), 2.0, theta=lambda t: max(0.0, t - 0.6))
+    assert len(rests) == 1
+    np.testing.assert_allclose(rests[0].theta, 0.0, atol=0.01)
 
 
 def test_sparse_noisy_angles_of_a_camera_are_averaged():
     rng = np.random.default_rng(0)
-    found = run(
+    rests = run(
         RestDetector(DEFAULT),
         10.0,
         theta=lambda _: 0.5 + 0.02 * rng.standard_normal(),
         measured=lambda n: n % 3 == 0,
     )
-    assert len(found) >= 5
-    errors = [f.theta[0] - 0.5 for f in found]
+    assert len(rests) >= 5
+    errors = [f.theta[0] - 0.5 for f in rests]
     assert np.std(errors) < 0.01
 
 
@@ -105,8 +105,8 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
 )
 def test_rest_is_detected_at_any_message_rate_and_rest_time(rate, rest_time):
     detector = RestDetector(replace(DEFAULT, rest_time=rest_time))
-    found = [detector.step(reading(0.3, 0.01), 1.0 / rate) for _ in range(round(13.0 * rate))]
-    assert any(rest is not None for rest in found)
+    rests = [detector.step(reading(0.3, 0.01), 1.0 / rate) for _ in range(round(13.0 * rate))]
+    assert any(rest is not None for rest in rests)
     detector.reset()
     moving = [
         detector.step(reading(0.05 * n / rate, 0.01), 1.0 / rate) for n in range(round(13.0 * rate))

@@ -3,13 +3,13 @@
 
 import pytest
 
-from bench.soak import judged
+from bench.soak import failures_of
 
 FLAT = [0.5] * 40
 
 
 @pytest.mark.parametrize(
-    ('worst', 'filled', 'most', 'times', 'said'),
+    ('worst', 'filled', 'most', 'times', 'expected'),
     [
         (1.1, 300.0, 330.0, FLAT, []),
         (1.3, 300.0, 330.0, FLAT, ['the error']),
@@ -18,7 +18,7 @@ FLAT = [0.5] * 40
         (1.1, 0.0, 0.0, [], []),
     ],
 )
-def test_error_memory_and_time_are_judged(worst, filled, most, times, said):
-    found = judged(worst, filled, most, times)
-    assert len(found) == len(said)
-    assert all(text.startswith(start) for text, start in zip(found, said, strict=True))
+def test_error_memory_and_time_are_judged(worst, filled, most, times, expected):
+    failures = failures_of(worst, filled, most, times)
+    assert len(failures) == len(expected)
+    assert all(text.startswith(start) for text, start in zip(failures, expected, strict=True))

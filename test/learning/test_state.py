@@ -95,9 +95,9 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
     store.forget(1, newest=1)
     with closing(StateStore(tmp_path, arm26)) as state:
         state.save(store, checkpoint.to_bytes(replace(initial, version=7)))
-    found, mae, not_used = read(tmp_path, arm26)
+    loaded, mae, not_used = read(tmp_path, arm26)
     assert not_used == ''
-    assert_same(found, store)
+    assert_same(loaded, store)
     assert mae.version == 7
     np.testing.assert_array_equal(mae.encoder[0][0], initial.encoder[0][0])
 
@@ -108,9 +108,9 @@ def test_a_full_store_comes_back_and_counts_on(tmp_path, arm26, stage):
         store.add(stage.sample())
     with closing(StateStore(tmp_path, arm26)) as state:
         state.save(store, None)
-    found, _, _ = read(tmp_path, arm26)
-    assert_same(found, store)
-    assert found.accepted == 12
+    loaded, _, _ = read(tmp_path, arm26)
+    assert_same(loaded, store)
+    assert loaded.accepted == 12
 
 
 @pytest.mark.parametrize('renames', [0, 1, 2])
@@ -141,9 +141,9 @@ def test_a_learner_killed_while_it_saves_has_the_state_before_or_after(
         patch.setattr(Path, 'unlink', die)
         with pytest.raises(Killed) if renames < 2 else nullcontext():
             state.save(after, None)
-    found, _, not_used = read(tmp_path, arm26)
+    loaded, _, not_used = read(tmp_path, arm26)
     assert not_used == ''
-    assert_same(found, before if renames < 2 else after)
+    assert_same(loaded, before if renames < 2 else after)
     assert {file.name for file in tmp_path.iterdir()} <= {NEWEST, PREVIOUS, LOCK}
 
 
@@ -184,12 +184,12 @@ def test_a_file_that_cannot_be_used_is_kept_and_the_one_before_it_is_used(
 ):
     store = written(tmp_path, arm26, stage, 4)
     spoil(tmp_path / NEWEST)
-    found, _, not_used = read(tmp_path, arm26)
-    assert found.numbers == store.numbers[:-1]
+    loaded, _, not_used = read(tmp_path, arm26)
+    assert loaded.numbers == store.numbers[:-1]
     assert NEWEST in not_used and BACKUP in not_used
     assert (tmp_path / BACKUP).exists()
     again, _, not_used = read(tmp_path, arm26)
-    assert_same(again, found)
+    assert_same(again, loaded)
     assert not_used == ''
 
 
@@ -211,16 +211,16 @@ def test_where_no_state_can_be_used_learning_starts_anew_and_says_so(
 
 def test_another_robots_state_is_kept_whole_and_not_used(tmp_path, arm26, stage):
     store = written(tmp_path, arm26, stage, 1)
-    found, mae, not_used = read(tmp_path, Robot.load('musashi_left_arm'))
-    assert (len(found), mae) == (0, None)
+    loaded, mae, not_used = read(tmp_path, Robot.load('musashi_left_arm'))
+    assert (len(loaded), mae) == (0, None)
     assert arm26.muscles[0] in not_used
     assert_same(read_backup(tmp_path, arm26, tmp_path / 'scratch')[0], store)
 
 
 def test_a_network_that_cannot_be_used_does_not_cost_the_samples(tmp_path, arm26, stage):
     store = written(tmp_path, arm26, stage, 3, b'no checkpoint')
-    found, mae, not_used = read(tmp_path, arm26)
-    assert_same(found, store)
+    loaded, mae, not_used = read(tmp_path, arm26)
+    assert_same(loaded, store)
     assert mae is None
     assert 'not safetensors' in not_used and BACKUP in not_used
     again, _, not_used = read(tmp_path, arm26)
@@ -245,22 +245,22 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
     with closing(Learner(arm26, initial, directory=tmp_path, trainer=Prepared)) as learner:
-        found = learner.samples
-        assert found.numbers == store.numbers
-        for one, other in zip(found.samples, store.samples, strict=True):
+        loaded = learner.samples
+        assert loaded.numbers == store.numbers
+        for one, other in zip(loaded.samples, store.samples, strict=True):
             assert one.isolated == (added + 1,) and other.isolated == (added,)
             np.testing.assert_array_equal(one.theta, other.theta)
             np.testing.assert_array_equal(one.length[kept], other.length)
             np.testing.assert_array_equal(one.direction[kept], other.direction)
-        np.testing.assert_array_equal(np.array(found.known)[:, kept], store.known)
-        assert not np.array(found.known)[:, added].any()
+        np.testing.assert_array_equal(np.array(loaded.known)[:, kept], store.known)
+        assert not np.array(loaded.known)[:, added].any()
         assert arm26.muscles[added] in learner.report().values['saved state not used']
         # They bring as many updates as when they came; then all waits for new ones.
         for now in range(10):
             learner.poll(2.0 * now)
         assert learner.updates == 4
     assert_same(read_backup(tmp_path, small, tmp_path / 'scratch')[0], store)
-    assert_same(read(tmp_path, arm26)[0], found)
+    assert_same(read(tmp_path, arm26)[0], loaded)
 
 
 # -- one learner a directory ----------------------------------------------------------------------

@@ -23,7 +23,7 @@ def within(margin: float) -> np.ndarray:
     return np.random.default_rng(3).uniform(LOWER + margin, UPPER - margin, (150, 3))
 
 
-def found(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
+def estimated_zeros(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
     ones = np.ones(len(LOWER))
     return sensor_zeros(read * radian, LOWER * radian, UPPER * radian, radian * ones)
 
@@ -31,18 +31,18 @@ def found(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize('seed', range(5))
 def test_readings_at_the_stops_give_the_joint_sensor_offsets(seed):
     noise = 0.002 * np.random.default_rng(9).standard_normal((150, 3))
-    zero, spread = found(rests(seed=seed) + TRUE + noise)
+    zero, spread = estimated_zeros(rests(seed=seed) + TRUE + noise)
     assert zero == pytest.approx(TRUE, abs=STOP)
     assert (spread < 0.5 * ZERO).all()
 
 
 def test_a_sensor_without_offset_is_not_corrected():
-    zero, _ = found(rests())
+    zero, _ = estimated_zeros(rests())
     assert zero == pytest.approx(np.zeros(3), abs=0.005)
 
 
 def test_joints_that_never_reach_a_stop_give_no_offset():
-    zero, spread = found(within(0.1) + TRUE)
+    zero, spread = estimated_zeros(within(0.1) + TRUE)
     assert zero == pytest.approx(np.zeros(3), abs=0.003)
     assert (spread > 0.5 * ZERO).all()
 
@@ -51,43 +51,43 @@ def test_joints_that_never_reach_a_stop_give_no_offset():
 def test_a_few_readings_close_together_are_no_stop(count):
     rng = np.random.default_rng(4)
     for _ in range(10):
-        zero, _ = found(rng.uniform(LOWER, UPPER, (count, 3)))
+        zero, _ = estimated_zeros(rng.uniform(LOWER, UPPER, (count, 3)))
         assert np.linalg.norm(zero) < 2.0 * STOP
 
 
 def test_one_posture_held_near_a_limit_is_no_stop():
     theta = within(0.1)
     held = LOWER + 0.04 + 0.001 * np.random.default_rng(1).standard_normal((40, 3))
-    zero, _ = found(np.vstack([theta, held]))
+    zero, _ = estimated_zeros(np.vstack([theta, held]))
     assert zero == pytest.approx(np.zeros(3), abs=0.005)
 
 
 def test_a_joint_parked_near_a_limit_while_others_move_is_no_stop():
     theta = within(0.1)
     theta[50:] = LOWER + 0.04 + 0.001 * theta[50:] * [1, 0, 0] + within(0.1)[50:] * [0, 1, 1]
-    zero, _ = found(theta)
+    zero, _ = estimated_zeros(theta)
     assert zero[0] == pytest.approx(0.0, abs=0.005)
 
 
 def test_limits_that_stop_nothing_are_not_taken_for_stops():
     rng = np.random.default_rng(2)
     theta = rng.uniform(LOWER - 0.1, UPPER + 0.1, (150, 3))
-    zero, _ = found(theta)
+    zero, _ = estimated_zeros(theta)
     assert zero == pytest.approx(np.zeros(3), abs=STOP)
 
 
 def test_a_joint_without_sensor_has_no_offset():
     read = rests() + TRUE
     read[:, 1] = np.nan
-    zero, spread = found(read)
+    zero, spread = estimated_zeros(read)
     assert zero == pytest.approx(TRUE * [1, 0, 1], abs=STOP)
     assert np.isfinite(spread).all()
     read[:] = np.nan
-    assert found(read[:0])[0] == pytest.approx(np.zeros(3))
+    assert estimated_zeros(read[:0])[0] == pytest.approx(np.zeros(3))
 
 
 def test_offsets_of_prismatic_joints_scale_with_their_radian():
     read = rests() + TRUE
-    (zero, spread), (slid, slid_spread) = found(read), found(read, 0.02)
+    (zero, spread), (slid, slid_spread) = estimated_zeros(read), estimated_zeros(read, 0.02)
     assert slid == pytest.approx(0.02 * zero)
     assert slid_spread == pytest.approx(0.02 * spread)

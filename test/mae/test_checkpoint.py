@@ -291,11 +291,11 @@ def test_what_tells_a_push_from_friction_comes_back_and_unsound_values_are_refus
     np.testing.assert_array_equal(mae.touch.friction, touch.friction)
     np.testing.assert_array_equal(mae.touch.spread, touch.spread)
     assert small().touch is None and from_bytes(GOOD).touch is None
-    for wrong, said in (
+    for wrong, problem in (
         (replace(touch, friction=np.array([0.1, 9.0])), 'touch.friction has a value of ±9'),
         (replace(touch, spread=np.zeros(1)), 'touch.spread has the value 0'),
         (replace(touch, time=-1.0), 'touch_time'),
         (replace(touch, spread=np.ones(2)), 'touch.spread has shape'),
     ):
-        with pytest.raises(CheckpointError, match=said):
+        with pytest.raises(CheckpointError, match=problem):
             from_bytes(to_bytes(replace(small(), touch=wrong)))

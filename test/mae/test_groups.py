@@ -63,10 +63,10 @@ def test_groups_are_what_muscles_connect_however_they_are_listed():
 
 def test_a_joint_without_muscles_and_a_muscle_without_joints_are_in_some_group():
     crossed = np.array([[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]], dtype=bool)
-    found = groups(crossed)
-    for whole, parts in zip((range(4), range(3)), zip(*found)):
+    result = groups(crossed)
+    for whole, parts in zip((range(4), range(3)), zip(*result)):
         assert sorted(sum(parts, ())) == [*whole]
-    assert all(joints and muscles for joints, muscles in found)
+    assert all(joints and muscles for joints, muscles in result)
 
 
 def test_layers_and_training_steps_grow_with_a_large_group():

@@ -15,7 +15,7 @@ from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.nodes.sources import SILENT_TOPIC
 
 
-def said(
+def diagnostics(
     node: str, message: str = '', level: bytes = DiagnosticStatus.OK, **values: str
 ) -> DiagnosticArray:
     pairs = [KeyValue(key=key.replace('_', ' '), value=value) for key, value in values.items()]
@@ -26,23 +26,23 @@ def said(
 def test_before_the_first_sample_it_says_why_the_error_may_rise():
     situation = Situation('/left')
     assert situation.hint() == ''  # nobody learns
-    situation.diagnosed(said('/left/learner', samples='0'))
+    situation.diagnosed(diagnostics('/left/learner', samples='0'))
     assert 'error may rise' in situation.hint()
-    situation.diagnosed(said('/left/learner', samples='3', checkpoints='2'))
+    situation.diagnosed(diagnostics('/left/learner', samples='3', checkpoints='2'))
     assert situation.hint() == '' and (situation.samples, situation.checkpoints) == ('3', '2')
 
 
 def test_a_learned_network_is_not_said_to_have_learned_nothing():
     situation = Situation('/left')
-    situation.diagnosed(said('/left/learner', samples='0', network_learned='True'))
+    situation.diagnosed(diagnostics('/left/learner', samples='0', network_learned='True'))
     assert situation.hint() == ''
 
 
 def test_it_says_with_how_many_samples_learning_begins():
     situation = Situation('/left')
-    situation.diagnosed(said('/left/learner', samples='3', samples_to_begin_with='20'))
+    situation.diagnosed(diagnostics('/left/learner', samples='3', samples_to_begin_with='20'))
     assert 'learning begins with 20 samples' in situation.hint()
-    situation.diagnosed(said('/left/learner', samples='20', samples_to_begin_with='20'))
+    situation.diagnosed(diagnostics('/left/learner', samples='20', samples_to_begin_with='20'))
     assert situation.hint() == ''
 
 
@@ -75,7 +75,9 @@ def stopped(cause, mode='stopped'):
         'remedy': cause.remedy,
         'remedy_steps': identifiers(cause.steps),
     }
-    return said('/left/controller', f'stopped: {cause.text}', DiagnosticStatus.ERROR, **values)
+    return diagnostics(
+        '/left/controller', f'stopped: {cause.text}', DiagnosticStatus.ERROR, **values
+    )
 
 
 RESET = '(to go on: call controller/reset)'
@@ -84,13 +86,13 @@ REPAIR = '(to go on: repair the muscle; call estimator/reset)'
 
 def test_a_stop_of_this_arm_alone_is_shown_with_its_remedy():
     situation = Situation('/left')
-    situation.diagnosed(said('/right/controller', mode='stopped', stop='another arm'))
+    situation.diagnosed(diagnostics('/right/controller', mode='stopped', stop='another arm'))
     assert situation.trouble() == ''
-    situation.diagnosed(said('/left/controller', mode='holding'))
+    situation.diagnosed(diagnostics('/left/controller', mode='holding'))
     assert situation.trouble() == ''
     situation.diagnosed(stopped(StopCause.OPERATOR))
     assert situation.trouble() == f'STOPPED: controller/stop was called {RESET}'
-    situation.diagnosed(said('/left/controller', mode='paused', stop_cause='stale_estimate'))
+    situation.diagnosed(diagnostics('/left/controller', mode='paused', stop_cause='stale_estimate'))
     assert situation.trouble() == ''  # it goes on by itself
 
 
@@ -105,24 +107,26 @@ def test_every_stop_is_shown_with_the_remedy_of_its_cause(cause):
 def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     situation = Situation('/left')
     suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps'}
-    situation.diagnosed(said('/left/estimator', **suspect, d='12.5', d_limit='9.0'))
+    situation.diagnosed(diagnostics('/left/estimator', **suspect, d='12.5', d_limit='9.0'))
     assert (situation.distance, situation.limit) == (12.5, 9.0)
     assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # without a controller
-    situation.diagnosed(said('/left/controller', mode='exploring'))
+    situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
     situation.diagnosed(stopped(StopCause.ANOMALY))
     assert situation.trouble() == (
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
         'call estimator/reset; call controller/reset; call controller/explore to explore again)'
     )
     assert situation.steps() == ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore']
-    situation.diagnosed(said('/left/estimator', finding='none'))
-    situation.diagnosed(said('/left/controller', mode='holding'))
+    situation.diagnosed(diagnostics('/left/estimator', finding='none'))
+    situation.diagnosed(diagnostics('/left/controller', mode='holding'))
     assert situation.trouble() == ''
 
 
 def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
     situation = Situation('/left')
-    situation.diagnosed(said('/left/estimator', finding='slack_tendon', suspect_muscle='biceps'))
+    situation.diagnosed(
+        diagnostics('/left/estimator', finding='slack_tendon', suspect_muscle='biceps')
+    )
     situation.diagnosed(stopped(StopCause.ANOMALY, 'verifying'))
     assert situation.trouble() == 'ANOMALY: biceps is being verified'
     situation.diagnosed(stopped(StopCause.OPERATOR, 'verifying'))
@@ -140,7 +144,9 @@ def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seco
 
     def second(estimator, controller):
         for node, version in ('estimator', estimator), ('controller', controller):
-            situation.diagnosed(said(f'/{node}', mode='holding', checkpoint_version=str(version)))
+            situation.diagnosed(
+                diagnostics(f'/{node}', mode='holding', checkpoint_version=str(version))
+            )
 
     for version in range(10):  # the controller follows a moment later
         second(version, max(version - 1, 0))
@@ -157,22 +163,24 @@ def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seco
 def test_an_error_of_any_node_is_shown_until_it_is_over():
     error = DiagnosticStatus.ERROR
     alone = Situation('/')
-    alone.diagnosed(said('/right/learner', 'the disk is full', error))
+    alone.diagnosed(diagnostics('/right/learner', 'the disk is full', error))
     assert alone.trouble() == ''
-    alone.diagnosed(said('/learner', 'the disk is full', error))
+    alone.diagnosed(diagnostics('/learner', 'the disk is full', error))
     assert alone.trouble() == '/learner: the disk is full'
     situation = Situation('/left')
-    situation.diagnosed(said('/right/learner', 'the disk is full', error))
-    situation.diagnosed(said('/left/controller', 'a KeyError escaped', error, fault='a KeyError'))
+    situation.diagnosed(diagnostics('/right/learner', 'the disk is full', error))
+    situation.diagnosed(
+        diagnostics('/left/controller', 'a KeyError escaped', error, fault='a KeyError')
+    )
     assert situation.trouble() == '/left/controller: a KeyError escaped'
     situation.diagnosed(stopped(StopCause.OPERATOR))
     stop = f'STOPPED: controller/stop was called {RESET}'
     assert situation.trouble() == stop
-    situation.diagnosed(said('/left/learner', 'the disk is full', error))
+    situation.diagnosed(diagnostics('/left/learner', 'the disk is full', error))
     assert situation.trouble() == f'{stop}, /left/learner: the disk is full'
-    situation.diagnosed(said('/left/controller', 'holding', mode='holding'))
+    situation.diagnosed(diagnostics('/left/controller', 'holding', mode='holding'))
     assert situation.trouble() == '/left/learner: the disk is full'
-    situation.diagnosed(said('/left/learner', 'learning'))
+    situation.diagnosed(diagnostics('/left/learner', 'learning'))
     assert situation.trouble() == ''
 
 
@@ -183,7 +191,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     def second(*nodes, lasting=1.0):
         nonlocal now
         for node in nodes:
-            situation.diagnosed(said(f'/left/{node}'))
+            situation.diagnosed(diagnostics(f'/left/{node}'))
         now += lasting
         situation.tick()
         return situation.level(), situation.trouble()
@@ -196,7 +204,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s: ')
     assert 'sim' not in trouble and 'view' not in trouble
     assert second('sim', 'learner') == ('ok', '')
-    situation.diagnosed(said('/left/second', 'wrong', DiagnosticStatus.ERROR))
+    situation.diagnosed(diagnostics('/left/second', 'wrong', DiagnosticStatus.ERROR))
     assert second('sim', 'learner')[1] == '/left/second: wrong'
     for _ in range(6):  # it has ended, and is none of the arm's own nodes
         second('sim', 'learner')
@@ -205,29 +213,29 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
 
 def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_body():
     situation = Situation('')
-    situation.diagnosed(said('/sim', 'slow', DiagnosticStatus.WARN))
+    situation.diagnosed(diagnostics('/sim', 'slow', DiagnosticStatus.WARN))
     assert (situation.level(), situation.trouble()) == ('warn', 'warning: /sim: slow')
     body = {'state': 'isolated', 'isolated_muscles': 'biceps', 'unknown_length_offsets': 'triceps'}
-    situation.diagnosed(said('/estimator', 'estimating', DiagnosticStatus.WARN, **body))
+    situation.diagnosed(diagnostics('/estimator', 'estimating', DiagnosticStatus.WARN, **body))
     assert situation.trouble() == (
         'isolated: biceps, length offsets unknown: triceps (to go on: call estimator/zero), '
         'warning: /sim: slow'
     )
-    situation.diagnosed(said('/estimator', finding='none', state='estimating'))
-    situation.diagnosed(said('/controller', mode='idle', unknown_length_offsets='triceps'))
+    situation.diagnosed(diagnostics('/estimator', finding='none', state='estimating'))
+    situation.diagnosed(diagnostics('/controller', mode='idle', unknown_length_offsets='triceps'))
     assert situation.trouble().startswith('length offsets unknown: triceps (to go on: ')
-    situation.diagnosed(said('/controller', mode='idle'))
+    situation.diagnosed(diagnostics('/controller', mode='idle'))
     several = {'several_publishers': 'joint_states come from a and b', 'finding': 'none'}
-    situation.diagnosed(said('/estimator', 'two', DiagnosticStatus.ERROR, **several))
+    situation.diagnosed(diagnostics('/estimator', 'two', DiagnosticStatus.ERROR, **several))
     assert (situation.level(), situation.trouble()) == (
         'error',
         '/estimator: two, warning: /sim: slow',
     )
     stop = 'several publishers: joint_states come from a and b'
     values = {'mode': 'stopped', 'stop_cause': 'second_publisher', 'stop': stop, 'remedy': 'end it'}
-    situation.diagnosed(said('/controller', 'stopped', DiagnosticStatus.ERROR, **values))
+    situation.diagnosed(diagnostics('/controller', 'stopped', DiagnosticStatus.ERROR, **values))
     assert situation.trouble() == f'STOPPED: {stop} (to go on: end it), warning: /sim: slow'
-    situation.diagnosed(said('/bringup_status', 'the same again', DiagnosticStatus.ERROR))
+    situation.diagnosed(diagnostics('/bringup_status', 'the same again', DiagnosticStatus.ERROR))
     assert 'the same again' not in situation.trouble()
 
 

@@ -138,9 +138,9 @@ def host(graph, arm26, trained_file, monkeypatch):
     def make(process=False, **parameters):
         if not process:
             here = 'musculoskeletal_ae.nodes.learner.TrainerProcess'
-            monkeypatch.setattr(here, lambda *given, device: Trainer(*given))  # noqa: ARG005
-        given = {'checkpoint': trained_file, 'state_directory': '', **parameters}
-        return HostedLearner(graph, arm26, **given)
+            monkeypatch.setattr(here, lambda *values, device: Trainer(*values))  # noqa: ARG005
+        defaults = {'checkpoint': trained_file, 'state_directory': ''}
+        return HostedLearner(graph, arm26, **(defaults | parameters))
 
     return make
 

@@ -53,10 +53,10 @@ print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
     assert lines[-1] == 'loaded'
     assert lines[0].startswith(f'The node `{node}`: ')
     for name, parameter in PARAMETERS[node].items():
-        told = [line for line in lines if f' {name} (default: ' in line]
-        assert len(told) == 1
-        assert told[0].startswith(' *') is parameter.settable
-        below = lines[lines.index(told[0]) + 1]
+        matching = [line for line in lines if f' {name} (default: ' in line]
+        assert len(matching) == 1
+        assert matching[0].startswith(' *') is parameter.settable
+        below = lines[lines.index(matching[0]) + 1]
         assert parameter.meaning in below and parameter.unit in below
         assert all(word in below for word in parameter.legal)
         if parameter.within:
@@ -149,12 +149,14 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
 def test_of_parameters_set_together_none_is_taken_if_one_is_refused(
     graph, trained_file, kind, parameters, kept
 ):
-    given = {'checkpoint': trained_file} if 'checkpoint' in parameters else {}
+    required = {'checkpoint': trained_file} if 'checkpoint' in parameters else {}
     node = graph.host(
-        kind, robot='arm26', **given, **{'explore': True} if kind is Controller else {}
+        kind, robot='arm26', **required, **{'explore': True} if kind is Controller else {}
     )
     before = kept(node)
-    one, other = (RosParameter(name, value=value) for name, value in (parameters | given).items())
+    one, other = (
+        RosParameter(name, value=value) for name, value in (parameters | required).items()
+    )
     result = node.set_parameters_atomically([one, other])
     assert not result.successful and result.reason.startswith(f'parameter {other.name}: ')
     assert kept(node) == before

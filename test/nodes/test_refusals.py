@@ -54,11 +54,11 @@ def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):
     unreliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     graph.node.create_publisher(JointState, 'target_joint_states', unreliable)
     latching = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    told = set()
+    texts = set()
 
     def shown():
-        told.add(graph.report('controller').message.partition('; refused ')[2])
-        return any('publish it reliable' in text for text in told)
+        texts.add(graph.report('controller').message.partition('; refused ')[2])
+        return any('publish it reliable' in text for text in texts)
 
     graph.wait(shown, 'the report')
     graph.listen(Float64MultiArray, 'muscle_length_command', latching)

@@ -430,10 +430,10 @@ def test_a_wire_that_touches_nowhere_what_it_should_wrap_round_is_told(change, t
     (route,) = (m['route'] for m in document['muscles'] if m['name'] == 'triceps_lateral')
     place = next(n for n, item in enumerate(route) if item['link'] == 'forearm')
     wrap = {'wrap': 'cylinder', 'link': 'forearm', 'xyz': [0, 0, 0], 'axis': [0, 1, 0]}
-    for given, kinds in (({}, []), (change, ['idle_object'])):
+    for change_of_wrap, kinds in (({}, []), (change, ['idle_object'])):
         document['muscles'][3]['route'] = [
             *route[:place],
-            wrap | {'radius': 0.03} | given,
+            wrap | {'radius': 0.03} | change_of_wrap,
             *route[place:],
         ]
         warnings = check_robot(Robot.load(write_muscles(folder, document))).warnings
@@ -471,17 +471,17 @@ def test_a_remedy_written_into_muscles_yaml_does_what_it_says(tmp_path, case):
     for line in lines:
         if '→' not in line:
             continue
-        said = float(re.search(r'→ ([\d.]+) %', line)[1])
+        stated_share = float(re.search(r'→ ([\d.]+) %', line)[1])
         changed = {key: dict(v) if isinstance(v, dict) else v for key, v in top.items()}
-        told = number.findall(line)
-        if len(told) != line.split('→')[0].count(',') + 1:
+        changes = number.findall(line)
+        if len(changes) != line.split('→')[0].count(',') + 1:
             continue  # mass, moment arms and limits are not in muscles.yaml
-        for owner, name, value in told:
+        for owner, name, value in changes:
             (changed.setdefault(owner, {}) if owner else changed)[name] = float(value)
         changed.setdefault('tension', {})['max'] = 2000.0
         after = check_robot(Robot.load(write_robot(tmp_path / 'after', **changed)), 60)
         share = getattr(after, kind.removeprefix('not_')).mean()
-        assert 100.0 * share == pytest.approx(said, abs=0.06), line
+        assert 100.0 * share == pytest.approx(stated_share, abs=0.06), line
         assert share > getattr(before, kind.removeprefix('not_')).mean()
         assert (share >= 0.95) == ('not enough' not in line)
         tried += 1

@@ -14,16 +14,16 @@ POSTURES = ARM.random_postures(100, np.random.default_rng(0), -0.1)
 def test_a_pose_is_reached_within_the_noise_of_the_camera_from_a_distant_estimate():
     for theta in POSTURES:
         pose = ARM.kinematics.end_effector_pose(theta)
-        found = inverse_kinematics(ARM, pose, theta + 0.15)
-        assert found.distance < 3.0 * SPREADS[0] and found.angle < 3.0 * SPREADS[3]
+        posture = inverse_kinematics(ARM, pose, theta + 0.15)
+        assert posture.distance < 3.0 * SPREADS[0] and posture.angle < 3.0 * SPREADS[3]
 
 
 def test_an_estimate_that_agrees_with_the_pose_is_not_changed():
     for theta in POSTURES:
         pose = ARM.kinematics.end_effector_pose(theta)
         for spreads in (SPREADS, POSITION_ONLY):
-            found = inverse_kinematics(ARM, pose, theta, spreads)
-            np.testing.assert_allclose(found.theta, theta, atol=1e-9)
+            posture = inverse_kinematics(ARM, pose, theta, spreads)
+            np.testing.assert_allclose(posture.theta, theta, atol=1e-9)
 
 
 def test_noise_of_the_camera_turns_joints_by_less_than_0_2_rad():
@@ -31,5 +31,7 @@ def test_noise_of_the_camera_turns_joints_by_less_than_0_2_rad():
     rng = np.random.default_rng(1)
     theta = ARM.random_postures(400, rng)
     observed = [camera_reading(ARM.kinematics.end_effector_pose(each), rng) for each in theta]
-    found = [inverse_kinematics(ARM, *known).theta for known in zip(observed, theta, strict=True)]
-    assert np.linalg.norm(np.array(found) - theta, axis=1).max() < 0.2
+    solutions = [
+        inverse_kinematics(ARM, *known).theta for known in zip(observed, theta, strict=True)
+    ]
+    assert np.linalg.norm(np.array(solutions) - theta, axis=1).max() < 0.2

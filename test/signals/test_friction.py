@@ -26,10 +26,10 @@ def test_small_sliding_is_followed_through_noise(distance, most):
     moves = rng.uniform(-0.001, 0.001, 100)
     slid = np.concatenate([[*np.full(50, move / 50), *np.zeros(100)] for move in moves])
     read = np.cumsum(slid) + 1e-4 * rng.standard_normal(slid.shape)
-    for moved, found in zip(slid, directions(read[:, None])[:, 0], strict=True):
+    for moved, direction in zip(slid, directions(read[:, None])[:, 0], strict=True):
         way = -np.sign(moved)
         s = way + (s - way) * np.exp(-abs(moved) / distance)
-        off.append(found - s)
+        off.append(direction - s)
     assert np.sqrt(np.mean(np.square(off))) < most  # 0.19 and 0.11; by a clipped spring 0.28, 0.19
 
 

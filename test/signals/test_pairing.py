@@ -76,14 +76,14 @@ def test_each_joint_is_paired_as_if_it_were_alone(publishers, muscles, period):
     for moments, joints in publishers:
         for time in moments:
             sent.setdefault(time, np.array([joints >> j & 1 for j in range(3)], dtype=bool))
-    pairing, found = Pairing(period), []
+    pairing, paired_theta = Pairing(period), []
     for time, kind in sorted([(time, 0) for time in sent] + [(m, 1) for m in [*muscles, math.inf]]):
         if kind == 0:
             pairing.joints(time, np.where(sent[time], float(time), np.nan))
         elif paired := pairing.muscles(time, 'message'):
-            found.append(np.full(3, np.nan) if paired.theta is None else paired.theta)
+            paired_theta.append(np.full(3, np.nan) if paired.theta is None else paired.theta)
     for j in range(3):
         own = sorted(time for time, which in sent.items() if which[j])
         alone = paired_by_definition(own, muscles, period)
         alone = [np.nan if n is None else own[n] for n in alone]
-        np.testing.assert_array_equal([theta[j] for theta in found], alone)
+        np.testing.assert_array_equal([theta[j] for theta in paired_theta], alone)

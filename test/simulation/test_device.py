@@ -25,11 +25,11 @@ class Devices(TorchFunctionMode):
 
     def __init__(self):
         super().__init__()
-        self.seen = set()
+        self.types = set()
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         result = function(*args, **(kwargs or {}))
-        self.seen |= {result.device.type} if isinstance(result, torch.Tensor) else set()
+        self.types |= {result.device.type} if isinstance(result, torch.Tensor) else set()
         return result
 
 
@@ -89,7 +89,7 @@ def test_the_network_is_computed_on_the_device(robot, mae):
     network, tension = TorchLengths(mae, 'meta'), np.ones((ARMS, robot.muscle_count))
     with Devices() as devices, pytest.raises((NotImplementedError, RuntimeError), match='meta'):
         network.lengths_with_pullback(theta, tension)
-    assert devices.seen == {'meta'}
+    assert devices.types == {'meta'}
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason='it simulates there')

@@ -74,8 +74,8 @@ class Browser:
             raise
 
     def _find_tab(self) -> str | None:
-        found = self.call('Target.getTargets')['targetInfos']
-        return next((each['targetId'] for each in found if each['type'] == 'page'), None)
+        targets = self.call('Target.getTargets')['targetInfos']
+        return next((each['targetId'] for each in targets if each['type'] == 'page'), None)
 
     @staticmethod
     def _wait(condition: Any, what: str = 'the browser') -> Any:
@@ -141,7 +141,7 @@ class Browser:
 
     def centre(self, button: str) -> tuple[float, float]:
         """Return where the button with a text is."""
-        found = self._wait(
+        result = self._wait(
             lambda: self.evaluate(
                 '(() => { const b = [...document.querySelectorAll("button")].find('
                 f'b => b.innerText.trim() === {json.dumps(button)}); if (!b) return null;'
@@ -150,7 +150,7 @@ class Browser:
             ),
             f'the button {button}',
         )
-        return found[0], found[1]
+        return result[0], result[1]
 
     def close_notifications(self) -> None:
         """Click away what covers the arm, such as the warning that there is no graphics card."""

@@ -102,12 +102,12 @@ def test_the_camera_sees_the_whole_arm_with_its_hand(robot, tmp_path):
         camera = page._server.initial_camera
         eye, ahead = np.array(camera.position), np.array(camera.look_at) - camera.position
         middle = 0.5 * (robot.lower + robot.upper)
-        seen = [*robot.routes.points(middle[None])[0]]
-        seen += [
+        visible = [*robot.routes.points(middle[None])[0]]
+        visible += [
             robot.kinematics.link_pose(middle, link).translation
             for link in robot.description.end_effectors
         ]
-        to = np.array(seen) - eye
+        to = np.array(visible) - eye
         cosine = to @ ahead / (np.linalg.norm(to, axis=1) * np.linalg.norm(ahead))
         # Half of the height is 0.4 rad; panels leave less than that of the width.
         assert np.arccos(cosine).max() < math.atan(0.7 * math.tan(0.4))
