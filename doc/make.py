@@ -199,33 +199,43 @@ def command_line() -> str:
 #: of README: key of `experiment robustness`, label, and what the paper measured on Musashi
 ESTIMATES = {
     'before_rad': ('before learning', '0.414'),
-    'least_squares_rad': ('least squares on the geometric model', '–'),
+    'least_squares_rad': ('least squares on the geometric model (no learning)', '–'),
     'paper_after_rad': ('preset `paper`, after learning', '0.186'),
     'after_rad': ('**preset `default`, after learning**', '–'),
-    'joint_sensors_rad': ('the joint sensors that it learned from', '–'),
+    'joint_sensors_rad': ('the joint sensors themselves', '–'),
 }
 #: of README: what, a text with numbers of an experiment's result.json, and the experiment
 CAPABILITIES = (
-    ('learning without joint sensors', '{none_rad:.3f} rad', 'sensors'),
     (
-        'the same, with a marker seen in 1 of 10 rest samples',
+        'joint-angle error after learning without joint sensors',
+        '{none_rad:.3f} rad ({before_rad:.3f} before)',
+        'sensors',
+    ),
+    (
+        'the same, if a camera sees a marker on the hand in one of ten resting postures',
         '{marker_tenth_rad:.3f} rad',
         'sensors',
     ),
     (
-        'naming a ruptured muscle',
-        '{named_share:.0%} named correctly in {detection_s:.2f} s; {false_alarms} false alarms',
+        'naming the ruptured muscle, if it carried tension',
+        '{named_share:.0%} of {counted_cuts}, {detection_s:.2f} s after the rupture on average',
         'estimation',
     ),
+    ('false alarms in one healthy hour', '{false_alarms}', 'estimation'),
     (
-        'moving on without it (`on_anomaly: isolate`)',
-        '{right_isolations_share:.0%} isolated correctly within 10 s',
+        'isolating exactly the ruptured muscle within 10 s (`on_anomaly: isolate`)',
+        '{right_isolations_share:.0%} of the ruptures',
         'resilience',
     ),
-    ('tracking joint motions of 1 s', '{track_1s_rad:.3f} rad', 'motion'),
+    ('wrong isolations in ten healthy hours', '{wrong_isolations}', 'resilience'),
     (
-        'external force of 10–50 N, without a force sensor',
-        '{wrench_error:.0%} and {wrench_error_deg:.1f}° off',
+        'mean tracking error of point-to-point motions of 1 s',
+        '{track_1s_rad:.3f} rad',
+        'motion',
+    ),
+    (
+        'estimating a force of 10–50 N on the hand without a force sensor',
+        'magnitude {wrench_error:.0%} and direction {wrench_error_deg:.1f}° off',
         'motion',
     ),
 )
@@ -244,14 +254,14 @@ def estimates_table() -> str:
         if key == 'after_rad':
             cells = [f'**{cell}**' for cell in cells]
         lines.append(f'| {label} | {" | ".join(cells)} | {printed} |')
-    lines += ['', f'`experiment robustness`, mean of {individuals(about["seeds"])}.']
+    lines += ['', f'`experiment robustness`, means over {individuals(about["seeds"])}.']
     return '\n'.join(lines)
 
 
 def capabilities_table() -> str:
     """Return the table of capabilities in README."""
     results = read(FOLDER / 'results')
-    lines = ['| capability, measured on `kin` | result | command |', '|---|---|---|']
+    lines = ['| capability on `kin` | result | command |', '|---|---|---|']
     for what, text, name in CAPABILITIES:
         lines.append(f'| {what} | {text.format(**results[name])} | `experiment {name}` |')
     return '\n'.join(lines)
