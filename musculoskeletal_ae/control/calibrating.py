@@ -56,7 +56,8 @@ class Calibrating:
     def step(self, inputs: Inputs) -> Command | None:
         """Return the next length command."""
         if self._ramp is None or (self._ramp.done and self._rested >= REST):
-            self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, SPEED)
+            speed = float(self._robot.fastest(SPEED).min())
+            self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, speed)
             self._rested = 0.0
         if self._ramp.done:
             self._rested += inputs.dt

@@ -43,7 +43,8 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
         tension: T [N], (..., M).
 
     Returns:
-        l_comp [m], (..., M); zero at T_bias, negative above it.
+        l_comp [m], (..., M); zero at T_bias, negative above it. Zero for modules that follow
+        positions, since their K_stiff is infinite.
     """
     return -(tension - robot.tension.bias) / robot.stiffness
 
@@ -53,4 +54,6 @@ def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
     tension = np.maximum(sample.motor_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
-    return Command(LENGTH, sample.length + msc_compensation(robot, tension))
+    if robot.follows_position:
+        return Command(LENGTH, sample.length.copy())
+    return Command(LENGTH, robot.length_for(sample.length, sample.motor_tension, tension))

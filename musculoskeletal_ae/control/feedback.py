@@ -17,6 +17,9 @@ RELIEF = 0.01
 #: Estimated errors up to this size are not corrected [rad], for prismatic joints times RACK [m]. It
 #: is about the error of the estimate. Without it, an arm with friction would creep for ever.
 DEADBAND = 0.03
+#: largest relief of modules that follow positions [m]; covers errors of a network that has not
+#: learned the arm yet, which such modules turn into slack or into tension
+SLACK = 0.03
 BETWEEN = 0.1  # time between two computations of the needless tension [s]
 SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
 
@@ -52,6 +55,9 @@ class RestFeedback:
     torque of T_end, so that the relief moves no joint. A tendon that was wound in is paid out until
     friction no longer retains tension in it. A tendon that was paid out is not paid out further,
     because friction already supports the arm there.
+
+    Modules that follow positions do not hold T_bias. For them K_stiff is the stiffness of the
+    series elastic element, T may be below T_bias, and |r| ≤ SLACK: a slack tendon is wound in.
 
     Attributes:
         correction: c [rad], (D,).
@@ -100,14 +106,16 @@ class RestFeedback:
         self.correction = np.clip(correction, -self.largest, self.largest)
         self._unsolved += dt
         if self._unsolved >= BETWEEN:
-            bias = self._robot.tension.bias
-            share = gain * self._unsolved / self._robot.stiffness
+            robot, bias = self._robot, self._robot.tension.bias
+            lowest = np.zeros_like(bias) if robot.follows_position else bias
+            largest = SLACK if robot.follows_position else RELIEF
+            share = gain * self._unsolved / robot.tension_per_length(pull.motor)
             self._unsolved = 0.0
-            bone = np.clip(pull.bone, bias, limit)
+            bone = np.clip(pull.bone, lowest, limit)
             least = least_tension(jacobian, -jacobian.T @ bone, bias, limit).tension
-            motor = np.clip(pull.motor, bias, limit)
+            motor = np.clip(pull.motor, lowest, limit)
             needless = np.where(motor > least, motor - least, np.minimum(bone - least, 0.0))
-            self.relief = np.clip(self.relief + share * needless, -RELIEF, RELIEF)
+            self.relief = np.clip(self.relief + share * needless, -largest, largest)
         return True
 
     def shift(self, jacobian: Array) -> Array:

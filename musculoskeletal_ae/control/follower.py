@@ -16,6 +16,8 @@ dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/d
 drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This is
 T_low. λ is measured while the arm moves (`winches`).
 
+Modules that follow positions resist no motion beyond their lag λ; l_comp and K_stiff λ dl/dt are 0.
+
 A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
 (`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
 rest feedback (`feedback.RestFeedback`) continues from c.
@@ -89,7 +91,8 @@ class Stiffening:
             self._near = solution.tension if near is None else near
             self.solution = solution
         # Use half of it, because the series elastic elements stretch as well.
-        largest = 0.5 * (1.0 - SHARE) * settings.rate_limit * robot.stiffness * dt
+        rates = robot.fastest(settings.rate_limit) * robot.tension_per_length(self._near)
+        largest = 0.5 * (1.0 - SHARE) * rates * dt
         self._near = self._near + np.clip(solution.tension - self._near, -largest, largest)
         return self._near
 
@@ -235,7 +238,7 @@ class Follower:
             length = self._held(inputs)
         length = np.where(self._robot.used, length, sent)
         if self._blend is None:
-            rate_limit = self._settings.rate_limit
+            rate_limit = float(self._robot.fastest(self._settings.rate_limit).min())
             self._blend = Ramp(sent - length, np.zeros_like(length), BLENDING, rate_limit)
         return Command(LENGTH, length + self._blend.step(dt))
 
@@ -280,7 +283,9 @@ class Follower:
         speed = jacobian @ at.velocity
         self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
-        low = robot.tension.bias + robot.stiffness * lag * np.maximum(speed, 0.0)
+        low = robot.tension.bias
+        if not robot.follows_position:
+            low = low + robot.stiffness * lag * np.maximum(speed, 0.0)
         loss = np.exp(self._friction * self._sliding)
         near: Array | float = 0.0
         if self._is_stiff:
@@ -318,4 +323,5 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]
-    return float(max(1.0, np.abs(speed).max() / (SHARE * settings.rate_limit)))
+    fastest = SHARE * robot.fastest(settings.rate_limit)
+    return float(max(1.0, (np.abs(speed) / fastest).max()))

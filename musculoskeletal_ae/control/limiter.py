@@ -14,6 +14,15 @@ contact demands. If the measured tension exceeds the limit nevertheless, for exa
 or a sensor is wrong, the feedback r pays the muscle out further. A muscle whose measured tension is
 above `tension.limit` is paid out faster than the rate limit. No muscle is wound in faster.
 
+Modules that follow positions turn a command into tension by stretching the series elastic elements:
+
+    l_target ≥ l − SHARE (L_e(T_limit) − L_e(T)) + r       while T ≤ T_limit
+    l_target ≥ l + L_e(T) − L_e(T_limit) + r               above it
+
+Here T is measured, so that the limit holds in any posture and for any error of the network. They
+receive length commands only: a desired tension becomes the length that moves T towards it by a
+share of the difference (`ADMITTANCE`).
+
 T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
 (`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
 
@@ -46,6 +55,11 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
 #: largest difference between the length of a real muscle and that of the model [m]
 LENGTH_MARGIN = 0.03
+#: share of the stretch that remains up to T_limit that a command to a module that follows positions
+#: may use; the rest covers errors of L_e and the age of T
+SHARE = 0.7
+#: share of a difference of tensions that a command to such a module removes
+ADMITTANCE = 0.5
 RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
 
@@ -101,6 +115,8 @@ class CommandLimiter:
         if self.command.kind == kind:
             return self.command
         if kind == TENSION:
+            if self._robot.follows_position:
+                return unchanging(self._robot, TENSION, sample)
             return Command(TENSION, self._robot.demanded(sample.length, self.command.value))
         return Command(LENGTH, self._length_demanding(self.command.value, sample))
 
@@ -116,10 +132,10 @@ class CommandLimiter:
         change = self.largest_change(LENGTH, age)
         return np.clip(length, before - change, before + change)
 
-    def largest_change(self, kind: str, dt: float) -> Array | float:
-        """Return the largest change of a command within dt [s]: [m], or [N] (M,)."""
-        rate = self._settings.rate_limit * dt
-        return rate if kind == LENGTH else rate * self._robot.stiffness
+    def largest_change(self, kind: str, dt: float) -> Array:
+        """Return the largest change of a command within dt [s]: [m] or [N], (M,)."""
+        robot, rate = self._robot, self._robot.fastest(self._settings.rate_limit) * dt
+        return rate if kind == LENGTH else rate * robot.tension_per_length(robot.tension.bias)
 
     def limit(
         self, desired: Command, sample: MuscleSample, tension_limit: Array, dt: float
@@ -135,6 +151,8 @@ class CommandLimiter:
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
         """
+        if desired.kind == TENSION and self._robot.follows_position:
+            desired = self._by_admittance(desired.value, sample)
         kind = desired.kind
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
@@ -155,15 +173,31 @@ class CommandLimiter:
             self._last_length = self._last_length[0], self._last_length[1] + dt
         return self.command
 
+    def _by_admittance(self, tension: Array, sample: MuscleSample) -> Command:
+        """Return the lengths that move the measured tensions towards others [N] (M,)."""
+        robot, measured = self._robot, np.maximum(sample.motor_tension, 0.0)
+        goal = measured + ADMITTANCE * (tension - measured)
+        return Command(LENGTH, robot.length_for(sample.length, measured, goal))
+
     def _shortest(
-        self, before: Array, change: Array | float, sample: MuscleSample, limit: Array, dt: float
+        self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
         """Return the shortest length [m] (M,) that demands no tension above the limit."""
         robot = self._robot
         tension = sample.motor_tension * sample.usable
-        depth = -msc_compensation(robot, limit)
-        relief = self._relief + RELIEF * dt * (tension - limit) / robot.stiffness
-        self._relief = np.clip(relief, 0.0, depth)
+        if robot.follows_position:
+            depth = robot.elongation(limit) - robot.elongation(tension)
+            depth, most = np.where(depth > 0.0, SHARE * depth, depth), robot.release
+            # Where the tension is not known, a command may not run further ahead of the module than
+            # what stretches it from T_bias to T_limit.
+            is_known = np.isfinite(tension)
+            depth, tension = np.where(is_known, depth, most), np.where(is_known, tension, 0.0)
+        else:
+            depth = most = -msc_compensation(robot, limit)
+        per_length = robot.tension_per_length(limit)
+        self._relief = np.clip(
+            self._relief + RELIEF * dt * (tension - limit) / per_length, 0.0, most
+        )
         length = np.minimum(sample.length, self.longest)
         shortest = length - depth + self._relief
         # The rate limit is exceeded only if the measured tension is too high: a length sensor alone

@@ -147,7 +147,7 @@ class LengthRamps:
         self.solution = None  # in case the next line raises an exception
         self.solution = self._solve(goal, inputs.mae, self._tension)
         length = np.where(self._robot.used, self.solution.length, self._command)
-        rate_limit = self._settings.rate_limit
+        rate_limit = float(self._robot.fastest(self._settings.rate_limit).min())
         self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)
         self._remaining = max(goal.duration, self._ramp.duration)
 

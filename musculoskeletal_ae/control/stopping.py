@@ -5,6 +5,11 @@ The last command is held for `hold_time`, except after an overload. Then lengths
 rate limit until muscle stiffness control demands only T_bias. Tension commands fall to T_bias at
 K_stiff times the rate limit.
 
+Modules that follow positions hold no tension of their own. Each is paid out until its measured
+tension is T_bias, and then stays: a tendon that no weight loads is not paid out further, and an arm
+that its muscles carry is let down slowly. A muscle whose tension is not known is paid out by
+`Robot.release`, counted from the start of the release.
+
 After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
 once the other muscles are paid out. Winding ends when its measured tension, or the tension that
 muscle stiffness control demands, has risen by `LARGEST_RISE`. It also ends when its command has
@@ -15,6 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import Settings
@@ -54,6 +60,7 @@ class SafeStop:
         self.is_entered = False
         self._held = 0.0  # time since the start of the stop [s]
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]
+        self._released_from: Array | None = None  # lengths at the start of the release [m], (M,)
 
     @property
     def is_releasing(self) -> bool:
@@ -98,6 +105,12 @@ class SafeStop:
             return Command(TENSION, np.maximum(self._robot.tension.bias, last.value - change))
         change = self._limiter.largest_change(LENGTH, dt)
         longest = self._limiter.longest
+        if self._robot.follows_position:
+            value = self._paid_out(last.value, change, sample, is_fresh)
+            if winds and self.suspect is not None:
+                m = self.suspect
+                value[m] = self._wound(m, float(last.value[m]), sample, dt)
+            return Command(LENGTH, value)
         # With l_target at the measured length, muscle stiffness control demands only T_bias. If the
         # length is out of date, the muscle is paid out to its largest possible length.
         end = sample.length if is_fresh else np.maximum(sample.length, longest)
@@ -110,13 +123,37 @@ class SafeStop:
             )
         return Command(LENGTH, value)
 
+    def _paid_out(self, last: Array, change: Array, sample: MuscleSample, is_fresh: bool) -> Array:
+        """Return the next lengths of modules that follow positions [m], (M,)."""
+        robot, whole = self._robot, self._robot.description.tension
+        if self._released_from is None:
+            self._released_from = np.maximum(last, sample.length)
+        end = self._released_from + robot.release
+        tension = sample.motor_tension
+        if is_fresh:
+            # The tension sensor of an isolated muscle may be faulty.
+            is_known = np.isfinite(tension) & robot.used
+            excess = robot.elongation(tension) - robot.elongation(whole.bias)
+            measured = sample.length + np.maximum(excess, 0.0)
+            # Where the tension is low enough, the module stays where it is commanded to be.
+            measured = np.where(tension > whole.bias, np.maximum(measured, last), last)
+            end = np.where(is_known, measured, end)
+        end = np.minimum(end, self._limiter.longest)
+        return np.minimum(last + change, np.maximum(end, last))
+
     def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:
         """Return the suspect's next length command [m]; `command` is its last one."""
         if self._wound_from is None:
             self._wound_from = command
         length, tension, _ = sample.newest[:, muscle]
         rise = tension - self._robot.description.tension.bias[muscle]
-        demand = self._robot.stiffness[muscle] * (length - command)
-        if max(rise, demand) > LARGEST_RISE:
+        if not self._robot.follows_position:
+            rise = max(rise, self._robot.stiffness[muscle] * (length - command))
+        if rise > LARGEST_RISE:
             return command
-        return max(command - SPEED * dt, self._wound_from - DEPTH)
+        # A module that follows positions may have to take up slack first. `Robot.release` stretches
+        # its tendon from T_bias to T_limit, whatever its tension sensor reads.
+        depth = DEPTH
+        if self._robot.follows_position:
+            depth = float(self._robot.release[muscle])
+        return max(command - SPEED * dt, self._wound_from - depth)

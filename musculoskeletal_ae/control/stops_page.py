@@ -28,7 +28,9 @@ controller in `/diagnostics` name the same.
 
 The action `hold` keeps the last command; if the stop lasts longer than `hold_time`, the arm is \
 released. The action `release` keeps the last command for `hold_time` and then pays out all \
-muscles until each exerts T_bias; `release at once` does not wait for `hold_time`. If several \
+muscles until each exerts T_bias; `release at once` does not wait for `hold_time`. Modules that \
+follow positions are paid out until their measured tension is T_bias, or by `release` of \
+muscles.yaml where no tension is known. If several \
 causes begin together, the first one in this table is reported.
 
 {table}

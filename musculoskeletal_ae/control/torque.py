@@ -81,7 +81,8 @@ class TorqueControl:
         # Change all muscles by the same share: each tension between two that hold the arm holds it,
         # too.
         change = tension - self._command
-        fastest = robot.stiffness * self._settings.rate_limit * dt
+        rates = robot.tension_per_length(self._command) * robot.fastest(self._settings.rate_limit)
+        fastest = rates * dt
         share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
         self._command = self._command + change * share
         return Command(TENSION, self._command.copy())

@@ -20,6 +20,8 @@ class Winches:
 
         l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
 
+    Modules that follow positions have K_stiff = ∞ and always follow.
+
     The fit is by least squares over all muscles whose speed exceeds WINDING.
     """
 
@@ -53,7 +55,9 @@ class Winches:
             return
         speed = (length - before) / since
         lacking = length - command + msc_compensation(self._robot, tension)
-        is_usable = (np.abs(speed) > WINDING) & (length > command) & self._robot.used
+        is_usable = (np.abs(speed) > WINDING) & self._robot.used
+        if not self._robot.follows_position:
+            is_usable &= length > command
         self._products -= float(lacking[is_usable] @ speed[is_usable])
         self._squares += float(speed[is_usable] @ speed[is_usable])
 

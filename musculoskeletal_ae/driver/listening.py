@@ -224,6 +224,8 @@ class Listening:
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
         """Check T and temperature in `states` (3, M) of modules without commands."""
         bias = self._robot.tension.bias
+        if self._robot.follows_position:  # T is what the posture gives
+            bias = np.full_like(bias, np.nan)
         for unit, newtons in TENSION_UNITS.items():
             if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():
                 verdict.failed('tension unit', unit=unit)
@@ -306,6 +308,8 @@ class Listening:
             return math.inf
         model = robot.muscle_lengths(theta, tension)
         moved: Bools = np.ptp(model, axis=0) > MOVED
+        if robot.follows_position:  # a hand moves the joints, but the modules hold their lengths
+            moved[:] = False
 
         def misfit(error: Array) -> Array:
             # On a moved arm, length offsets do not affect this comparison. On an arm at rest, the
@@ -315,7 +319,8 @@ class Listening:
 
         fit = np.array([misfit(column[:, None] - model) for column in length.T])
         if not moved.any():
-            verdict.notes.append('move the arm by hand for a better check of sign and order')
+            better = 'pass --move' if robot.follows_position else 'move the arm by hand'
+            verdict.notes.append(f'{better} for a better check of sign and order')
             fit = np.maximum(fit, fit.T)  # at rest, only pairwise exchanges can be recognised
         rows, best = linear_sum_assignment(fit)
         inverse = misfit(length + model)

@@ -14,6 +14,7 @@ from musculoskeletal_ae.schema import Strict
 Check = Literal['rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency']
 CHECKS: tuple[Check, ...] = get_args(Check)
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
+POSITION_LAW = 'l → l_target, for as long as T is below T_max'
 LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g} N/m'
 
 
@@ -65,6 +66,8 @@ class Verdict:
         if muscles:
             first, robot = muscles[0], self.robot
             values['law'] = LAW.format(robot.tension.bias[first], robot.stiffness[first])
+            if robot.follows_position:
+                values['law'] = POSITION_LAW
         muscles = muscles or tuple(range(self.robot.muscle_count))
         self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))

@@ -14,22 +14,27 @@ TENSION_TOLERANCE. It then replaces the tolerance, and all demanded tensions and
 thresholds grow by the same factor.
 """
 
-from collections import deque
 from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.driver.motion import (
+    MEAN,
+    RELEASE,
+    MotionTest,
+    RunAwayError,
+    Wait,
+)
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
 ABOVE_BIAS = 40.0  # [N] default of the highest demanded tension, above T_bias
 LEAST_ABOVE_BIAS = 20.0  # [N]; responses to lower demands cannot be distinguished from noise
-SETTLE, HOLD, RELEASE, MEAN = 1.5, 0.5, 0.6, 0.3  # [s] durations
+SETTLE, HOLD = 1.5, 0.5  # [s] durations
 SPEED = 0.01  # [m/s] at which a target continues inwards while the arm gives way
-RELEASE_SPEED = 0.03  # [m/s] at which a target returns
 FURTHEST = 0.025  # [m] by which a muscle is wound in at most
 SLACK = 0.01  # [m] by which l_target is then set beyond l
 RUN_AWAY_TENSION = 60.0  # [N] above the demand at which a muscle is released
@@ -44,8 +49,6 @@ CLIP = 20.0, 0.05  # demand beyond tension.max [N], tolerance beyond it (share)
 MIRROR_TOLERANCE = 0.008  # [m] around −l, where a muscle with the wrong sign of l gets tight
 MOST_BEYOND = 0.3  # highest demand beyond tension.max, as a share of it
 
-Wait = Generator[None, None, None]  # each step takes one message
-
 
 class _Reading(NamedTuple):
     """Mean values over MEAN, each (M,), and the demand of the law."""
@@ -56,11 +59,7 @@ class _Reading(NamedTuple):
     demand: Array
 
 
-class RunAwayError(Exception):
-    """A muscle exceeds its demand and must be released."""
-
-
-class Winding:
+class Winding(MotionTest):
     """Winds muscles in, with one command per message, and checks their responses."""
 
     def __init__(
@@ -77,9 +76,9 @@ class Winding:
             MusculoskeletalError: If the response to `highest` could not be distinguished from
                 noise, or if a muscle would need more than its tension.max.
         """
-        self.verdict, robot = verdict, verdict.robot
-        self._robot, self._bias = robot, robot.tension.bias
-        self._muscles = muscles or range(robot.muscle_count)
+        super().__init__(verdict, muscles)
+        robot = self._robot
+        self._bias = robot.tension.bias
         #: tolerance of T [N] (M,), and the factor by which it exceeds TENSION_TOLERANCE
         self._tolerance = np.maximum(TENSION_TOLERANCE, LENGTH_ERROR * robot.stiffness)
         self._scale: Array = self._tolerance / TENSION_TOLERANCE
@@ -106,24 +105,9 @@ class Winding:
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, '
                     f'not {limit} N'
                 )
-        self.trying = ''  # current step, for people
-        self.done = False
-        self._now = 0.0
-        self._recent: deque[tuple[float, Array]] = deque()
-        self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
         #: last time that each muscle was below its demand plus RUN_AWAY_TENSION [s]
         self._tame_at: Array = np.zeros(robot.muscle_count)
         self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
-        self._run = self._sequence()
-
-    def step(self, states: Array, now: float) -> Array | None:
-        """Take l, T, temperature (3, M) at a time [s]; return l_target [m] (M,), or None."""
-        self._now = now
-        self._recent.append((now, states))
-        while now - self._recent[0][0] > MEAN:
-            self._recent.popleft()
-        self.done = self.done or next(self._run, self) is self
-        return None if self.done or np.isnan(self._target).any() else self._target.copy()
 
     # -- what is commanded ----------------------------------------------------------------------
 
@@ -179,25 +163,11 @@ class Winding:
         length, tension, third = readings.mean(axis=0)
         return _Reading(length, tension, third, clipped)
 
-    def _noise(self) -> Array:
-        """Return the standard deviation of T over MEAN [N] (M,)."""
-        return np.std([states[1] for _, states in self._recent], axis=0)
-
     def _off(self, reading: _Reading) -> Bools:
         """Return which muscles have another tension than the law demands, (M,)."""
         tolerated = np.maximum(self._resting, TENSION_SHARE * reading.demand)
         wrong: Bools = np.abs(reading.tension - reading.demand) > tolerated
         return wrong
-
-    def _go(self, m: int, goal: float) -> Wait:
-        """Move a target to `goal` [m] at RELEASE_SPEED, and wait."""
-        last = self._now
-        while self._target[m] != goal:
-            yield from self._wait(1e-9)
-            most = RELEASE_SPEED * (self._now - last)
-            self._target[m] += np.clip(goal - self._target[m], -most, most)
-            last = self._now
-        yield from self._wait(RELEASE)
 
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]

@@ -3,9 +3,12 @@
 
     MSC        T_ref = T_bias + max(0, K (l − l_target))      (paper, §III-E, eq. 5)
     motor      dl/dt = −gain (T_ref − T), within the speed limit and the length limits
+    position   dl/dt = (l_target − l)/POSITION_LAG, within the speed of the module; T ≤ T_max
     heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
 
-In MSC and motor control, l and T are the readings of the module's own sensors.
+In MSC and motor control, l and T are the readings of the module's own sensors. `muscles.yaml` says
+whether the modules follow MSC or positions (`actuation`). A module that follows positions holds its
+length while it gets no commands, and gives way to more than T_max.
 """
 
 import math
@@ -31,6 +34,7 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # These values are chosen; those of Musashi are not public.
 RELEASE_RATE = 100.0  # [N/s] at which a module in the safe state approaches T_bias
 MOTOR_GAIN = 0.004  # [m/s/N]
+POSITION_LAG = 0.02  # [s] time constant of a module that follows positions
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
 AMBIENT = 25.0  # [°C]
@@ -64,6 +68,8 @@ class Modules(NamedTuple):
     length_low: Array  # limits of l that the motor can wind to [m]
     length_high: Array
     stiffness: Array  # K of muscle stiffness control [N/m]
+    follows_position: Array  # 1 for modules that follow positions
+    speed: Array  # largest speed [m/s]
     tension_bias: Array  # [N]
     tension_max: Array
     loss: Array  # k [W/N²]
@@ -113,7 +119,15 @@ def wind(
     reading: float, tension: float,
 ) -> float:  # fmt: skip
     """Move motor m by its length [m] and tension [N] readings; return the wound-in length [m]."""
-    before, previous, bias = muscle.length[m], muscle.reference[m], modules.tension_bias[m]
+    previous, bias = muscle.reference[m], modules.tension_bias[m]
+    most = min(modules.speed[m], SPEED_LIMIT * (1.0 - command.stuck[m]))
+    if modules.follows_position[m] > 0.0:
+        speed = 0.0
+        if kind == FOLLOW_LENGTH:
+            speed = (command.value[m] - reading) / POSITION_LAG
+        if tension > modules.tension_max[m]:
+            speed = max(speed, MOTOR_GAIN * (tension - modules.tension_max[m]))
+        return _turn(modules, muscle, m, min(most, max(-most, speed)))
     if kind == FOLLOW_LENGTH:
         desired = bias + max(0.0, modules.stiffness[m] * (reading - command.value[m]))
     elif kind == FOLLOW_TENSION:
@@ -125,8 +139,13 @@ def wind(
     speed = -MOTOR_GAIN * (muscle.reference[m] - tension)
     if muscle.ruptured[m] > 0.0:
         speed = -SPEED_LIMIT
-    most = SPEED_LIMIT * (1.0 - command.stuck[m])
-    speed = min(most, max(-most, speed))
+    return _turn(modules, muscle, m, min(most, max(-most, speed)))
+
+
+@njit(cache=True)
+def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
+    """Turn motor m at a speed [m/s] for one STEP; return the wound-in length [m]."""
+    before = muscle.length[m]
     after = min(modules.length_high[m], max(modules.length_low[m], before + STEP * speed))
     muscle.length[m] = after
     return before - after
@@ -200,7 +219,10 @@ class Arm(ABC):
         mean = loss, WINDING_CAPACITY, HOUSING_CAPACITY, WINDING_RESISTANCE, HOUSING_RESISTANCE
         spread = self._heat_rng.normal(0.0, HEAT_SPREAD, (5, self.robot.muscle_count))
         thermal = (one * np.exp(factor) for one, factor in zip(mean, spread, strict=True))
-        return Modules(low, high, self.robot.stiffness, tension.bias, tension.max, *thermal)
+        robot, ones = self.robot, np.ones(self.robot.muscle_count)
+        follows, speed = ones * robot.follows_position, np.minimum(SPEED_LIMIT, robot.speed)
+        limits = tension.bias, tension.max
+        return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
     def reset(self, theta: Array | None = None) -> None:
         """Put the arm at rest at θ, unloaded and at ambient temperature; mend ruptured tendons.
@@ -270,11 +292,19 @@ class Arm(ABC):
         return self._kind == SAFE
 
     def command_length(self, length: Array) -> None:
-        """Follow target lengths [m], shape (M,), by muscle stiffness control."""
+        """Follow target lengths [m], shape (M,), by muscle stiffness control or as positions."""
         self._follow(FOLLOW_LENGTH, length)
 
     def command_tension(self, tension: Array) -> None:
-        """Follow target tensions [N], shape (M,)."""
+        """Follow target tensions [N], shape (M,).
+
+        Raises:
+            MusculoskeletalError: If the modules follow positions; nothing changes then.
+        """
+        if self.robot.follows_position:
+            raise MusculoskeletalError(
+                'actuation: position: the modules follow lengths only; send length commands'
+            )
         self._follow(FOLLOW_TENSION, tension)
 
     def _follow(self, kind: int, value: Array) -> None:

@@ -306,7 +306,9 @@ class Estimator:
         demand = self._commands.demand(self.robot, sample.length, now)
         known = self.body.offsets.known
         self.measured = self._measured_theta(now)
-        finding = self.health.step(Observation(sample, estimate, demand, dt, known, self.measured))
+        command = self._commands.length(now)
+        observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
+        finding = self.health.step(observation)
         detected = self._handle(finding, now)
         contact = None
         if known:

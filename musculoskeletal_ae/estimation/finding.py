@@ -63,6 +63,7 @@ class Observation:
         dt: Time since the previous message [s], at most a short pause.
         lengths_known: Whether the length offsets are known.
         measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
+        command: l_target of the muscle modules [m], (M,); None without a command.
     """
 
     sample: MuscleSample
@@ -71,6 +72,7 @@ class Observation:
     dt: float
     lengths_known: bool = True
     measured: Array | None = None
+    command: Array | None = None
 
 
 def observe(
@@ -81,6 +83,7 @@ def observe(
     dt: float,
     demand: Array | None = None,
     state: State | None = None,
+    command: Array | None = None,
 ) -> Observation:
     """Return the observation of recorded readings, whose temperatures are unknown.
 
@@ -92,6 +95,7 @@ def observe(
         dt: Time since the message before [s].
         demand: T that the modules are commanded [N], (M,), if it is known.
         state: What the network restores, if the caller has computed it already.
+        command: l_target of the modules [m], (M,), if it is known.
     """
     unknown = np.full(len(length), np.nan)
     sample = MuscleSample(
@@ -106,7 +110,8 @@ def observe(
         newest=np.array([length, motor_tension, unknown]),
     )
     state = mae.estimate(bone_tension, length) if state is None else state
-    return Observation(sample, estimate_of(mae, state, bone_tension, length), demand, dt)
+    estimate = estimate_of(mae, state, bone_tension, length)
+    return Observation(sample, estimate, demand, dt, command=command)
 
 
 class Detector:

@@ -26,8 +26,11 @@ class ModuleCommands:
         return self._length if now - self._time <= COMMAND_AGE else None
 
     def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
-        """Return T that the modules have to pull with at l [m] (M,), [N] (M,), or None."""
-        if now - self._time > COMMAND_AGE:
+        """Return T that the modules have to pull with at l [m] (M,), [N] (M,), or None.
+
+        Modules that follow positions have no such tension.
+        """
+        if now - self._time > COMMAND_AGE or robot.follows_position:
             return None
         if self._length is None:
             return self._tension

@@ -29,7 +29,13 @@ from collections.abc import Iterable
 
 from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Kind
 from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
-from musculoskeletal_ae.estimation.verification import Outcome, Verdict, Verification
+from musculoskeletal_ae.estimation.verification import (
+    ModuleLaw,
+    Outcome,
+    PositionLaw,
+    Verdict,
+    Verification,
+)
 from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS, WITHIN = 2, 60.0  # number of healthy suspects, and the time in which they count [s]
@@ -108,9 +114,16 @@ class SuspectHandling:
         recent = [time for time in self._acquitted if now - time < WITHIN]
         if not isolates or finding.kind in OF_SEVERAL or len(recent) >= ACQUITTALS:
             return isolated
-        bias, stiffness = self._robot.description.tension.bias, self._robot.stiffness
-        self.verification = Verification(muscle, float(bias[muscle]), float(stiffness[muscle]))
+        self.verification = Verification(muscle, self._law(muscle))
         return (*isolated, muscle)
+
+    def _law(self, muscle: int) -> ModuleLaw:
+        robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])
+        if not robot.follows_position:
+            return ModuleLaw(bias, float(robot.stiffness[muscle]))
+        elastic = robot.series_elastic.of(muscle)
+        at_zero = robot.routes.length_at_zero[muscle]
+        return PositionLaw(bias, lambda tension: float(elastic.elongation(at_zero, tension)))
 
     def conclude(self, verdict: Verdict, isolated: Iterable[int], now: float) -> tuple[int, ...]:
         """End the verification with a verdict; return the muscles that are isolated from now on."""

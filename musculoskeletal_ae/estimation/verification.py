@@ -7,7 +7,24 @@ muscle stiffness control demands, and with the length l' estimated from the othe
 
     T_ref = T_bias + K (l − l_target)
 
-The first row that applies decides:
+Modules that follow positions regulate no tension. Their T_ref is what the series elastic element
+has to pull with when the suspect is stretched further than before it was wound in:
+
+    L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T)
+
+There a tendon may be slack at first. It is wound in until it pulls, or until it is so short that a
+sound one had to pull. The first row that applies decides:
+
+    l does not change at all                     length_sensor_frozen
+    l does not follow l_target                   jammed
+    T near zero, and x > STRETCHED · L_e(T_bias) ruptured
+    T does not change at all                     tension_sensor_frozen
+    T near zero all the same                     not_wound_in
+    |l − l'| > FAR                               length_sensor_offset
+    T rises with T_ref                           healthy
+    otherwise                                    tension_sensor_frozen
+
+The first row that applies decides, under muscle stiffness control:
 
     l does not change at all                     length_sensor_frozen
     T near zero, and l' − l > FAR or growing     ruptured: the winch winds in the rest of the tendon
@@ -23,6 +40,7 @@ a broken one. A suspect that is not wound in within PATIENCE seconds stays isola
 """
 
 import math
+from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
 
@@ -40,7 +58,11 @@ USUAL_BIAS = 30.0  # T_bias for which the tensions below apply; for other arms t
 CLOSE = 8.0  # absolute tolerance of T relative to T_ref [N]
 SHARE = 0.35  # relative tolerance, as a share of T_ref − T_bias
 TIGHT = 20.0  # excess over T_ref that shows a jam although the suspect was not wound in [N]
+STRETCHED = 1.5  # stretch of a sound tendon that has to pull, as a multiple of that at T_bias
+LONGEST_WINDING = 2.5  # [s] for which a slack tendon is wound in, at most
+BEHIND = 0.005  # decrease of a position command that a sound module follows [m]
 STANDS = 0.0005  # largest motion of a jammed muscle module [m]
+HIGHEST, HALVINGS = 5000.0, 40  # of the search for T_ref of a position [N]
 FROZEN = 1e-6  # largest range of the readings of a frozen sensor [m], [N]
 
 
@@ -80,6 +102,15 @@ class Verdict(NamedTuple):
         return f'{text} {self.evidence}' if self.evidence else text
 
 
+class _Reading(NamedTuple):
+    """Readings of the suspect, its command, and what the other muscles say."""
+
+    tension: float  # T [N]
+    length: float  # l [m]
+    command: float  # l_target [m]
+    likely: float  # l' [m]
+
+
 class _Row(NamedTuple):
     """Readings of the suspect at one moment while it was wound in."""
 
@@ -87,20 +118,65 @@ class _Row(NamedTuple):
     length: float  # l [m]
     demand: float  # T_ref [N]
     excess: float  # l − l' [m]
+    command: float  # l_target [m]
+    stretch: float  # x [m]
+
+
+class ModuleLaw:
+    """T_ref of one module under muscle stiffness control."""
+
+    def __init__(self, bias: float, stiffness: float) -> None:
+        """Take T_bias [N] and K [N/m]."""
+        self.bias, self._stiffness = bias, stiffness
+
+    def stretch(self, row: _Reading) -> float:
+        """Return x [m]; only modules that follow positions need it."""
+        return row.likely - row.length
+
+    def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
+        """Return T_ref [N]; `is_reference`: the suspect has not been wound in yet."""
+        return self.bias + max(0.0, self._stiffness * (row.length - row.command))
+
+
+class PositionLaw(ModuleLaw):
+    """T_ref of one module that follows positions, by the stretch of its series elastic element."""
+
+    def __init__(self, bias: float, elongation: Callable[[float], float]) -> None:
+        """Take T_bias [N] and L_e [m] as a function of T [N]."""
+        super().__init__(bias, math.inf)
+        self._elongation = elongation
+        self._reference = 0.0  # x_0 − L_e(T_0) [m]
+        self.stretched = STRETCHED * elongation(bias)  # [m]
+
+    def stretch(self, row: _Reading) -> float:
+        """Return x [m]."""
+        return row.likely - row.length + self._elongation(row.tension)
+
+    def demand(self, row: _Reading, is_reference: bool) -> float:
+        """Return T_ref [N]."""
+        stretch = self.stretch(row)
+        if is_reference:  # x_0 of a slack tendon is not known
+            is_slack = row.tension < LIMITS.slack_share * self.bias
+            self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
+        wanted, low, high = stretch - self._reference, 0.0, HIGHEST
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._elongation(middle) < wanted else (low, middle)
+        return low
 
 
 class Verification:
     """Verifies one suspect muscle, starting with the message after its finding."""
 
-    def __init__(self, muscle: int, bias: float, stiffness: float) -> None:
+    def __init__(self, muscle: int, law: ModuleLaw) -> None:
         """Start the verification.
 
         Args:
             muscle: Index of the suspect.
-            bias: Its T_bias [N].
-            stiffness: Its K of muscle stiffness control [N/m].
+            law: T_ref of its module.
         """
-        self.muscle, self._bias, self._stiffness = muscle, bias, stiffness
+        bias = self._bias = law.bias
+        self.muscle, self._law = muscle, law
         self._scale = min(1.0, bias / USUAL_BIAS)
         self._time = 0.0
         self._highest_command = -math.inf
@@ -126,13 +202,18 @@ class Verification:
         self._time += dt
         demand = math.inf
         if command is not None:
-            demand = self._bias + max(0.0, self._stiffness * (length - command))
-            if command >= self._highest_command:
+            is_reference = command >= self._highest_command
+            reading = _Reading(tension, length, command, likely)
+            demand, stretch = self._law.demand(reading, is_reference), self._law.stretch(reading)
+            if is_reference:
                 self._highest_command = command
                 self._before = tension, demand
             if command < self._highest_command - BEGUN:
                 self._watched += dt
-                self._rows.append(_Row(tension, length, demand, length - likely))
+                excess = length - likely
+                self._rows.append(_Row(tension, length, demand, excess, command, stretch))
+        if self._watched >= JUDGED and isinstance(self._law, PositionLaw):
+            return self._judge_position(self._law)
         if self._watched >= JUDGED:
             return self._judge()
         if self._time < PATIENCE:
@@ -142,7 +223,7 @@ class Verification:
         return Verdict(Outcome.NOT_WOUND_IN)
 
     def _judge(self) -> Verdict:
-        tension, length, demand, excess = np.array(self._rows).T
+        tension, length, demand, excess, *_ = np.array(self._rows).T
         first_quarter = slice(max(len(tension) // 4, 1))
         last_quarter = slice(-max(len(tension) // 4, 1), None)
         reached, wanted, beside = map(_late_median, (tension, demand, excess))
@@ -167,6 +248,33 @@ class Verification:
         if abs(reached - wanted) < close + SHARE * (wanted - self._bias):
             return Verdict(Outcome.HEALTHY)
         return Verdict(Outcome.JAMMED)
+
+    def _judge_position(self, law: PositionLaw) -> Verdict | None:
+        rows = self._rows[len(self._rows) // 2 :]
+        tension, length, demand, excess, command, stretch = np.median(rows[-10:], axis=0)
+        is_slack = tension < LIMITS.slack_share * self._bias
+        is_stretched = stretch > law.stretched
+        if is_slack and not is_stretched and self._watched < LONGEST_WINDING:
+            return None
+        spread: Array = np.ptp([(row.tension, row.length) for row in self._rows], axis=0)
+        first = self._rows[0]
+        followed, asked = first.length - length, first.command - command
+        if spread[1] < FROZEN:
+            return Verdict(Outcome.LENGTH_SENSOR_FROZEN)
+        if asked > BEHIND and followed < 0.5 * asked:
+            return Verdict(Outcome.JAMMED)
+        if is_slack and is_stretched:
+            return Verdict(Outcome.RUPTURED)
+        if spread[0] < FROZEN:
+            return Verdict(Outcome.TENSION_SENSOR_FROZEN)
+        if is_slack:
+            return Verdict(Outcome.NOT_WOUND_IN)
+        if abs(excess) > FAR:
+            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'by {1e3 * excess:.0f} mm')
+        rise, demanded = tension - self._before[0], demand - self._before[1]
+        if rise >= SHARE * demanded or demanded <= CLOSE * self._scale:
+            return Verdict(Outcome.HEALTHY)
+        return Verdict(Outcome.TENSION_SENSOR_FROZEN)
 
 
 def _late_median(values: Array) -> float:

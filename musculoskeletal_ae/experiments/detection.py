@@ -122,9 +122,10 @@ def run_detector(robot: Robot, mae: Mae, recording: Recording) -> DetectorOutput
     restored = mae.estimate(bone_tensions, recording.length)
     messages = zip(recording.length, recording.tension, bone_tensions, strict=True)
     for n, (length, tension, bone_tension) in enumerate(messages):
-        demand = robot.demanded(length, recording.command[n])
+        command = recording.command[n]
+        demand = None if robot.follows_position else robot.demanded(length, command)
         state = State(*(part[n] for part in restored))
-        message = observe(mae, length, tension, bone_tension, SAMPLE_TIME, demand, state)
+        message = observe(mae, length, tension, bone_tension, SAMPLE_TIME, demand, state, command)
         finding = health.step(message)
         reading = health.residual.reading
         assert reading is not None

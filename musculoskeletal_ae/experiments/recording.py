@@ -23,6 +23,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions, end_tension
 
+PAID_OUT = 0.1  # [m] beyond its command, at which a muscle is slack in any posture
 SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
 #: random seeds of the exploration (plus the individual's seed) and of the held-out motion
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
@@ -145,7 +146,7 @@ def record(
     Every command is that of `first`. `second` needs the current tension, which a fixed list cannot
     contain; the least tension that holds the posture on the geometric model replaces it. While a
     muscle is switched off, all modules follow tensions: 0 N for this muscle, and the tensions of
-    MSC for the others.
+    MSC for the others. A module that follows positions is paid out instead.
 
     Args:
         arm: The arm.
@@ -167,8 +168,8 @@ def record(
             off = script(arm, SAMPLE_TIME * len(rows)) if script else None
             share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step.duration))
             command = start + share * (goal - start)
-            if off is None:
-                arm.command_length(command)
+            if off is None or robot.follows_position:
+                arm.command_length(command if off is None else command + off * PAID_OUT)
             else:
                 arm.command_tension(np.where(off, 0.0, robot.demanded(read.length, command)))
             arm.step(SAMPLE_TIME)

@@ -179,7 +179,10 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
         MusculoskeletalError: If the options name an unknown muscle, or too small a tension.
     """
     muscles = robot.muscle_indices(options.muscles or [])
-    kind = import_heavy('musculoskeletal_ae.driver.winding').Winding
+    if robot.follows_position:
+        kind: Any = import_heavy('musculoskeletal_ae.driver.positioning').Positioning
+    else:
+        kind = import_heavy('musculoskeletal_ae.driver.winding').Winding
     return kind(verdict, muscles, options.tension)
 
 

@@ -129,7 +129,9 @@ class Controller(Shell):
             kind: publisher.get_subscription_count()
             for kind, publisher in self.publishers_of.items()
         }
-        if value in BY_TENSION and followed[LENGTH] and not followed[TENSION]:
+        # The limiter turns tensions into lengths for modules that follow positions.
+        by_tension = value in BY_TENSION and not self.robot.follows_position
+        if by_tension and followed[LENGTH] and not followed[TENSION]:
             # The driver would pay the muscles out, as it does without commands.
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
             problem = f'{value!r}: the driver follows muscle_length_command only'

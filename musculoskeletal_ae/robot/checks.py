@@ -168,7 +168,9 @@ def judge(setting: Setting) -> RobotCheck:
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
-    taut = np.where(tension[held] > bias + SLACK_MARGIN, k, 0.0)
+    # A module that follows a position also holds a muscle at T_bias.
+    is_taut = robot.follows_position | (tension[held] > bias + SLACK_MARGIN)
+    taut = np.where(is_taut, k, 0.0)
     full, sided = (
         setting.springs + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
         for x in (k, taut)

@@ -8,14 +8,14 @@ message. Later code relies on this.
 import math
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from msgspec import UNSET, to_builtins
+from msgspec import UNSET, UnsetType, to_builtins
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
@@ -46,6 +46,8 @@ OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 INDEFINITE = -1e-9
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
+STIFFNESS_DEFAULT = 10000.0  # [N/m]
+SPEED_DEFAULT = 0.1  # [m/s]
 
 
 class RoutePoint(NamedTuple):
@@ -113,8 +115,14 @@ class RobotDescription:
     muscles: tuple[str, ...]  # in the order of T and l
     routes: tuple[Route, ...]  # one for each muscle
     series_elastic: SeriesElastic
-    stiffness: Array  # K_stiff of muscle stiffness control [N/m], (M,)
+    #: K_stiff of muscle stiffness control [N/m], (M,); infinite for modules that follow positions
+    stiffness: Array
     tension: TensionRange
+    #: whether the modules follow l_target itself, and the resulting tension is not regulated
+    follows_position: bool
+    speed: Array  # with which they follow it [m/s], (M,); infinite for other modules
+    #: that a stop pays out where no tension is known [m], (M,)
+    release: Array
     end_effectors: tuple[str, ...]  # links; `end_effector` is the first
     couplings: dict[str, Coupling]  # of joints that follow others
     joint_elasticity: JointElasticity  # springs and dampers of the joints
@@ -133,8 +141,10 @@ class RobotDescription:
 
     @property
     def joint_notes(self) -> list[str]:
-        """Lines that name the coupled joints and those held fixed."""
+        """Lines that name coupled joints, those held fixed, and modules that follow positions."""
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
+        if self.follows_position:
+            lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines
@@ -168,14 +178,19 @@ def load_description(robot: str | Path) -> RobotDescription:
     links = [str(frame.name) for frame in body_frames(model)]
     elastic_default = series_elastic.DEFAULT | _entries(content.series_elastic)
     tension_default = _read_tension('$.tension', content.tension, TENSION_DEFAULT, fail)
+    follows_position = content.actuation == 'position'
+    stiffness_default = math.inf if follows_position else _or(content.stiffness, STIFFNESS_DEFAULT)
+    speed_default = _or(content.speed, SPEED_DEFAULT) if follows_position else math.inf
     routes, elastic, tension, stiffness, warnings = [], [], [], [], list[str]()
+    speed, release = [], []
     for i, muscle in enumerate(content.muscles):
         place = f'$.muscles[{i}]'
         routes.append(_read_route(f'{place}.route', muscle, links, fail, warnings))
         elastic.append(elastic_default | _entries(muscle.series_elastic))
         tension.append(_read_tension(f'{place}.tension', muscle.tension, tension_default, fail))
-        own = muscle.stiffness
-        stiffness.append(content.stiffness if own is UNSET else own)
+        stiffness.append(_or(muscle.stiffness, stiffness_default))
+        speed.append(_or(muscle.speed, speed_default))
+        release.append(_or(muscle.release, _or(content.release, math.nan)))
     order = [link.get('name', '') for link in tree.iter('link')]
     return RobotDescription(
         directory=directory,
@@ -187,6 +202,9 @@ def load_description(robot: str | Path) -> RobotDescription:
         series_elastic=SeriesElastic(**_columns(elastic)),
         stiffness=np.array(stiffness),
         tension=TensionRange(**_columns(tension)),
+        follows_position=follows_position,
+        speed=np.array(speed),
+        release=np.array(release),
         end_effectors=_read_end_effectors(content, model, couplings, order, fail),
         couplings=couplings,
         joint_elasticity=_read_joint_elasticity(content, couplings, fail),
@@ -206,6 +224,10 @@ def _entries(entry: Strict | None) -> dict[str, float]:
     """Return the values that an entry of the file sets, without omitted keys."""
     entries: dict[str, float] = {} if entry is None else to_builtins(entry)
     return entries
+
+
+def _or(value: float | UnsetType, default: float) -> float:
+    return default if value is UNSET else value
 
 
 def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
@@ -423,3 +445,15 @@ def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
         str(link.name): sum(model.names[i] in names for i in model.supports[link.parentJoint])
         for link in body_frames(model)
     }
+
+
+def with_modules(description: RobotDescription, actuation: str) -> RobotDescription:
+    """Return the description with another kind of muscle modules and their default values."""
+    follows_position, ones = actuation == 'position', np.ones(len(description.muscles))
+    return replace(
+        description,
+        follows_position=follows_position,
+        stiffness=ones * (math.inf if follows_position else STIFFNESS_DEFAULT),
+        speed=ones * (SPEED_DEFAULT if follows_position else math.inf),
+        release=np.full_like(ones, math.nan),
+    )

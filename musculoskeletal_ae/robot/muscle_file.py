@@ -94,6 +94,8 @@ class MuscleEntry(Strict, frozen=True):
     route: Annotated[tuple[RouteEntry, ...], Meta(min_length=2, max_length=LONGEST_LIST)]
     series_elastic: ElasticEntry | None = None
     stiffness: Positive | UnsetType = UNSET
+    speed: Positive | UnsetType = UNSET
+    release: Positive | UnsetType = UNSET
     tension: TensionEntry = TensionEntry()
 
     def __post_init__(self) -> None:
@@ -148,7 +150,10 @@ class MuscleFile(Strict, frozen=True):
     joints: Names
     muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
     series_elastic: ElasticEntry | None = None
-    stiffness: Positive = 10000.0  # K_stiff of muscle stiffness control [N/m]
+    actuation: Literal['stiffness', 'position'] = 'stiffness'
+    stiffness: Positive | UnsetType = UNSET  # K_stiff of muscle stiffness control [N/m]
+    speed: Positive | UnsetType = UNSET  # of a module that follows positions [m/s]
+    release: Positive | UnsetType = UNSET  # that it pays out if no tension is known [m]
     tension: TensionEntry = TensionEntry()
     end_effector: Name | None = None
     end_effectors: Names | None = None
@@ -166,6 +171,23 @@ class MuscleFile(Strict, frozen=True):
         _check_unique('joint_elasticity', (entry.joint for entry in self.joint_elasticity))
         if self.end_effector is not None and self.end_effectors is not None:
             raise ValueError('expected end_effector or end_effectors, got both')
+        self._check_actuation()
+
+    def _check_actuation(self) -> None:
+        """Check that no key belongs to the other kind of actuation."""
+        is_position = self.actuation == 'position'
+        foreign = ('stiffness',) if is_position else ('speed', 'release')
+        needed = 'actuation: stiffness' if is_position else 'actuation: position'
+        for key in foreign:
+            owners = [f'muscle {each.name!r}' for each in self.muscles
+                      if getattr(each, key) is not UNSET]  # fmt: skip
+            if getattr(self, key) is not UNSET:
+                owners.insert(0, 'the robot')
+            if owners:
+                raise ValueError(
+                    f'{key} of {owners[0]} needs {needed}, and actuation is {self.actuation!r}; '
+                    f'remove {key}, or set {needed}'
+                )
 
 
 def _check_unique(key: str, names: Iterable[str]) -> None:

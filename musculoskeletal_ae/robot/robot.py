@@ -33,6 +33,7 @@ class Robot:
         self.isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
         self.stiffness = description.stiffness
+        self.follows_position, self.speed = description.follows_position, description.speed
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
@@ -67,6 +68,8 @@ class Robot:
             routes=tuple(whole.routes[m] for m in muscles),
             series_elastic=SeriesElastic(*elastic),
             stiffness=whole.stiffness[muscles],
+            speed=whole.speed[muscles],
+            release=whole.release[muscles],
             tension=TensionRange(*tension),
             joint_elasticity=whole.joint_elasticity.of_joints(joints),
         )
@@ -75,12 +78,61 @@ class Robot:
     def demanded(self, length: Array, command: Array) -> Array:
         """Return the tensions [N] (M,) that MSC demands, not limited to T_max.
 
+        NaN for modules that follow positions, which demand no tension.
+
         Args:
             length: l [m], (M,).
             command: l_target [m], (M,).
         """
+        if self.follows_position:
+            return np.full(np.shape(length), np.nan)
         demand: Array = self.tension.bias + np.maximum(0.0, self.stiffness * (length - command))
         return demand
+
+    def elongation(self, tension: Array) -> Array:
+        """Return L_e [m] (M,) at the tendon lengths of θ = 0 and T [N] (M,)."""
+        return self.series_elastic.elongation(self.routes.length_at_zero, tension)
+
+    def tension_per_length(self, tension: Array) -> Array:
+        """Return the change of tension per change of a length command [N/m], (M,).
+
+        It is K_stiff of MSC. Modules that follow positions stretch the series elastic elements; it
+        is then their stiffness at T [N] (M,).
+        """
+        if not self.follows_position:
+            return self.stiffness
+        stiffness: Array = 1.0 / self.series_elastic.compliance(self.routes.length_at_zero, tension)
+        return stiffness
+
+    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
+        """Return the length command [m] (M,) that gives other tensions in the same posture.
+
+            l_target = l − (T_wanted − T_bias)/K_stiff        MSC
+            l_target = l + L_e(T) − L_e(T_wanted)             modules that follow positions
+
+        Args:
+            length: l [m], (M,).
+            tension: T at that length [N], (M,).
+            wanted: T_wanted [N], (M,).
+        """
+        if self.follows_position:
+            return length + self.elongation(tension) - self.elongation(wanted)
+        return length - (wanted - self.tension.bias) / self.stiffness
+
+    def fastest(self, rate_limit: float) -> Array:
+        """Return the largest rate of each length command [m/s] (M,), with a given limit."""
+        return np.minimum(rate_limit, self.speed)
+
+    @property
+    def release(self) -> Array:
+        """Length that a stop pays out where no tension is known [m], (M,).
+
+        By default it is what takes a tension from T_limit to T_bias in the same posture.
+        """
+        whole = self.description.tension
+        usual = self.elongation(whole.limit) - self.elongation(whole.bias)
+        stated = self.description.release
+        return np.where(np.isnan(stated), usual, stated)
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
         """Return the indices of the named muscles in T and l.

@@ -8,6 +8,8 @@ T = force · (exp(rate · Δ) − 1). The tendon is Dyneema, whose stretch is pr
 The default constants are plausible values for Musashi, whose own constants are not public.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +27,11 @@ class SeriesElastic:
     rate: Array  # stiffening rate of the elastic element [1/m]
     wire_stretch: Array  # stretch of the tendon per metre and newton [1/N]
 
-    def elongation(self, absolute_length: Array, tension: Array) -> Array:
+    def of(self, muscle: int) -> SeriesElastic:
+        """Return the constants of one muscle, of shape ()."""
+        return SeriesElastic(*(values[muscle] for values in vars(self).values()))
+
+    def elongation(self, absolute_length: Array, tension: Array | float) -> Array:
         """Return L_e(l_abs, T) [m]; l_abs [m] and T [N] of shape (..., M)."""
         tension = np.maximum(tension, 0.0)
         stretch = self.wire_stretch * absolute_length * tension

@@ -14,10 +14,15 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
+LEAST_COMPLIANCE = 1e-7  # [m/N]; no element and tendon are stiffer
+
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:
-    """Return k [N/m] of MSC (K_stiff [N/m]) and elastic element (∂L_e/∂T [m/N]) in series."""
-    return 1.0 / (1.0 / module + compliance)
+    """Return k [N/m] of MSC (K_stiff [N/m]) and elastic element (∂L_e/∂T [m/N]) in series.
+
+    K_stiff of a module that follows positions is infinite.
+    """
+    return 1.0 / (1.0 / module + np.maximum(compliance, LEAST_COMPLIANCE))
 
 
 def muscle_hessian(

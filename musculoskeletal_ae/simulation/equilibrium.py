@@ -36,8 +36,11 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, Tree, hold
 
-#: l_target of muscles without a command; MSC then holds T_bias
+#: l_target of muscles without a command; MSC then holds T_bias, and modules that follow positions
+#: hold their length
 PAID_OUT = np.inf  # [m]
+#: K of modules that follow positions [N/m]; 400 N move such a module by a millimetre
+RIGID = 4e5
 #: B divided by Σ_i |∂l_i/∂θ| [N·s/rad]. Motions then take as long as those of the emulated arm;
 #: values from 8 to 20 do equally well.
 VISCOSITY = 12.0
@@ -46,6 +49,7 @@ LEAST_VISCOSITY = 0.1  # [N·m·s/rad] of a joint that no muscle crosses
 JOINT_SPEED = 5.0  # [rad/s] or [m/s]; limits each step, and so the effect of network errors
 MODULE_SPEED = 0.25  # [m/s] winding speed of muscle modules, the same as in the emulator
 ROUNDS = 3  # at most, to find the tendons whose friction reverses in a step
+FARTHEST = 0.05  # how far a position command may run ahead of the module [m]
 POSTURES_PER_COEFFICIENT = 10  # of a cubic
 
 
@@ -64,9 +68,13 @@ class Body(NamedTuple):
     """Constants of muscles (M,) and joints (D,) for the compiled code."""
 
     stiffness: Array  # K_stiff [N/m]
-    bias: Array
+    bias: Array  # T at l = l_target [N]: T_bias, or 0 for modules that follow positions
     most: Array  # T_max [N]
+    #: how far l_target can lie below and beyond l before T no longer changes [m]
+    span: Array
+    loose: Array
     friction: Array  # μ
+    speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
     force: Array  # of the series elastic elements, as in `SeriesElastic`
     rate: Array
     wire_stretch: Array
@@ -105,7 +113,9 @@ def clip(value: float, low: float, high: float) -> float:
 
 
 @njit(cache=True)
-def follow(command: float, followed: float, length: float, span: float, most: float) -> float:
+def follow(
+    command: float, followed: float, length: float, span: float, loose: float, most: float
+) -> float:
     """Return the length [m] that a muscle module has reached on the way to a command.
 
     Args:
@@ -113,11 +123,12 @@ def follow(command: float, followed: float, length: float, span: float, most: fl
         followed: The length it had reached a step before [m].
         length: Muscle length [m].
         span: How far the command can lie below `length` until the tension is T_max [m].
+        loose: How far it can lie beyond `length`, as of a slack tendon [m].
         most: Farthest that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
     # Beyond these limits the tension no longer changes, but the way back would take time.
-    return clip(reached, length - span, length + most)
+    return clip(reached, length - span, length + max(loose, most))
 
 
 @njit(cache=True)
@@ -278,10 +289,15 @@ def advance(
     add_slopes(limbs, theta, end, jacobian, slope)
     for m in range(muscles):
         stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
-        span = (most - bias) / stiffness
+        speed = min(MODULE_SPEED, body.speed[m])
         for n in range(arms):
             after.followed[m, n] = follow(
-                command[m, n], state.followed[m, n], length[m, n], span, MODULE_SPEED * h
+                command[m, n],
+                state.followed[m, n],
+                length[m, n],
+                body.span[m],
+                body.loose[m],
+                speed * h,
             )
             stretch = body.wire_stretch[m] * (body.length_at_zero[m] + length[m, n])
             unit = body.rate[m] * (body.force[m] + max(end[m, n], 0.0))
@@ -383,7 +399,12 @@ class QuasiStatics:
         self.tree = Load(robot.kinematics).tree
         # A noisy fit may return a slightly negative friction, which would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
-        muscles = robot.stiffness, robot.tension.bias, robot.tension.max, friction
+        bias, most = robot.tension.bias, robot.tension.max
+        stiffness, span, loose = robot.stiffness, (most - bias) / robot.stiffness, 0.0 * most
+        if robot.follows_position:
+            stiffness, bias = np.full_like(most, RIGID), 0.0 * bias
+            span = loose = np.full_like(most, FARTHEST)
+        muscles = stiffness, bias, most, span, loose, friction, robot.speed
         units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
         joints = robot.lower, robot.upper, self._viscosity
         self.body = Body(*map(np.array, (*muscles, *units, *joints)))
@@ -393,6 +414,8 @@ class QuasiStatics:
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
         """Return the arms h [s] later; `SimulatedBody.step` describes the arguments."""
+        if self._robot.follows_position:
+            command = np.where(np.isfinite(command), command, state.followed)
         passed = np.exp(-self.body.friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)

@@ -171,7 +171,8 @@ class Simulation:
         if limits := self.limits():
             return Report('warn', f'at the limit: {", ".join(limits)}', values)
         commanded = np.isfinite(command).all()
-        return Report('ok', 'following commands' if commanded else 'resting at T_bias', values)
+        waiting = 'holding its lengths' if self.robot.follows_position else 'resting at T_bias'
+        return Report('ok', 'following commands' if commanded else waiting, values)
 
     def _advance(self, h: float) -> None:
         # Callers may assign any array, but the compiled code requires this type and order.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.driver.listening import Listening
+from musculoskeletal_ae.driver.positioning import Positioning
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -81,7 +82,8 @@ class Driver:
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
     ) -> Verdict:
         """Return what `Winding` says, besides what was heard before."""
-        winding = Winding(heard or Verdict(self.robot), muscles, highest)
+        kind = Positioning if self.robot.follows_position else Winding
+        winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
             for _, rows in self.step():
                 if (target := winding.step(rows, self.now)) is not None:

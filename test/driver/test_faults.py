@@ -18,7 +18,7 @@ from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.description import TensionRange
+from musculoskeletal_ae.robot.description import TensionRange, with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals import motor_interface
@@ -551,3 +551,42 @@ def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
     verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)
     assert reported in str(verdict)
+
+
+POSITION = Robot(with_modules(ROBOT.description, actuation='position'))
+
+
+def test_a_sound_driver_that_follows_positions_is_found_sound():
+    driver = Driver(POSITION, 0)
+    verdict = driver.listen(2.0)
+    assert not verdict.faults, str(verdict)
+    verdict = driver.wind()
+    assert not verdict.faults, str(verdict)
+    assert all(line.count('ok') == 4 for line in str(verdict).splitlines()[1 : M + 1])
+
+
+POSITION_FAULTS = {
+    'deaf': ('take', lambda _: np.zeros(M), 'position hold'),
+    'sign of the command': ('take', lambda target: -target - 0.04, 'position ran away'),
+    'exchanged commands': ('take', exchanged, 'position hold'),
+    'half of the way': ('take', 'half', 'position gain'),
+    'sign of T': ('publish', 'fall', 'position sign'),
+    'late': ('late', 0.3, 'late'),
+}
+
+
+@pytest.mark.parametrize('fault', POSITION_FAULTS)
+def test_what_a_driver_that_follows_positions_gets_wrong_is_found(fault):
+    driver = Driver(POSITION, 0)
+    driver.listen(1.0)
+    home = np.stack(driver.arm.sense()[1:])
+    where, value, what = POSITION_FAULTS[fault]
+    if value == 'half':
+        value = lambda target: home[0] + 0.4 * (target - home[0])  # noqa: E731
+    elif value == 'fall':
+        value = lambda rows: np.stack([rows[0], 2.0 * home[1] - rows[1], rows[2]])  # noqa: E731
+    setattr(driver, where, value)
+    verdict = driver.wind((BICEPS,))
+    texts = FAULTS[what]
+    assert verdict.faults
+    assert any(found.check == texts.check for found in verdict.faults), str(verdict)

@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.estimation.verification import PATIENCE, Outcome, Verification
+from musculoskeletal_ae.estimation.verification import PATIENCE, ModuleLaw, Outcome, Verification
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
@@ -18,7 +18,7 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
 
 def verdict(tension, length, likely=0.0):
     """Wind in by 3 mm after a while; T and l are functions of T_ref and of the row's number."""
-    watched = Verification(0, BIAS, STIFFNESS)
+    watched = Verification(0, ModuleLaw(BIAS, STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.003)
         demand = BIAS + max(0.0, -STIFFNESS * command)
@@ -59,7 +59,7 @@ def test_verification_recognises_the_fault_by_the_response_to_winding_in(
 
 
 def test_a_suspect_that_is_not_wound_in_stays_isolated():
-    watched = Verification(0, BIAS, STIFFNESS)
+    watched = Verification(0, ModuleLaw(BIAS, STIFFNESS))
     answers = [watched.step(0.0, 0.0, None, 0.0, DT) for _ in range(round(PATIENCE / DT) + 5)]
     assert answers[-1].outcome is Outcome.NOT_WOUND_IN
     assert not any(answers[: round(PATIENCE / DT) - 5])
@@ -234,7 +234,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
 @pytest.mark.parametrize('scale', [1.0, 0.1])
 def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
     # It stays at T_bias, demanded three times that.
-    watched = Verification(0, scale * BIAS, scale * STIFFNESS)
+    watched = Verification(0, ModuleLaw(scale * BIAS, scale * STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0004), 0.006)
         result = watched.step(scale * (BIAS + shake), stir, command, 0.0, DT)

@@ -49,7 +49,7 @@ AT_POINT = '$.muscles[0].route[1]'
 
 #: an edit of muscles.yaml, and what the error names: the place, the value, what is legal
 BAD = {
-    'unknown key': (put(['speed'], 1.0), ["$: unknown key 'speed'", 'joints, muscles']),
+    'unknown key': (put(['sped'], 1.0), ["$: unknown key 'sped'", 'joints, muscles']),
     'unknown key within': (put([*POINT, 'frame'], 1), [AT_POINT, "'frame'", 'link, xyz']),
     'key missing': (drop(['muscles', 0, 'name']), ['$.muscles[0]', "'name' is missing"]),
     'wrong type': (put(['muscles', 0, 'name'], 7), ['$.muscles[0].name', 'got int: 7']),

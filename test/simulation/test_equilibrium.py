@@ -64,8 +64,8 @@ def test_each_limb_of_a_body_has_slopes_of_its_own():
 
 def test_modules_wind_at_a_limited_speed_and_by_a_bounded_length():
     for command, once, at_last in ((0.5, 0.01, 0.01), (-0.5, -0.01, -0.05), (1e-4, 1e-4, 1e-4)):
-        followed = follow(command, 0.0, 0.0, 0.05, 0.01)
+        followed = follow(command, 0.0, 0.0, 0.05, 0.0, 0.01)
         assert followed == once
         for _ in range(100):
-            followed = follow(command, followed, 0.0, 0.05, 0.01)
+            followed = follow(command, followed, 0.0, 0.05, 0.0, 0.01)
         assert followed == at_last

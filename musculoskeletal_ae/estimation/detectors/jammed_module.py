@@ -8,7 +8,7 @@ The readings of a jammed module may be consistent with a posture, so residuals m
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -36,12 +36,10 @@ class JammedModule(Detector):
 
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
-        if observation.demand is None:
+        is_far, length = self._is_far(observation), observation.sample.length
+        if is_far is None:
             self._time[:] = 0.0
             return None
-        tension, length = observation.sample.motor_tension, observation.sample.length
-        demand = np.minimum(observation.demand, self._robot.tension.max)
-        is_far = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
         has_to_move = is_far & self._robot.used
         if not np.count_nonzero(has_to_move):
             self._length = length

@@ -16,6 +16,7 @@ from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 DEAD_TIME = 0.5  # [s] without tension after which a muscle is reported
 
@@ -51,6 +52,8 @@ class SlackTendon(Detector):
 
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
+        if self._robot.follows_position:
+            return self._step_by_stretch(observation)
         sample, theta, dt = observation.sample, observation.estimate.state.theta, observation.dt
         tension, length = sample.motor_tension, sample.length
         demand = self._demand(observation)
@@ -83,6 +86,36 @@ class SlackTendon(Detector):
         return Finding(
             muscle, Kind.SLACK_TENDON, 'it has no tension although the command demands it'
         )
+
+    def _step_by_stretch(self, observation: Observation) -> Finding | None:
+        """Take a message of modules that follow positions."""
+        sample, bias = observation.sample, self._robot.tension.bias
+        is_slack = (sample.motor_tension < LIMITS.slack_share * bias) & self._robot.used
+        is_dead = is_slack & observation.lengths_known
+        if np.count_nonzero(is_dead):
+            is_dead &= self._is_stretched(sample, tuple(np.flatnonzero(is_slack).tolist()))
+        self._slack_time = np.where(is_dead, self._slack_time + observation.dt, 0.0)
+        if self._slack_time.max() < DEAD_TIME - 1e-9:
+            return None
+        muscle = int(self._slack_time.argmax())
+        return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched and does not pull')
+
+    def _is_stretched(self, sample: MuscleSample, slack: tuple[int, ...]) -> Bools:
+        """Return which slack muscles are so short that they had to pull, (M,)."""
+        robot, mae = self._robot, self._mae
+        isolated = tuple(sorted({*robot.isolated, *slack}))
+        if robot.muscle_count - len(isolated) <= robot.joint_count:
+            return np.zeros(robot.muscle_count, dtype=bool)  # the others do not determine θ
+        if isolated not in self._reduced:
+            self._reduced[isolated] = mae.without(isolated)
+        theta = self._reduced[isolated].estimate(sample.bone_tension, sample.length).theta
+        tension = sample.bone_tension.copy()
+        tension[list(isolated)] = 0.0
+        is_calibrated = mae.anomaly is not None and mae.anomaly.calibrated
+        share = STRETCH if is_calibrated else UNCALIBRATED
+        stretch = mae.lengths(theta, tension) - sample.length
+        is_stretched: Bools = stretch > share * robot.elongation(robot.description.tension.bias)
+        return is_stretched
 
     def _demand(self, observation: Observation) -> Array | None:
         """Return the demanded tension [N], (M,), or None if it is unknown.

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compares kinds of muscle modules: stiffness control or positions, and what is known of tension.
+
+    python -m bench actuation [--robot musashi_left_arm] [--seeds 0,1,2,3,4] [--quick]
+
+Each emulated individual explores and learns with every kind of module, from the same initial
+network. Then, with what it has learned:
+
+- estimate: mean ‖θ_est − θ‖ while it explores for another while, before and after learning,
+- control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random postures that the model can hold,
+- rupture: each of some muscles ruptures while the arm explores. The share that is isolated as
+  broken within 10 s, the share where that muscle is the one, and the mean time to the finding,
+- max/limit: the highest true tension as a multiple of `tension.limit`, except after a rupture,
+- wrong: isolated muscles and stops of the healthy arm.
+
+Tensions are the true ones of the emulated arm, whatever its sensors measure.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, ClosedLoop
+from musculoskeletal_ae.experiments.resilience import IsolatingLoop
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.options import Parser, names, positive
+from musculoskeletal_ae.robot.description import with_modules
+from musculoskeletal_ae.robot.robot import Robot
+
+EXPLORED, HELD_OUT = 300.0, 60.0  # [s]
+TARGETS, HELD = 5, 4.0  # [s] for each
+RUPTURES = 3
+MOVING, LATEST = 4.0, 10.0  # [s] before a rupture, and until its isolation
+#: kinds of modules: actuation and tension_source of muscles.yaml
+KINDS = {
+    'stiffness': {'actuation': 'stiffness'},
+    'position': {'actuation': 'position'},
+}
+HEAD = (
+    f'{"reality":<8} {"seed":>4} {"modules":<18} {"before":>7} {"after":>7} {"control":>8} '
+    f'{"ruptures":>9} {"named":>6} {"found":>6} {"max/limit":>9} {"wrong":>6} {"samples":>8}\n'
+    f'{"":<8} {"":>4} {"":<18} {"[rad]":>7} {"[rad]":>7} {"[rad]":>8} {"isolated":>9} {"":>6} '
+    f'{"[s]":>6}'
+)
+
+
+class Result(NamedTuple):
+    """What one individual showed with one kind of module."""
+
+    before: float
+    after: float
+    control: float
+    isolated: float  # share of the ruptures
+    named: float
+    found: float  # [s]
+    highest: float  # as a multiple of the limit
+    wrong: float
+    samples: float
+
+
+def with_kind(robot: Robot, kind: str) -> Robot:
+    """Return the robot with another kind of modules."""
+    return Robot(with_modules(robot.description, **KINDS[kind]))
+
+
+class Watched:
+    """Records the highest true tension of an arm, as a multiple of its limit."""
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm, self.highest = arm, 0.0
+
+    def note(self) -> None:
+        """Take the present tensions."""
+        share = self._arm.tension / self._arm.robot.tension.limit
+        self.highest = max(self.highest, float(share.max()))
+
+
+def learn(
+    arm: Arm, initial: Mae, seed: int, seconds: float, watched: Watched
+) -> tuple[Learner, int]:
+    """Explore and learn for a time [s]; return the learner and the number of stops."""
+    loop = ClosedLoop(arm, initial, None, EXPLORATION_STREAM + seed)
+    learner = Learner(arm.robot, initial, 'default', seed)
+    for count in range(round(seconds / SAMPLE_TIME)):
+        if learner.mae is not None and learner.mae is not loop.mae:
+            loop.use(learner.mae)
+        row = loop.explore()
+        learner.step(count * SAMPLE_TIME, row[1], row[3], row[2])
+        watched.note()
+    return learner, loop.stops
+
+
+def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
+    """Return the mean error of the estimate while exploring [rad], and wrong isolations."""
+    loop = IsolatingLoop(arm, mae, EXPLORATION_STREAM + 50 + seed)
+    loop.run(1.0)
+    loop.core.explore(True)
+    errors = []
+    for _ in range(round(seconds / SAMPLE_TIME)):
+        loop.step()
+        errors.append(loop.error)
+        watched.note()
+    wrong = sum(bool(isolated) for isolated, _ in loop.verdicts)
+    return float(np.mean(errors)), wrong + (not loop.core.supervisor.is_running)
+
+
+def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tuple[float, int]:
+    """Return the mean distance from targets after HELD [s], and the number of stops."""
+    robot, rng = arm.robot, np.random.default_rng([seed, 0xAC])
+    postures = (robot.random_postures(1, rng)[0] for _ in range(TRIES))
+    errors, stops, loop = [], 0, ClosedLoop(arm, mae)
+    loop.wait(0.1)
+    for theta, _ in holdable_postures(robot, postures, targets, arm.individual.muscle_jacobian):
+        if not loop.core.supervisor.is_running:
+            stops += 1
+            loop = ClosedLoop(arm, mae)
+            loop.wait(0.1)
+        loop.target(theta)
+        for _ in range(round(HELD / SAMPLE_TIME)):
+            loop.step()
+            watched.note()
+        errors.append(float(np.linalg.norm(arm.theta - theta)))
+    return float(np.mean(errors)), stops
+
+
+def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, float]:
+    """Rupture muscles in turn; return the shares isolated and named, and the time found [s]."""
+    isolated, named, times = 0, 0, []
+    for m in np.random.default_rng([seed, 0x2B]).permutation(arm.robot.muscle_count)[:count]:
+        arm.reset()
+        loop = IsolatingLoop(arm, mae, EXPLORATION_STREAM + seed + int(m))
+        loop.run(1.0)
+        loop.core.explore(True)
+        loop.run(MOVING)
+        arm.set_ruptured([arm.robot.muscles[m]])
+        found = LATEST
+        for step in range(round(LATEST / SAMPLE_TIME)):
+            loop.step()
+            if found == LATEST and loop.isolated:
+                found = step * SAMPLE_TIME
+            if loop.verdicts:
+                break
+        times.append(found)
+        last = loop.verdicts[-1][0] if loop.verdicts else ()
+        isolated += bool(last)
+        named += last == (m,)
+        arm.set_ruptured([])
+    return isolated / count, named / count, float(np.mean(times))
+
+
+def measure(robot: Robot, kind: str, initial: Mae, reality: str, seed: int, share: float) -> Result:
+    """Measure one individual with one kind of module."""
+    own = with_kind(robot, kind)
+    arm = make_arm(own, seed, reality)
+    watched = Watched(arm)
+    before, wrong_before = estimate(arm, initial, seed, share * HELD_OUT, watched)
+    arm.reset()
+    learner, stops = learn(arm, initial, seed, share * EXPLORED, watched)
+    mae = learner.mae or initial
+    arm.reset()
+    after, wrong = estimate(arm, mae, seed, share * HELD_OUT, watched)
+    arm.reset()
+    distance, stopped = control(arm, mae, seed, max(2, round(share * TARGETS)), watched)
+    found = ruptures(arm, mae, seed, max(2, round(share * RUPTURES)))
+    wrong += wrong_before + stops + stopped
+    return Result(before, after, distance, *found, watched.highest, wrong, len(learner.samples))
+
+
+def line(reality: str, seed: str, kind: str, result: Result) -> str:
+    """Return a line of the table."""
+    return (
+        f'{reality:<8} {seed:>4} {kind:<18} {result.before:>7.3f} {result.after:>7.3f} '
+        f'{result.control:>8.3f} {result.isolated:>9.2f} {result.named:>6.2f} '
+        f'{result.found:>6.2f} {result.highest:>9.2f} {result.wrong:>6.1f} {result.samples:>8.0f}'
+    )
+
+
+def main(argv: list[str]) -> int:
+    """Measure every individual with every kind of module, and print the table."""
+    parser = Parser('actuation', (__doc__ or '').partition('\n')[0])
+    parser.add_robot()
+    parser.add_seeds(tuple(range(5)))
+    parser.add_quick('a quarter of the time')
+    add = parser.add_argument
+    add('--realities', type=names, default=(KIN, FOREIGN), help='emulator models')
+    add('--modules', type=names, default=tuple(KINDS), help=f'kinds: {", ".join(KINDS)}')
+    add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
+    add('--initial', type=Path, help='initial checkpoint (default: train one)')
+    options = parser.parse_args(argv)
+    if wrong := set(options.modules) - set(KINDS):
+        raise MusculoskeletalError(f'--modules {sorted(wrong)}; legal: {", ".join(KINDS)}')
+    share = (0.25 if options.quick else 1.0) * options.seconds / EXPLORED
+    robot = Robot.load(options.robot)
+    if options.initial is None:
+        initial = initial_mae(robot).mae
+    else:
+        initial = checkpoint.load(options.initial, robot)
+    print(HEAD)
+    for reality in options.realities:
+        rows: dict[str, list[Result]] = {kind: [] for kind in options.modules}
+        for seed in options.seeds:
+            for kind, results in rows.items():
+                results.append(measure(robot, kind, initial, reality, seed, share))
+                print(line(reality, str(seed), kind, results[-1]), flush=True)
+        for kind, results in rows.items():
+            mean = Result(*np.nanmean(results, axis=0))
+            highest = max(result.highest for result in results)
+            print(line(reality, 'mean', kind, mean._replace(highest=highest)), flush=True)
+    return 0

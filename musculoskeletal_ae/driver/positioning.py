@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check the response of a driver whose modules follow positions, one muscle at a time.
+
+At first every l_target is the current l, where every l must stay. Then, for each muscle, the target
+moves inwards slowly, until the tension has risen or the target has moved by FURTHEST. l must follow
+
+    l → l_target
+
+and T must not fall meanwhile. The target then returns and moves outwards, where l must follow, too.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.driver.motion import RELEASE, MotionTest, RunAwayError, Wait
+from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.winding import ABOVE_BIAS, HOLD, LATEST, MOMENT, RESPONSE, SETTLE
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.report import distinct
+
+STEP = 0.003  # first step inwards, by which latency is measured [m]
+SPEED = 0.01  # [m/s] at which the target goes on inwards
+FURTHEST = 0.015  # farthest that the target moves inwards [m]
+OUTWARDS = 0.005  # [m]
+FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
+SHARES = 0.7, 1.4  # range of the motion of l divided by that of l_target
+RUN_AWAY_TENSION, RUN_AWAY = 60.0, 0.03  # [N] above the highest tension, [m] away from l_target
+
+
+class Positioning(MotionTest):
+    """Moves muscles by position commands, and checks their responses."""
+
+    def __init__(
+        self, verdict: Verdict, muscles: Sequence[int] = (), highest: float | None = None
+    ) -> None:
+        """Prepare to test muscles.
+
+        Args:
+            verdict: Receives the results.
+            muscles: Indices of the muscles; empty: all.
+            highest: Tension at which a muscle is wound in no further [N]; None: ABOVE_BIAS above
+                T_bias, but at most tension.limit.
+
+        Raises:
+            MusculoskeletalError: If `highest` is above a muscle's tension.limit.
+        """
+        super().__init__(verdict, muscles)
+        tension = self._robot.tension
+        self._highest: Array = np.minimum(tension.bias + ABOVE_BIAS, tension.limit)
+        if highest is not None:
+            m = int(tension.limit.argmin())
+            if highest > tension.limit[m]:
+                wanted, limit = distinct(highest, tension.limit[m])
+                raise MusculoskeletalError(
+                    f'--tension {wanted} N is above tension.limit of {self._robot.muscles[m]!r}, '
+                    f'{limit} N; choose a lower one'
+                )
+            self._highest = np.full(self._robot.muscle_count, highest)
+        #: last time at which each muscle neither pulled too hard nor was far from its target [s]
+        self._tame_at: Array = np.zeros(self._robot.muscle_count)
+
+    # -- what is commanded ----------------------------------------------------------------------
+
+    def _sequence(self) -> Wait:
+        try:
+            self.trying = 'hold'
+            yield from self._wait(RELEASE)
+            self._target[:] = self._mean()[0]
+            yield from self._wait(SETTLE)
+            held = self._mean()
+            for m in np.flatnonzero(np.abs(held[0] - self._target) > FOLLOWS).tolist():
+                off = 1e3 * (held[0] - self._target)[m]
+                self.verdict.failed('position hold', m, off=off)
+            for m in self._muscles:
+                self.trying = self._robot.muscles[m]
+                yield from self._try(m)
+        except RunAwayError as error:
+            muscle, detail = error.args
+            self.verdict.failed('position ran away', muscle, detail=detail)
+            self._target[muscle] += self._robot.release[muscle]
+            end = self._now + RELEASE
+            while self._now < end:
+                yield
+
+    def _wait(self, duration: float) -> Wait:
+        end = self._now + duration
+        while self._now < end:
+            yield
+            length, tension, _ = self._recent[-1][1]
+            most = self._highest + RUN_AWAY_TENSION
+            far = np.abs(length - self._target) > RUN_AWAY
+            self._tame_at[~((tension > most) | far)] = self._now
+            wild = self._now - self._tame_at > MOMENT
+            if wild.any():
+                m = int(wild.argmax())
+                text = f'T rose to {tension[m]:.0f} N'
+                if far[m]:
+                    text = f'l is {1e3 * (length - self._target)[m]:+.0f} mm off l_target'
+                raise RunAwayError(m, text)
+
+    def _mean(self) -> Array:
+        """Return mean l [m], T [N] and temperature [°C], (3, M)."""
+        mean: Array = np.mean([states for _, states in self._recent], axis=0)
+        return mean
+
+    # -- what is judged -------------------------------------------------------------------------
+
+    def _try(self, m: int) -> Wait:
+        verdict, home, start = self.verdict, self._mean(), float(self._target[m])
+        begun, latency = self._now, 0.0
+        answer = max(2.0 * RESPONSE[1], 0.3 * STEP)
+        self._target[m] = start - STEP
+        while self._now - begun < HOLD:
+            yield from self._wait(1e-9)
+            if not latency and abs(self._recent[-1][1][0, m] - home[0, m]) > answer:
+                latency = self._now - begun
+        last = self._now
+        while self._target[m] > start - FURTHEST and self._may_go_on(m):
+            self._target[m] -= SPEED * (self._now - last)
+            last = self._now
+            yield from self._wait(1e-9)
+        yield from self._wait(HOLD)
+        wound, asked = self._mean(), start - self._target[m]
+        moved = (home - wound)[0]
+        others = np.abs(moved) * (np.arange(len(moved)) != m)
+        if abs(moved[m]) < SHARES[0] * STEP * 0.5:
+            other = int(others.argmax())
+            if others[other] > 0.5 * asked:
+                verdict.failed('other one', m, other=self._robot.muscles[other])
+            else:
+                verdict.failed('no answer', m)
+            yield from self._go(m, start)
+            return
+        pulled = wound[1, m] - home[1, m]
+        if not SHARES[0] < moved[m] / asked < SHARES[1]:
+            detail = (
+                f'l fell by {1e3 * moved[m]:.1f} mm where l_target fell by {1e3 * asked:.1f} mm'
+            )
+            verdict.failed('position gain', m, detail=detail)
+        else:
+            verdict.passed('unit', m)
+        if np.isnan(pulled):
+            verdict.notes.append(f'{self.trying}: its tension is unknown, the sign is not judged')
+        elif pulled < -RESPONSE[0]:
+            detail = f'T fell by {-pulled:.0f} N as l fell by {1e3 * moved[m]:.1f} mm'
+            verdict.failed('position sign', m, detail=detail)
+        else:
+            verdict.passed('sign', m)
+        yield from self._go(m, start)
+        yield from self._go(m, start + OUTWARDS)
+        out = self._mean()[0, m] - home[0, m]
+        if out < SHARES[0] * OUTWARDS:
+            verdict.failed('position outwards', m, out=1e3 * out, asked=1e3 * OUTWARDS)
+        else:
+            verdict.passed('law', m)
+        yield from self._go(m, start)
+        if latency > LATEST:
+            verdict.failed('late', m, late=1e3 * latency, most=1e3 * LATEST)
+        verdict.passed('latency', m)
+
+    def _may_go_on(self, m: int) -> bool:
+        """Return whether muscle m may be wound in further; an unknown tension does not end it."""
+        tension = float(np.mean([states[1, m] for _, states in self._recent]))
+        return not tension > self._highest[m]

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Modules that follow positions: limits, stop and methods where no module holds a tension."""
+
+import numpy as np
+import pytest
+from control_bench import sample
+from exact_mae import ExactMae
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
+from musculoskeletal_ae.control.limiter import CommandLimiter
+from musculoskeletal_ae.control.methods import first_command, proposed
+from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.stopping import PAYING_OUT, SafeStop
+from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.experiments.recording import ClosedLoop
+from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot(with_modules(Robot.load('arm26').description, actuation='position'))
+COUNT, BIAS = ROBOT.muscle_count, ROBOT.tension.bias[0]
+LIMIT, MAX = ROBOT.tension.limit, ROBOT.tension.max
+DT, THETA = 0.01, np.array([-0.3, -1.0])
+
+
+def vectors(low, high):
+    return st.lists(st.floats(low, high), min_size=COUNT, max_size=COUNT).map(np.array)
+
+
+def pull_in_this_posture(length, tension, command):
+    """Return the tensions [N] after the modules have gone from l to l_target, joints held."""
+    stretch = ROBOT.elongation(tension) + length - command
+    grid = np.linspace(0.0, 2.0 * MAX[0], 4001)
+    table = ROBOT.elongation(grid[:, None] * np.ones(COUNT))
+    return np.array([np.interp(s, column, grid) for s, column in zip(stretch, table.T)])
+
+
+@given(st.lists(st.tuples(vectors(-1.0, 1.0), vectors(0.0, 260.0)), min_size=1, max_size=5),
+       vectors(60.0, 190.0))  # fmt: skip
+def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_way(messages, limit):
+    limiter, length = CommandLimiter(ROBOT, Settings(rate_limit=1.0)), np.zeros(COUNT)
+    for desired, tension in messages:
+        now = sample(length, tension, ROBOT)
+        before = limiter.last(LENGTH, now).value
+        sent = limiter.limit(Command(LENGTH, desired), now, limit, DT).value
+        # The speed of the module limits commands, too; only a muscle above T_limit is paid out
+        # faster.
+        is_tense = tension > LIMIT
+        assert (sent - before >= -SPEED_DEFAULT * DT - 1e-12).all()
+        assert ((sent - before)[~is_tense] <= SPEED_DEFAULT * DT + 1e-12).all()
+        result = pull_in_this_posture(length, tension, sent)
+        assert (result <= np.maximum(LIMIT, 0.0) + 1e-3)[is_tense].all()
+        wound_in = sent < before
+        assert (result <= limit + 1.0)[wound_in & (before >= length)].all()
+
+
+def test_a_desired_tension_becomes_a_length_command_towards_it():
+    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, 50.0, ROBOT)
+    sent = limiter.limit(Command(TENSION, np.full(COUNT, 80.0)), now, LIMIT, DT)
+    assert sent.kind == LENGTH
+    assert (sent.value < 0.0).all()
+    slack = limiter.limit(Command(TENSION, np.full(COUNT, BIAS)), sample(0.0, 120.0, ROBOT), LIMIT,
+                          DT)  # fmt: skip
+    assert (slack.value > sent.value).all()
+
+
+def stopped(now, steps, suspect=None, settings=None):
+    limiter = CommandLimiter(ROBOT, settings or Settings(hold_time=0.0))
+    limiter.limit(Command(LENGTH, np.zeros(COUNT)), sample(0.0, BIAS, ROBOT), LIMIT, DT)
+    stop, sent = SafeStop(ROBOT, settings or Settings(hold_time=0.0), limiter), []
+    stop.suspect = suspect
+    for step in range(steps):
+        message = now(step, limiter.command.value)
+        is_fresh = message is not None
+        message = message or sample(0.0, 150.0, ROBOT)
+        desired = stop.step(message, DT, is_fresh, may_wind=True)
+        sent.append(limiter.limit(desired, message, LIMIT, DT).value)
+    return np.array(sent)
+
+
+def test_a_stop_holds_and_then_pays_out_until_the_measured_tension_is_the_bias():
+    def now(_, command):
+        return sample(command, pull_in_this_posture(0.0, np.full(COUNT, 150.0), command), ROBOT)
+
+    sent = stopped(now, 200, settings=Settings(hold_time=0.2))
+    assert (sent[15] == 0.0).all()
+    assert np.diff(sent, axis=0).min() >= 0.0  # nothing is wound in
+    assert np.diff(sent, axis=0).max() <= SPEED_DEFAULT * DT + 1e-12
+    left = pull_in_this_posture(0.0, np.full(COUNT, 150.0), sent[-1])
+    np.testing.assert_allclose(left, BIAS, atol=3.0)
+    is_slack = stopped(lambda _, command: sample(command, 5.0, ROBOT), 50)
+    assert (is_slack == 0.0).all()  # a tendon without tension stays where it is
+
+
+def test_without_a_known_tension_a_stop_pays_out_the_stated_length():
+    for unknown in (lambda *_: None, lambda _, command: sample(command, np.nan, ROBOT)):
+        sent = stopped(unknown, 200)
+        longest = CommandLimiter(ROBOT, Settings()).longest
+        np.testing.assert_allclose(sent[-1], np.minimum(ROBOT.release, longest))
+
+
+def test_a_stopped_suspect_is_wound_in_slightly_and_no_other_muscle():
+    sent = stopped(lambda _, command: sample(command, 10.0, ROBOT), 350, suspect=2)
+    begun = round(PAYING_OUT / DT) - 1
+    assert (sent[:begun] == 0.0).all()
+    others = np.arange(COUNT) != 2
+    assert (sent[:, others] == 0.0).all()
+    assert -ROBOT.release[2] - 1e-9 <= sent[-1, 2] < -0.005
+
+
+def test_the_length_command_is_the_length_itself():
+    mae = ExactMae(ROBOT)
+    tension = np.linspace(40.0, 90.0, COUNT)
+    np.testing.assert_array_equal(
+        first_command(ROBOT, mae, THETA, tension), mae.lengths(THETA, tension)
+    )
+    torque = ROBOT.kinematics.holding_torque(THETA)
+    plan = proposed(ROBOT, mae, THETA, torque, ROBOT.tension.bias, LIMIT)
+    np.testing.assert_allclose(plan.length, mae.lengths(THETA, plan.tension))
+
+
+class WithJointSensors(ClosedLoop):
+    """A loop in which joint sensors replace the estimate."""
+
+    def estimate(self, read, now):  # noqa: ARG002
+        return read.theta
+
+
+@pytest.fixture(scope='module')
+def loops():
+    """Return the arm under every method: on the way to a target for 5 s, or let alone."""
+    result = {}
+    for method in METHODS:
+        arm = EmulatedArm(ROBOT, 0, Individual(ROBOT, 0, NOMINAL))
+        loop = WithJointSensors(arm, ExactMae(ROBOT), Settings(method=method, first_duration=2.0))
+        loop.wait(0.1)
+        if method != 'float':
+            loop.target(THETA)
+        loop.wait(5.0)
+        result[method] = loop
+    return result
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_every_method_moves_the_arm_and_keeps_it_within_its_tensions(loops, method):
+    loop = loops[method]
+    assert loop.core.supervisor.is_running
+    assert loop.core.limiter.command.kind == LENGTH
+    # Gravity compensation holds the arm where it was, away from the stop of the elbow.
+    goal, near = (THETA, 0.1) if method != 'float' else (np.zeros(2), 0.15)
+    assert np.abs(loop.arm.theta - goal).max() < near
+    assert loop.arm.tension.max() < LIMIT[0]
+    if method in ('proposed', 'stiffness'):
+        assert loop.arm.tension.min() > 0.5 * BIAS  # no tendon stays slack
+
+
+def test_gravity_compensation_follows_a_hand(loops):
+    loop = loops['float']
+    before = loop.arm.theta
+    loop.arm.set_wrench([15.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    loop.wait(3.0)
+    loop.arm.set_wrench(np.zeros(6))
+    loop.wait(1.0)
+    assert np.abs(loop.arm.theta - before).max() > 0.2

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of modules that follow positions: a slack tendon is none, a ruptured one is found."""
+
+import numpy as np
+import pytest
+from exact_mae import rest_readings
+
+from musculoskeletal_ae.estimation.detectors.jammed_module import JAM_TIME, JammedModule
+from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SlackTendon
+from musculoskeletal_ae.estimation.finding import Kind, observe
+from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.verification import Outcome, PositionLaw, Verification
+from musculoskeletal_ae.robot.description import with_modules
+from musculoskeletal_ae.robot.robot import Robot
+
+DT, THETA, MUSCLE = 0.01, np.array([0.2, -0.9]), 2
+ROBOT = Robot(with_modules(Robot.load('arm26').description, actuation='position'))
+BIAS = ROBOT.tension.bias
+NOISE = np.random.default_rng(0).normal(0.0, 1.0, (600, 2)) * [1.0, 1e-4]
+
+
+def readings(mae, shorter=0.0):
+    """Return l and T with one tendon without tension, which is so much shorter than slack."""
+    length, tension = rest_readings(ROBOT, THETA, np.full(ROBOT.muscle_count, 60.0))
+    tension = tension.copy()
+    tension[MUSCLE] = 0.0
+    length = mae.lengths(THETA, tension)
+    length[MUSCLE] -= shorter
+    return length, tension
+
+
+@pytest.mark.parametrize(('shorter', 'is_found'), [(0.06, True), (0.0, False), (-0.02, False)])
+def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, is_found):
+    detector = SlackTendon(ROBOT, Detection())
+    detector.use(mae)
+    length, tension = readings(mae, shorter)
+    message = observe(mae, length, tension, tension, DT)
+    found = [detector.step(message) for _ in range(round(1.5 * DEAD_TIME / DT))]
+    assert found[0] is None
+    assert (found[-1] is not None) == is_found
+    if is_found:
+        assert (found[-1].muscle, found[-1].kind) == (MUSCLE, Kind.SLACK_TENDON)
+
+
+@pytest.mark.parametrize(
+    ('behind', 'tension', 'is_found'), [(0.02, 60.0, True), (0.001, 60.0, False),
+                                        (0.02, 490.0, False)]
+)  # fmt: skip
+def test_a_module_that_does_not_go_where_it_is_commanded_is_jammed(mae, behind, tension, is_found):
+    detector = JammedModule(ROBOT)
+    detector.use(mae)
+    length, pull = mae.lengths(THETA, BIAS), BIAS.copy()
+    pull[MUSCLE] = tension
+    command = length - behind * (np.arange(ROBOT.muscle_count) == MUSCLE)
+    message = observe(mae, length, pull, pull, DT, command=command)
+    found = [detector.step(message) for _ in range(round(1.5 * JAM_TIME / DT))]
+    assert (found[-1] is not None) == is_found
+
+
+def elongation(tension):
+    return float(ROBOT.elongation(np.full(ROBOT.muscle_count, max(tension, 0.0)))[MUSCLE])
+
+
+def verdict(tension, length, slack):
+    """Wind in by 20 mm after a while; T and l are functions of the wound length and of noise.
+
+    At first the tendon is so much longer than a slack one [m].
+    """
+    watched = Verification(MUSCLE, PositionLaw(BIAS[MUSCLE], elongation))
+    for n, (shake, stir) in enumerate(NOISE):
+        command = -min(max(0.0, (n - 150) * 0.0002), 0.028)
+        pull, wound = tension(-command, shake), length(command, stir)
+        likely = -slack - elongation(pull)  # the joints stay where they are
+        if found := watched.step(pull, wound, command, likely, DT):
+            return found.outcome
+    raise AssertionError('no answer')
+
+
+def pull_of(stretch):
+    grid = np.linspace(0.0, 500.0, 2001)
+    return float(np.interp(stretch, [elongation(t) for t in grid], grid))
+
+
+def followed(command, stir):
+    return command + stir
+
+
+@pytest.mark.parametrize(
+    ('tension', 'length', 'slack', 'outcome'),
+    [
+        (lambda wound, shake: pull_of(0.008 + wound) + shake, followed, -0.008, Outcome.HEALTHY),
+        # Slack at first: it is wound in until it pulls.
+        (lambda wound, shake: max(pull_of(wound - 0.01) + shake, 0.0), followed, 0.01,
+         Outcome.HEALTHY),
+        (lambda _, shake: 0.1 * abs(shake), followed, -0.008, Outcome.RUPTURED),
+        (lambda _, __: 0.0, followed, 0.005, Outcome.RUPTURED),
+        (lambda _, __: 0.0, followed, 0.06, Outcome.TENSION_SENSOR_FROZEN),
+        (lambda _, shake: 0.1 * abs(shake), followed, 0.06, Outcome.NOT_WOUND_IN),
+        (lambda _, shake: 40.0 + shake, lambda _, stir: stir, -0.01, Outcome.JAMMED),
+        (lambda _, __: 71.0, followed, -0.01, Outcome.TENSION_SENSOR_FROZEN),
+        (lambda _, shake: 40.0 + shake, followed, -0.01, Outcome.TENSION_SENSOR_FROZEN),
+        (lambda wound, shake: pull_of(0.008 + wound) + shake, lambda *_: 0.0, -0.008,
+         Outcome.LENGTH_SENSOR_FROZEN),
+    ],
+)  # fmt: skip
+def test_verification_recognises_the_fault_by_the_response_to_winding_in(
+    tension, length, slack, outcome
+):
+    assert verdict(tension, length, slack) is outcome
