@@ -64,7 +64,8 @@ class HardwareEmulator(Arm):
                 raise MusculoskeletalError(f'parameter imu_link: {link!r}; legal: {legal}')
             self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_length_commands(self.arm.command_length)
-        self.follow_muscles('muscle_tension_command', self.arm.command_tension)
+        if not self.robot.follows_position:
+            self.follow_muscles('muscle_tension_command', self.arm.command_tension)
         self.follow_wrench('hardware_emulator', self.arm.set_wrench)
         serve(self, Trigger, 'hardware_emulator/reset', self._reset)
         self.ticked = time.monotonic()

@@ -3,6 +3,7 @@
 
     l = f_decode,l(①(θ, T_end)),  T_end = T e^{−μ s}            learned body and tendon friction
     T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     muscle stiffness control (MSC)
+    l = l_target,  0 ≤ T ≤ T_max                                modules that follow positions
     B θ̇ = −(g(θ) + K θ − b − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
 The paper descends on a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and

@@ -3,6 +3,11 @@
 
     |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
 
+A module that follows positions has no T_ref. It is jammed if it does not move although its length
+differs from l_target and it does not pull with its largest tension:
+
+    |l − l_target| > BEHIND, T < T_max and |Δl| < STANDS for JAM_TIME
+
 The readings of a jammed module may be consistent with a posture, so residuals may not reveal it.
 """
 
@@ -15,6 +20,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 STANDS = 0.001  # [m] motion below which the winch counts as stationary
 JAM_TIME = 1.0  # [s]
+BEHIND = 0.005  # [m]
+FULL = 0.9  # share of T_max from which on a module need not move, because it cannot pull harder
 JAM, JAM_SHARE = 50.0, 0.3  # [N], and as a share of T_ref because the gain of sensors varies
 
 
@@ -52,3 +59,18 @@ class JammedModule(Detector):
             return None
         muscle = int(self._time.argmax())
         return Finding(muscle, Kind.JAMMED_MODULE, 'its winch does not follow the commands')
+
+    def _is_far(self, observation: Observation) -> Bools | None:
+        """Return which modules have not reached their command, (M,); None without a command."""
+        tension, most = observation.sample.motor_tension, self._robot.tension.max
+        if self._robot.follows_position:
+            if observation.command is None:
+                return None
+            behind = np.abs(observation.sample.length - observation.command) > BEHIND
+            is_behind: Bools = behind & ~(tension > FULL * most)
+            return is_behind
+        if observation.demand is None:
+            return None
+        demand = np.minimum(observation.demand, most)
+        is_far: Bools = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
+        return is_far

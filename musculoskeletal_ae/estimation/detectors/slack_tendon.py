@@ -6,6 +6,14 @@
 The rule needs no statistics, because a healthy module maintains at least T_bias. A slow winch takes
 time to wind in slack. The detector waits while the winch moves at `slack_speed` or faster, until it
 has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count.
+
+A module that follows positions maintains no tension, and a tendon may be slack because its command
+is long. The rule then looks for a tendon that is stretched and does not pull:
+
+    T < slack_share · T_bias for DEAD_TIME, and l(θ, 0) − l > STRETCH · L_e(T_bias)
+
+θ is estimated from the tendons that are not slack. A tendon that ruptures while it carries nothing
+is found as soon as it should carry something.
 """
 
 import numpy as np
@@ -18,6 +26,10 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
+#: stretch of a tendon without tension that shows a rupture, as a multiple of that at T_bias: with
+#: healthy statistics of the real arm, and without. Healthy slack tendons of networks that have not
+#: learned the arm seem to be stretched by up to 1.5.
+STRETCH, UNCALIBRATED = 0.8, 3.0
 DEAD_TIME = 0.5  # [s] without tension after which a muscle is reported
 
 
@@ -40,6 +52,7 @@ class SlackTendon(Detector):
 
     def use(self, mae: Mae) -> None:
         """Monitor the muscles that are not isolated in this network."""
+        self._mae, self._reduced = mae, dict[tuple[int, ...], Mae]()
         self._robot = self._complete_robot.without(mae.isolated)
 
     def configure(self, settings: Detection) -> None:
