@@ -18,6 +18,7 @@ class GeometricBody:
     """Answers as a network without any error would."""
 
     friction = np.zeros(8)
+    elasticity = None
 
     def __init__(self, robot):
         self.robot, self.lengths = robot, robot.muscle_lengths
