@@ -118,6 +118,8 @@ def run(args: Namespace) -> int:
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.joint_notes:
         print(f'coupled: {note}')
+    for note in robot.description.spring_notes:
+        print(f'spring: {note}')
     for warning in robot.description.warnings:
         print(f'warning: {warning}')
     print(length_verdict(comparison))

@@ -149,6 +149,18 @@ class RobotDescription:
             lines.append(f'held fixed at 0: {held}')
         return lines
 
+    @property
+    def spring_notes(self) -> list[str]:
+        """Lines that state the spring of each joint that has one."""
+        springs, lines = self.joint_elasticity, list[str]()
+        for i, joint in enumerate(self.joints):
+            kind = self.model.joints[self.model.getJointId(joint)].shortname()
+            stiffness, angle = ('N/m', 'm') if kind in PRISMATIC else ('N·m/rad', 'rad')
+            if springs.is_sprung[i]:
+                own = f'{springs.stiffness[i, i]:.3g} {stiffness}'
+                lines.append(f'{joint}: spring of {own}, at rest at {springs.rest[i]:.3g} {angle}')
+        return lines
+
 
 def refusal(file: Path, problem: str) -> RobotDescriptionError:
     """Return the error for a file of a robot directory that cannot be read."""

@@ -10,7 +10,9 @@ from exact_mae import ExactMae
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.methods import StiffnessModel
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.effects import NONE
 from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -20,9 +22,12 @@ from musculoskeletal_ae.exceptions import CheckpointError, InfeasibleError, Robo
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.fit import fit_body
 from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.trainer import Job
+from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.checks import check_robot
@@ -31,6 +36,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.load import Load
 from musculoskeletal_ae.simulation.simulation import Simulation
+from musculoskeletal_ae.tools.robot_report import summary
 
 #: the bend springs out against its bender, and lift and swing share a soft link
 SPRINGS = [
@@ -142,6 +148,11 @@ def test_a_spring_takes_the_place_of_an_antagonist(tmp_path):
     assert 'not_held' in {fault.kind for fault in weak.faults}
 
 
+def test_the_report_names_the_springs(springy):
+    assert summary(springy, check_robot(springy, 20), 0).count('spring of') == 3
+    assert 'bend: spring of 9 N·m/rad, at rest at 0.3 rad' in springy.description.spring_notes
+
+
 def test_springs_stiffen_the_joints(springy):
     bare = springy.with_elasticity(JointElasticity.none(3))
     theta, tension = 0.5 * (springy.lower + springy.upper), np.full(8, 80.0)
@@ -237,6 +248,23 @@ def test_springs_are_learned_from_rest_samples(springy):
     )
     assert off[0] < 0.15 * before[0]
     assert off.sum() < 0.35 * before.sum()
+
+
+def test_an_update_publishes_learned_springs_and_control_uses_them(springy):
+    true = springy.kinematics.elasticity.deviating(np.full(3, 0.5), np.full(3, 0.2))
+    observed = rests(springy.with_elasticity(true), 40)
+    updater = BodyUpdater(springy, initial_mae(springy, steps=40).mae)
+    nothing = Healthy(np.empty((0, 24), dtype=np.float32), 0.0, 0)
+    mae = updater.update(Job(observed, nothing, True, 4)).mae
+    core, theta = Controller(springy, Settings()), observed.theta[0]
+    before = core.robot.kinematics.holding_torque(theta)
+    core.use(mae)
+    off, nominal = (
+        np.abs(torque - springy.with_elasticity(true).kinematics.holding_torque(theta))[0]
+        for torque in (core.robot.kinematics.holding_torque(theta), before)
+    )
+    assert off < 0.3 * nominal
+    assert springy.kinematics.elasticity is springy.description.joint_elasticity  # not changed
 
 
 def rests(robot, count):

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learns public recordings of other people's tendon-driven robots, beside polynomial fits.
+
+    python -m bench recordings --clones DIR [--out DIR] [--only NAME]
+
+DIR has one clone for each repository of `recordings_read.repositories`, named OWNER+NAME or NAME
+(a working tree or a git directory). A repository without a clone is cloned into DIR if --fetch is
+given, and left out otherwise. Nothing of the data is kept. The results are recordings.json and
+recordings.md, of which doc/results.md has the tables.
+
+Every model is made from the training rests alone, and judged on all rows of runs (neck), files
+(arm) or poses (stand) that it was not made from. All constants are in `recordings_learn`; none was
+chosen by an error on test rows.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.recordings_learn import (
+    Model,
+    Statics,
+    effort_slope,
+    error,
+    joined,
+    package,
+    payload_share,
+    polynomial,
+)
+from bench.recordings_read import Files, Recording, Repository, Run, fitted, repositories
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.robot.robot import Robot
+
+HALF = slice(0, None, 2)  # every other rest trains
+
+
+class Split(NamedTuple):
+    """What is trained on, and what is tested on."""
+
+    name: str
+    training: Run  # rest samples
+    test: Run  # all rows
+    rests: list[Run]  # the same rest samples by run, for the statics; empty: without the statics
+    full: Run | None = None  # all rows of the training runs, for polynomials of all rows
+
+
+class Result(NamedTuple):
+    """The error of one model on one split."""
+
+    recording: str
+    split: str
+    samples: int
+    model: str
+    error_rad: float
+
+
+def neck_splits(recording: Recording) -> Iterator[Split]:
+    """Split the soft neck: one payload, and two payloads for the third."""
+    none, half, whole = recording.runs
+    own = none.at_rest(HALF)
+    for test in recording.runs:
+        yield Split(f'0 g → {test.name}', own, test, [], none)
+    for first, second, test in ((none, whole, half), (none, half, whole), (half, whole, none)):
+        rests = [first.at_rest(HALF), second.at_rest(HALF)]
+        name = f'{first.name}, {second.name} → {test.name}'
+        yield Split(name, joined(rests), test, rests, joined([first, second]))
+
+
+def arm_splits(recording: Recording) -> Iterator[Split]:
+    """Split the soft arm: other files of one payload, and other payloads."""
+    files = {load: [run for run in recording.runs if run.load == load] for load in (0.0, 0.5)}
+    others = [run for run in recording.runs if run.load not in files]
+    bare, held_out = files[0.0][0::2], files[0.0][1::2]
+    own = joined([run.at_rest() for run in bare])
+    yield Split('0 g → other files, 0 g', own, joined(held_out), [], joined(bare))
+    both = files[0.0] + files[0.5]
+    rests = joined([run.at_rest() for run in both])
+    yield Split('0 g, 500 g → 200 g, 300 g', rests, joined(others), [], joined(both))
+
+
+def stand_splits(recording: Recording) -> Iterator[Split]:
+    """Split the test stand: 20 or 100 of its poses, and all others."""
+    run = recording.runs[0]
+    order = np.random.default_rng(0).permutation(len(run.length))
+
+    def of(rows: Any) -> Run:
+        return replace(run, length=run.length[rows], effort=run.effort[rows], theta=run.theta[rows])
+
+    for count in (20, 100):
+        name = f'{count} poses → all others'
+        yield Split(name, of(order[:count]), of(order[count:]), [])
+
+
+SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {
+    'soft_neck': neck_splits,
+    'soft_arm': arm_splits,
+    'continuum_stand': stand_splits,
+}
+
+
+def models(recording: Recording, split: Split, directory: Path) -> Iterator[tuple[str, Model]]:
+    """Yield every model of a split with its name."""
+    efforts = (False, True) if split.training.effort.size else (False,)
+    for with_effort in efforts:
+        what = 'lengths and efforts' if with_effort else 'lengths'
+        for degree in (1, 2, 3):
+            fit = polynomial(split.training, degree, with_effort)
+            yield f'polynomial of degree {degree}, {what}', fit
+        if split.full is not None:
+            for degree in (1, 2, 3):
+                fit = polynomial(split.full, degree, with_effort)
+                yield f'polynomial of degree {degree}, {what}, of all rows', fit
+    link, at_zero = recording.link, np.zeros(3)
+    if link.name == 'continuum_stand':
+        link, at_zero = fitted(link, split.training)
+
+    def shifted(run: Run) -> Run:
+        return replace(run, length=run.length - at_zero)
+
+    robot = Robot.load(link.write(directory))
+    for with_effort in efforts:
+        learned = package(robot, shifted(split.training), with_effort)
+        what = 'lengths and efforts' if with_effort else 'lengths'
+        yield f'this package, {what}', lambda run, learned=learned: learned(shifted(run))
+    if split.rests:
+        yield 'statics with learned springs, payload known', Statics(robot, split.rests).posture
+
+
+def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str, Any]]:
+    """Return the errors of all models on a repository, and what else its runs show."""
+    recording = repository.read(files)
+    name, results = recording.link.name, []
+    with tempfile.TemporaryDirectory() as folder:
+        for split in SPLITS[name](recording):
+            for label, model in models(recording, split, Path(folder) / 'robot'):
+                off = error(model, split.test)
+                results.append(Result(name, split.name, len(split.training.length), label, off))
+                print(f'{name}: {split.name}: {label}: {off:.4f} rad', flush=True)
+    shown: dict[str, Any] = {}
+    if name == 'soft_neck':
+        azimuths = np.array(recording.link.azimuths)
+        slopes = {run.name: effort_slope(run, azimuths) for run in recording.runs}
+        none, half, whole = slopes.values()
+        shown = {'effort_slope': slopes, 'payload_by_effort_kg': (none - half) / (none - whole)}
+    if name == 'soft_arm':
+        for with_theta in (False, True):
+            for with_effort in (False, True):
+                inputs = ['lengths'] + ['currents'] * with_effort + ['angles'] * with_theta
+                share = payload_share(recording.runs, with_effort, with_theta)
+                shown[f'payload R² by {", ".join(inputs)}'] = share
+    return results, shown
+
+
+def table(results: list[Result]) -> str:
+    """Return the errors of one recording as a Markdown table, best model of each split in bold."""
+    splits, labels = (
+        [*dict.fromkeys(part)] for part in zip(*[(r.split, r.model) for r in results])
+    )
+    errors = {(r.split, r.model): r.error_rad for r in results}
+    samples = {r.split: r.samples for r in results}
+    heads = [f'{split} ({samples[split]} samples)' for split in splits]
+    lines = [f'| error [rad] | {" | ".join(heads)} |', '|---' * (len(splits) + 1) + '|']
+    best = {s: min(e for (split, _), e in errors.items() if split == s) for s in splits}
+    for label in labels:
+        cells = []
+        for split in splits:
+            value = errors.get((split, label))
+            text = '–' if value is None else f'{value:.3f}' if value < 10.0 else 'diverges'
+            cells.append(f'**{text}**' if value == best[split] else text)
+        lines.append(f'| {label} | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
+    """Return the clone of a repository, or None if there is none."""
+    owner, short = repository.name.split('/')
+    for name in (f'{owner}+{short}', short):
+        for path in (clones / name / 'repo', clones / name):
+            if path.is_dir():
+                return path
+    if not fetch:
+        return None
+    target = clones / f'{owner}+{short}'
+    address = f'https://github.com/{repository.name}'
+    done = subprocess.run(['git', 'clone', '--depth', '1', address, str(target)])
+    if done.returncode:
+        raise MusculoskeletalError(
+            f'{address}: git cannot clone it; clone it into {target} yourself'
+        )
+    return target
+
+
+def main(argv: list[str]) -> int:
+    """Learn all repositories that there are clones of; return 1 if there is none."""
+    parser = Parser('recordings', "Learns public recordings of other people's robots.")
+    parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
+    parser.add_argument('--fetch', action='store_true', help='clone what is missing from GitHub')
+    parser.add_argument('--only', default='', help='part of the name of a repository')
+    parser.add_argument('--out', type=Path, default=Path('doc/results/recordings'))
+    args = parser.parse_args(argv)
+    rows, shown, parts = [], dict[str, Any](), []
+    for repository in repositories():
+        clone = clone_of(repository, args.clones, args.fetch)
+        if args.only not in repository.name or clone is None:
+            print(f'{repository.name}: left out' + '; no clone, see --fetch' * (clone is None))
+            continue
+        results, also = learn(repository, Files(clone))
+        rows += [result._asdict() for result in results]
+        shown[repository.name] = also
+        notes = [f'{key}: {value}' for key, value in also.items()]
+        head = f'**{repository.name}** ({repository.licence}): {repository.robot}.'
+        parts.append('\n\n'.join([head, table(results), *notes]))
+    if not parts:
+        raise MusculoskeletalError(f'{args.clones}: no clone of any repository; use --fetch')
+    args.out.mkdir(parents=True, exist_ok=True)
+    document = {'errors': rows, 'also': shown}
+    text = json.dumps(document, indent=1, ensure_ascii=False)
+    (args.out / 'recordings.json').write_text(text + '\n', encoding='utf-8')
+    (args.out / 'recordings.md').write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
+    print(f'{args.out}: recordings.json, recordings.md')
+    return 0

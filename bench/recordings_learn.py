@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models that recordings are learned with: this package, and what it is compared with.
+
+Every model is made from rest samples and maps lengths (and efforts) to θ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations_with_replacement
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from bench.recordings_read import Run
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.trainer import Job
+from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.load import Load
+
+INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
+#: effort in the training rests that counts as this tension, where effort is taken for tension [N]
+STRONG = 40.0
+
+Model = Callable[[Run], Array]  # returns θ [rad], (N, D)
+
+
+def error(model: Model, run: Run) -> float:
+    """Return the mean distance of the estimated θ from the measured one [rad]."""
+    return float(np.linalg.norm(model(run) - run.theta, axis=1).mean())
+
+
+def joined(runs: list[Run]) -> Run:
+    """Return the rows of several runs as one."""
+    parts = [
+        np.concatenate([getattr(run, part) for run in runs])
+        for part in ('length', 'effort', 'theta')
+    ]
+    return Run('', float('nan'), *parts, runs[0].rests[:0])
+
+
+def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
+    """Return the least-squares polynomial of lengths, or of lengths and efforts."""
+
+    def inputs(run: Run) -> Array:
+        return np.hstack([run.length, run.effort]) if with_effort else run.length
+
+    values = inputs(training)
+    mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-12
+
+    def terms(run: Run) -> Array:
+        x = (inputs(run) - mean) / scale
+        columns = [
+            x[:, list(which)].prod(axis=1)
+            for power in range(degree + 1)
+            for which in combinations_with_replacement(range(x.shape[1]), power)
+        ]
+        return np.stack(columns, axis=1)
+
+    weight = np.linalg.lstsq(terms(training), training.theta, rcond=1e-10)[0]
+    return lambda run: np.asarray(terms(run) @ weight)
+
+
+def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
+    """Return what stands for the tensions [N]: T_bias alone, or with the effort on top."""
+    if not with_effort:
+        return lambda run: np.tile(robot.tension.bias, (len(run.length), 1))
+    strong = np.quantile(np.abs(training.effort), 0.95)
+
+    def scaled(run: Run) -> Array:
+        above = np.maximum(run.effort, 0.0) * (STRONG / strong)
+        return np.clip(robot.tension.bias + above, 0.0, robot.tension.max)
+
+    return scaled
+
+
+def package(robot: Robot, training: Run, with_effort: bool = False, seed: int = 0) -> Model:
+    """Return what this package learns: a network, trained on the calibrated body of the rests."""
+    tension = tensions(robot, training, with_effort)
+    pulls = tension(training)
+    known, still = np.ones(pulls.shape, dtype=bool), np.zeros_like(pulls)
+    observed = Observations(training.theta, pulls, training.length, still, known)
+    updater = BodyUpdater(robot, initial_mae(robot, steps=INITIAL_STEPS, seed=seed).mae, seed)
+    nothing = Healthy(np.empty((0, 3 * robot.muscle_count), dtype=np.float32), 0.0, 0)
+    for _ in range(UPDATES):
+        mae = updater.update(Job(observed, nothing, True, STEPS)).mae
+
+    return lambda run: mae.estimate(tension(run), run.length).theta
+
+
+class Statics:
+    """Rest postures by the balance of springs, weight, payload and elastic tendons.
+
+        0 = g(θ) + K θ − λ m Jᵀ F₁ + G(θ)ᵀ T,     T = k max(0, f_geo(θ) − γ l + p)
+
+    F₁ is the weight of 1 kg. The lengths l are known, and the tensions T follow. Unknown are the
+    spring K, the stiffness k of the tendons, the scale γ of the spools, the pretension p and the
+    share λ of the payload. They are fitted to rest samples with known payloads m. The orientation
+    of the IMU in a run is unknown as well, and 0 in runs without training samples.
+    """
+
+    #: log K [N·m/rad], log k [N/m], log γ, p [m], λ: prior means and spreads
+    MEAN = np.array([0.0, np.log(3000.0), 0.0, 0.001, 1.0])
+    SPREAD = np.array([1.0, 1.5, 0.1, 0.002, 0.5])
+    TILT, NOISE = 0.02, 0.015  # [rad] of the IMU's orientation, and of a rest sample
+    ROUNDS = 15
+
+    def __init__(self, robot: Robot, rests: list[Run]) -> None:
+        """Fit the unknowns to the rest samples of runs with different payloads."""
+        self._robot, self._rests = robot, rests
+        tilts = np.zeros(2 * len(rests))
+        self._mean = np.concatenate([self.MEAN, tilts])
+        self._spread = np.concatenate([self.SPREAD, tilts + self.TILT])
+        fits = []
+        for softer in (0.0, -1.0, -2.0):
+            start = self._mean.copy()
+            start[1] += softer * self.SPREAD[1]
+            fits.append(least_squares(self._residuals, start, x_scale=self._spread))
+        self.values = min(fits, key=lambda fit: fit.cost).x
+
+    def _residuals(self, values: Array) -> Array:
+        parts = [(values - self._mean) / self._spread]
+        for run, tilt in zip(self._rests, values[5:].reshape(-1, 2), strict=True):
+            off = self.posture(run, values) + tilt - run.theta
+            parts.append((off / self.NOISE).ravel())
+        return np.concatenate(parts)
+
+    def posture(self, run: Run, values: Array | None = None) -> Array:
+        """Return the rest postures of a run with a known payload [rad], (N, D)."""
+        spring, stiff, scale, pretension, share = (self.values if values is None else values)[:5]
+        robot = self._robot.with_elasticity(
+            JointElasticity(np.exp(spring) * np.eye(2), np.zeros(2), np.zeros(2))
+        )
+        load, eye = Load(robot.kinematics), np.eye(2)
+        wrench = np.tile([0.0, 0.0, -9.81 * share * run.load, 0.0, 0.0, 0.0], (len(run.length), 1))
+        length = np.exp(scale) * run.length
+        theta = np.zeros_like(run.theta)
+        for _ in range(self.ROUNDS):
+            absolute = robot.routes.absolute_lengths(theta) - robot.routes.length_at_zero
+            jacobian = robot.routes.muscle_jacobian(theta)
+            over = absolute - length + pretension
+            held, slope = load(theta, wrench)
+            stiffness = np.exp(stiff) * (over > 0.0)
+            torque = held + np.einsum('nmd,nm->nd', jacobian, stiffness * over)
+            slope = slope + np.einsum('nmi,nm,nmj->nij', jacobian, stiffness, jacobian)
+            # A payload may make the link unstable without its tendons.
+            least = np.linalg.eigvalsh(slope)[:, 0]
+            slope = slope + np.maximum(0.0, 0.2 - least)[:, None, None] * eye
+            step = np.linalg.solve(slope, torque[..., None])[..., 0]
+            theta = np.clip(theta - np.clip(step, -0.2, 0.2), robot.lower, robot.upper)
+        return theta
+
+
+def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float:
+    """Return R² of payloads of left-out runs, by ridge regression on means of each run's end.
+
+    1: the payload is known exactly; 0 or less: no better than the mean payload.
+    """
+    rests = [run.at_rest(slice(-1, None)) for run in runs]
+    parts = [[run.length[0]] for run in rests]
+    for row, run in zip(parts, rests, strict=True):
+        row += [run.effort[0]] * with_effort + [run.theta[0]] * with_theta
+    values, load = (
+        np.array([np.concatenate(row) for row in parts]),
+        np.array([r.load for r in runs]),
+    )
+    values = (values - values.mean(axis=0)) / values.std(axis=0)
+    off, plain = np.empty(len(runs)), np.empty(len(runs))
+    for n in range(len(runs)):
+        rest = np.arange(len(runs)) != n
+        x = np.c_[values[rest], np.ones(rest.sum())]
+        ridge = x.T @ x + np.diag([1.0] * values.shape[1] + [0.0])
+        weight = np.linalg.solve(ridge, x.T @ load[rest])
+        off[n] = np.append(values[n], 1.0) @ weight - load[n]
+        plain[n] = load[rest].mean() - load[n]
+    return float(1.0 - (off @ off) / (plain @ plain))
+
+
+def effort_slope(run: Run, azimuths: Array) -> float:
+    """Return by how much the efforts at rest rise with the commanded bend, in units of effort/m."""
+    out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+    rest = run.at_rest()
+    wound, effort = -rest.length @ out, rest.effort @ out
+    return float((wound * effort).sum() / (wound * wound).sum())

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readers of public recordings of tendon-driven robots. Nothing of their data is kept here.
+
+A recording is read from a clone: a working tree, or a git directory without one. Each reader
+returns runs with tendon lengths, efforts and true joint angles, in SI units, and the rest samples
+among them. Two revolute joints stand for the bend of a soft link, which the orientation of its tip
+determines: θ = β (cos φ, sin φ) of inclination β and azimuth φ.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+
+#: link below and above the joints, whose axes cross in the middle
+URDF = """<robot name="{name}">
+  <link name="base"/>
+  <joint name="bend_x" type="revolute"><parent link="base"/><child link="cross"/>
+    <origin xyz="0 0 {half}"/><axis xyz="0 1 0"/>
+    <limit lower="{low}" upper="{high}" effort="10" velocity="10"/></joint>
+  <link name="cross"><inertial><mass value="0.01"/>
+    <inertia ixx="1e-5" ixy="0" ixz="0" iyy="1e-5" iyz="0" izz="1e-5"/></inertial></link>
+  <joint name="bend_y" type="revolute"><parent link="cross"/><child link="tip"/>
+    <origin xyz="0 0 0"/><axis xyz="-1 0 0"/>
+    <limit lower="{low}" upper="{high}" effort="10" velocity="10"/></joint>
+  <link name="tip"><inertial><origin xyz="0 0 {half}"/><mass value="{mass}"/>
+    <inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
+  <joint name="top" type="fixed"><parent link="tip"/><child link="head"/>
+    <origin xyz="0 0 {half}"/></joint>
+  <link name="head"/>
+</robot>
+"""
+REST = 0.2  # [s] at the end of a pose over which a rest sample is the mean
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run with one payload."""
+
+    name: str
+    load: float  # payload [kg]
+    length: Array  # l, paid-out tendon since the start [m], (N, M)
+    effort: Array  # what the motors exert, in units of the recording, (N, M); (N, 0): unknown
+    theta: Array  # θ, which an independent sensor measured [rad], (N, D)
+    rests: Array  # first row of each rest, and the row after its last one, (R, 2)
+
+    def at_rest(self, rows: slice = slice(None)) -> Run:
+        """Return the rest samples as a run."""
+        spans = self.rests[rows]
+        length, effort, theta = (
+            np.array([part[a:b].mean(axis=0) for a, b in spans])
+            for part in (self.length, self.effort, self.theta)
+        )
+        return replace(self, length=length, effort=effort, theta=theta, rests=spans[:0])
+
+
+@dataclass(frozen=True)
+class SoftLink:
+    """A soft link with tendons parallel to it, as a robot of two joints."""
+
+    name: str
+    azimuths: tuple[float, ...]  # of the tendons [rad]
+    radius: tuple[float, ...]  # distance of each tendon from the middle [m]
+    height: float  # length of the link [m]
+    mass: float  # of its tip [kg]
+    limit: float  # largest bend [rad]
+
+    def write(self, directory: Path) -> Path:
+        """Write the robot directory, and return it."""
+        directory.mkdir(parents=True, exist_ok=True)
+        low, high, half = -self.limit, self.limit, 0.5 * self.height
+        urdf = URDF.format(name=self.name, half=half, mass=self.mass, low=low, high=high)
+        (directory / 'robot.urdf').write_text(urdf, encoding='utf-8')
+        muscles = []
+        for i, (azimuth, radius) in enumerate(zip(self.azimuths, self.radius, strict=True), 1):
+            x, y = (float(radius * f(azimuth)) for f in (np.cos, np.sin))
+            ends = {'link': 'base', 'xyz': [x, y, 0.0]}, {'link': 'tip', 'xyz': [x, y, half]}
+            muscles.append({'name': f'tendon_{i}', 'route': list(ends)})
+        document = {
+            'joints': ['bend_x', 'bend_y'], 'muscles': muscles, 'end_effector': 'head',
+            # Tendons of steel, without an elastic element.
+            'series_elastic': {'force': 1000.0, 'rate': 1000.0, 'wire_stretch': 1e-6},
+            'tension': {'bias': 5.0, 'limit': 60.0, 'max': 100.0},
+        }  # fmt: skip
+        text = yaml.safe_dump(document, sort_keys=False)
+        (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
+        return directory
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The runs of a repository."""
+
+    link: SoftLink
+    runs: list[Run]
+
+
+@dataclass(frozen=True)
+class Repository:
+    """A public repository with recordings."""
+
+    name: str  # owner/name on GitHub
+    licence: str
+    robot: str  # one line about the robot and its sensors
+    read: Callable[[Files], Recording]
+
+
+class Files:
+    """The files of a clone."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a working tree or a git directory.
+
+        Raises:
+            MusculoskeletalError: If it is neither.
+        """
+        self._path = path
+        self._is_bare = not (path / '.git').exists() and (path / 'HEAD').is_file()
+        if not self._is_bare and not path.is_dir():
+            legal = 'a clone: a directory with the files, or a git directory'
+            raise MusculoskeletalError(f'{path}: expected {legal}')
+
+    def names(self, pattern: str) -> list[str]:
+        """Return the files whose whole name matches a regular expression, sorted."""
+        if self._is_bare:
+            listed = self._git('ls-tree', '-r', '-z', '--name-only', 'HEAD').decode().split('\0')
+        else:
+            files = (file for file in self._path.rglob('*') if file.is_file())
+            listed = [str(file.relative_to(self._path)) for file in files]
+        return sorted(name for name in listed if re.fullmatch(pattern, name))
+
+    def text(self, name: str) -> str:
+        """Return the text of a file.
+
+        Raises:
+            MusculoskeletalError: If the clone lacks it.
+        """
+        if self._is_bare:
+            return self._git('show', f'HEAD:{name}').decode(errors='replace')
+        try:
+            return (self._path / name).read_text(encoding='utf-8', errors='replace')
+        except OSError as error:
+            raise self._lacks(name) from error
+
+    def _git(self, *arguments: str) -> bytes:
+        done = subprocess.run(['git', '-C', self._path, *arguments], capture_output=True)
+        if done.returncode:
+            raise self._lacks(arguments[-1])
+        return done.stdout
+
+    def _lacks(self, name: str) -> MusculoskeletalError:
+        return MusculoskeletalError(f'{self._path}: it lacks {name}; clone the repository again')
+
+
+def _columns(text: str) -> dict[str, Array]:
+    lines = text.strip().split('\n')
+    rows = np.array([[float(cell) for cell in line.split(',')] for line in lines[1:]])
+    return dict(zip(lines[0].strip().split(','), rows.T, strict=True))
+
+
+def _ends(changes: Array, count: int, rows: int) -> Array:
+    """Return first and last row of the last `rows` of each pose, which ends at a change."""
+    ends = np.append(changes, count)
+    starts = np.append(0, changes)
+    spans = [(end - rows, end) for start, end in zip(starts, ends) if end - start > 2 * rows]
+    return np.array(spans)
+
+
+def soft_neck(files: Files) -> Recording:
+    """Read the open-loop runs of the soft neck: encoders [degrees] and an IMU, 100 per second."""
+    folder = 'paper-results/csv-results/Frontiers-Test-Bench-Evaluation-Soft-Robotic-Link'
+    spool, ratio = 0.01, 5.69  # [m] radius of the spool; distance of the tendons over it
+    runs = []
+    for load in (0, 500, 1000):
+        column = _columns(files.text(f'{folder}/imu_openloop/spring_test_{load}gr.csv'))
+
+        def of_motors(kind: str, column: dict[str, Array] = column) -> Array:
+            return np.stack([column[f'{kind}{i}'] for i in (1, 2, 3)], axis=1)
+
+        inclination, azimuth = (
+            np.radians(column[f'{what}_sensor']) for what in ('inclination', 'orientation')
+        )
+        theta = inclination[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        changes = np.flatnonzero((np.diff(of_motors('target_motor'), axis=0) != 0.0).any(axis=1))
+        rests = _ends(changes + 1, len(theta), round(REST / 0.01))
+        length = -spool * np.radians(of_motors('encoder'))
+        effort = of_motors('cs')
+        runs.append(Run(f'{load} g', 1e-3 * load, length, effort, theta, rests))
+    azimuths = tuple(np.radians([90.0, -150.0, -30.0]).tolist())
+    return Recording(SoftLink('soft_neck', azimuths, (spool * ratio,) * 3, 0.1, 0.2, 0.7), runs)
+
+
+def soft_arm(files: Files) -> Recording:
+    """Read the control runs of the soft arm: motors [rad], currents [mA], IMU, 50 per second."""
+    spool, distance = 0.0093, 0.0382  # [m]
+    runs = []
+    for name in files.names(r'graphs/Control/.*/Masa_f?\d+/.*\.csv'):
+        rows = [line.split(',') for line in files.text(name).split('\n')]
+        table = np.array([[float(cell) for cell in row] for row in rows if len(row) == 16])
+        load = 1e-3 * float(re.findall(r'Masa_f?(\d+)', name)[0])
+        if len(table) < 100 or not np.isfinite(table).all():
+            continue
+        theta, length = table[:, 5:7], -spool * table[:, 7:10]
+        if np.abs(theta).max() > 1.6 or np.abs(length).max() > 0.2:
+            continue  # the motors or the IMU had failed
+        rests = np.array([[len(table) - round(REST / 0.02), len(table)]])
+        short, effort = name.rpartition('/')[2], table[:, 13:16]
+        runs.append(Run(short, load, length, effort, theta, rests))
+    azimuths = tuple(np.radians([0.0, -120.0, 120.0]).tolist())
+    return Recording(SoftLink('soft_arm', azimuths, (distance,) * 3, 0.2, 0.1, 1.7), runs)
+
+
+def continuum_stand(files: Files) -> Recording:
+    """Read the test stand: commanded shortenings [0.1 mm] of three tendons, and a tracked tip [mm].
+
+    The tip moves on a sphere. Its bend is the direction from the centre of that sphere, seen along
+    the axis that the unloaded link has. Where the tendons run is not stated; it is estimated from
+    the training rows (`fitted`). A tendon that is not shortened is slack where the link
+    bends away from it. Lengths are given ten times as large: the learner suits links of human size.
+    """
+    rows = [line.split(',') for line in files.text('Dataset/Dataset.txt').split()]
+    table = np.array(rows, float)
+    tip = 1e-3 * table[:, 3:]
+    known = np.linalg.lstsq(np.c_[2.0 * tip, np.ones(len(tip))], (tip**2).sum(axis=1), rcond=None)
+    out = tip - known[0][:3]
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    axis = out[table[:, :3].sum(axis=1) < 5.0].mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    first = np.cross([0.0, 0.0, 1.0], axis)
+    first /= np.linalg.norm(first)
+    across = np.stack([out @ first, out @ np.cross(axis, first)], axis=1)
+    sine = np.linalg.norm(across, axis=1, keepdims=True)
+    theta = across / np.maximum(sine, 1e-12) * np.arctan2(sine, (out @ axis)[:, None])
+    length, nothing = -1e-3 * table[:, :3], np.zeros((len(table), 0))
+    single = np.arange(len(table))[:, None] + np.array([0, 1])
+    run = Run('no load', 0.0, length, nothing, theta, single)
+    limit = 1.1 * float(np.abs(theta).max())
+    link = SoftLink('continuum_stand', (0.0,) * 3, (0.1,) * 3, 0.3, 0.1, limit)
+    return Recording(link, [run])
+
+
+def fitted(link: SoftLink, training: Run) -> tuple[SoftLink, Array]:
+    """Return a link whose tendons stand where training rows put them, and their lengths at θ = 0.
+
+    Rows in which a tendon is not shortened say nothing about it.
+    """
+    arms, at_zero = [], []
+    for length in training.length.T:
+        rows = length != 0.0
+        known = np.c_[training.theta, np.ones(len(length))][rows]
+        *slope, zero = np.linalg.lstsq(known, length[rows], rcond=None)[0]
+        arms.append(-np.array(slope))
+        at_zero.append(zero)
+    radius = [float(np.linalg.norm(arm)) for arm in arms]
+    azimuths = [float(np.arctan2(arm[1], arm[0])) for arm in arms]
+    return replace(link, azimuths=tuple(azimuths), radius=tuple(radius)), np.array(at_zero)
+
+
+def repositories() -> Iterator[Repository]:
+    """Yield the repositories, in the order of the table."""
+    yield Repository(
+        'HUMASoft/Data-and-Results', 'LGPL-3.0',
+        'soft neck, 3 tendons, motor encoders, IMU; 0, 500 and 1000 g', soft_neck,
+    )  # fmt: skip
+    yield Repository(
+        'HUMASoft/Soft-Arm', 'no licence file',
+        'soft arm, 3 tendons, motor encoders and currents (157:1 gears), IMU; 0 to 500 g', soft_arm,
+    )  # fmt: skip
+    yield Repository(
+        'ARM-Lab/Learning-Based-Position-Control-for-Continuum-Robots', 'MIT',
+        'continuum robot, 3 tendons, commanded shortenings, tracked tip; no load', continuum_stand,
+    )  # fmt: skip

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bench of public recordings: how it reads clones, and that its models find what is there."""
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.recordings import Result, main, table
+from bench.recordings_learn import Statics, effort_slope, error, joined, polynomial
+from bench.recordings_read import Files, Run, SoftLink, fitted, soft_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.robot import Robot
+
+AZIMUTHS = tuple(np.radians([90.0, -150.0, -30.0]).tolist())
+LINK = SoftLink('link', AZIMUTHS, (0.05,) * 3, 0.1, 0.2, 0.7)
+
+
+@pytest.fixture(scope='module')
+def link(tmp_path_factory) -> Robot:
+    return Robot.load(LINK.write(tmp_path_factory.mktemp('link')))
+
+
+def rests(link, values, load, count, seed):
+    """Return rest samples of a link by the statics, from lengths alone."""
+    rng = np.random.default_rng(seed)
+    bend = rng.uniform(-0.35, 0.35, (count, 2))
+    length = link.routes.absolute_lengths(bend) - link.routes.length_at_zero
+    run = Run('', load, length, np.zeros((count, 0)), np.zeros((count, 2)), np.zeros((0, 2), int))
+    model = object.__new__(Statics)
+    model._robot = link
+    theta = model.posture(run, values)
+    return Run('', load, length, np.zeros((count, 0)), theta, np.zeros((0, 2), int))
+
+
+def test_statics_predict_a_payload_that_was_not_trained(link):
+    """A spring of 1.2 N·m/rad and soft tendons: from 0 and 0.5 kg to 1 kg."""
+    true = np.array([np.log(1.2), np.log(1500.0), 0.03, 0.001, 1.1])
+    none, half, whole = (rests(link, true, load, 12, seed=7) for load in (0.0, 0.5, 1.0))
+    assert np.linalg.norm(none.theta - whole.theta, axis=1).mean() > 0.02
+    model = Statics(link, [none, half])
+    assert error(model.posture, whole) < 0.006
+    assert error(polynomial(joined([none, half]), 1, False), whole) > 0.02
+
+
+def test_a_clone_may_be_a_working_tree_or_a_git_directory(tmp_path):
+    tree = tmp_path / 'tree'
+    name = 'graphs/Control/PID/Masa_200/a.csv'
+    (tree / name).parent.mkdir(parents=True)
+    row = ', '.join(['0'] * 5 + ['0.1', '-0.2', '1', '-1', '0', '0', '0', '0', '7', '8', '9'])
+    (tree / name).write_text('\n'.join([row] * 120), encoding='utf-8')
+    author = ['-c', 'user.name=a', '-c', 'user.email=a@b']
+    for command in (['init', '-q'], ['add', '.'], [*author, 'commit', '-qm', 'data']):
+        subprocess.run(['git', '-C', tree, *command], check=True)
+    bare = tmp_path / 'bare'
+    subprocess.run(['git', 'clone', '-q', '--bare', tree, bare], check=True)
+    for path in (tree, bare):
+        (run,) = soft_arm(Files(path)).runs
+        assert run.load == pytest.approx(0.2)
+        rest = run.at_rest()
+        np.testing.assert_allclose(rest.theta, [[0.1, -0.2]])
+        np.testing.assert_allclose(rest.length, [[-0.0093, 0.0093, 0.0]])
+        np.testing.assert_allclose(rest.effort, [[7.0, 8.0, 9.0]])
+        with pytest.raises(MusculoskeletalError, match=r'it lacks .*other\.csv; clone'):
+            Files(path).text('other.csv')
+    with pytest.raises(MusculoskeletalError, match='expected a clone'):
+        Files(tmp_path / 'nothing')
+
+
+def test_without_a_clone_the_remedy_is_named(tmp_path):
+    with pytest.raises(MusculoskeletalError, match='no clone of any repository; use --fetch'):
+        main(['--clones', str(tmp_path), '--out', str(tmp_path / 'out')])
+    assert not Path(tmp_path / 'out').exists()
+
+
+def test_tendons_stand_where_their_lengths_put_them(link):
+    theta = np.random.default_rng(0).uniform(-0.3, 0.3, (40, 2))
+    length = link.routes.absolute_lengths(theta) - link.routes.length_at_zero - 0.004
+    run = Run('', 0.0, length, length, theta, np.zeros((0, 2), int))
+    found, at_zero = fitted(LINK, run)
+    np.testing.assert_allclose(found.azimuths, AZIMUTHS, atol=0.02)
+    np.testing.assert_allclose(found.radius, LINK.radius, rtol=0.05)
+    np.testing.assert_allclose(at_zero, -0.004, atol=1e-3)
+
+
+def test_the_slope_of_the_effort_is_the_stiffness_against_the_bend():
+    out = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=1)
+    wound = np.random.default_rng(0).normal(size=(30, 3))
+    spans = np.arange(30)[:, None] + np.array([0, 1])
+    run = Run('', 0.0, -wound, 2.5 * wound, wound @ out, spans)
+    assert effort_slope(run, np.array(AZIMUTHS)) == pytest.approx(2.5)
+
+
+def test_the_table_marks_the_best_model_of_each_split():
+    rows = [
+        Result('r', s, 9, m, e) for s, m, e in (('a', 'x', 0.1), ('a', 'y', 0.2), ('b', 'y', 0.3))
+    ]
+    lines = table(rows).split('\n')
+    assert lines[2:] == ['| x | **0.100** | – |', '| y | 0.200 | **0.300** |']
