@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small own models of every format that `import_robot` reads."""
+"""Small models in every format that `import_robot` reads."""
 
 MJCF = """<mujoco model="own">
   <compiler angle="radian"><lengthrange mode="none"/></compiler>

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all tests share."""
+"""Fixtures for all tests."""
 
 import fcntl
 import os
@@ -38,20 +38,20 @@ def _alone(factory: pytest.TempPathFactory, what: str) -> Iterator[Path]:
 
 @pytest.fixture(scope='session')
 def alone(tmp_path_factory) -> Callable[[str], AbstractContextManager[Path]]:
-    """Return what enters a folder of the whole run, one process at a time, to make something."""
+    """Return a context manager that admits one process at a time to a folder of the test run."""
     return partial(_alone, tmp_path_factory)
 
 
 @pytest.fixture
 def both_cores(alone) -> Iterator[None]:
-    """Let nobody else start what keeps both cores busy, such as whole systems in real time."""
+    """Run only one test at a time that occupies both cores, such as a whole real-time system."""
     with alone('cores'):
         yield
 
 
 @pytest.fixture(scope='session')
 def trained_files(alone) -> dict[str, Path]:
-    """Return files of briefly trained networks of arm26, by preset, trained once a run."""
+    """Return the files of briefly trained networks of arm26 by preset, trained once per run."""
     # Torch is loaded for tests that want a network only.
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.mae.training import initial_mae
@@ -69,7 +69,7 @@ def trained_files(alone) -> dict[str, Path]:
 
 @pytest.fixture(scope='session')
 def trained(trained_files) -> dict[str, Any]:
-    """Return briefly trained networks of arm26, by preset."""
+    """Return briefly trained networks of arm26 by preset."""
     from musculoskeletal_ae.mae import checkpoint
 
     return {preset: checkpoint.load(file) for preset, file in trained_files.items()}

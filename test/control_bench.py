@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller without an arm: sensor data is made up, time is counted by the test."""
+"""A controller without an arm: the test provides sensor data and time."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ COLD = np.full(ROBOT.muscle_count, 30.0)
 
 
 def sample(length, tension, robot=ROBOT, temperature=30.0):
-    """Return muscle states as the stream gives them out; numbers are for all muscles."""
+    """Return a sample of the muscle stream; a number applies to all muscles."""
     rows = [np.broadcast_to(row, robot.muscle_count) for row in (length, tension, temperature)]
     states = np.array(rows, dtype=float)
     return MuscleSample(
@@ -40,7 +40,7 @@ def sample(length, tension, robot=ROBOT, temperature=30.0):
 
 
 def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
-    """Return what an activity knows of an arm at rest."""
+    """Return the inputs of an activity for an arm at rest."""
     tension = robot.tension.bias if tension is None else tension
     now = sample(mae.lengths(theta, tension), tension, robot)
     return Inputs(
@@ -56,7 +56,7 @@ def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
 
 
 class Bench:
-    """A controller that is fed healthy sensor data unless told otherwise."""
+    """A controller with healthy sensor data, unless a test changes them."""
 
     def __init__(self, mae=None, **chosen):
         # Ramps of lengths need no arm that comes along.
@@ -100,7 +100,7 @@ class Bench:
 
     @property
     def condition(self):
-        """The stop cause with its details, for people, or ''."""
+        """The stop cause with its details as a text, or ''."""
         return str(self.core.supervisor.condition or '')
 
     def report(self):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulator, estimator and controller on one graph, and what tests ask of them."""
+"""Emulator, estimator and controller on one graph, with helpers for tests."""
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -21,9 +21,9 @@ NODES = {
 
 
 class ControlledArm:
-    """The whole loop of arm26 in a test's graph.
+    """The control loop of arm26 in the graph of a test.
 
-    The nodes run in the test's process, but for those whose processes are to be killed.
+    The nodes run in the test's process, except those that a test kills.
     """
 
     def __init__(self, graph, robot, checkpoint, processes=(), **hardware):
@@ -60,7 +60,7 @@ class ControlledArm:
         )
 
     def kill(self, process):
-        """Kill a node without the graph taking it for an accident; the others go on meanwhile."""
+        """Kill a node on purpose, while the others continue."""
         self.graph.processes.remove(process)
         process.process.kill()
         self.graph.wait(lambda: not process.alive(), f'the end of {process.name}')
@@ -76,7 +76,7 @@ class ControlledArm:
         return np.array([read_array(m, 1, self.robot.muscle_count) for m in messages])
 
     def never_jumped(self, since=0):
-        """Check that no length command went faster than the rate limit, after a pause either."""
+        """Check that no length command exceeded the rate limit, including those after a pause."""
         steps = np.abs(np.diff(self.sent()[since:], axis=0))
         assert steps.max() <= RATE_LIMIT * LONGEST_STEP + 1e-9
 
@@ -97,18 +97,18 @@ class ControlledArm:
         self.graph.wait(lambda: self.tension().max() < bias + 8.0, 'tensions near the bias')
 
     def state(self, node='controller'):
-        """Return what a node says of itself: the controller now, others once a second."""
+        """Return the status of a node: the controller's at once, others' with their next report."""
         if node == 'controller' and node not in self.processes:
             return self.controller.report()
         return self.graph.report(node)
 
     def value_of(self, key):
-        """Return a value of the controller's diagnostics, once it is there."""
+        """Wait for a value of the controller's diagnostics, and return it."""
         self.says(key)
         return self.state().values[key]
 
     def says(self, words, node='controller'):
-        """Wait until the node's diagnostics contain words."""
+        """Wait until the node's diagnostics contain certain words."""
 
         def is_reported():
             state = self.state(node)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of whatever is under test, without its help."""
+"""Numerical derivatives, independent of the code under test."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body image without error, as of a network that had learned the geometric model perfectly."""
+"""A network without error, as if it had learned the geometric model perfectly."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import numpy as np
 
 
 class ExactMae:
-    """What control asks of a `Mae`, given by the geometric model; `fail` makes it faulty."""
+    """The methods of a `Mae` that control uses, computed from the geometric model."""
 
     def __init__(self, robot: Any) -> None:
         self.robot = robot

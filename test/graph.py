@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A test's view of a real ROS graph: nodes here or in processes, real DDS, waits with deadlines."""
+"""A real ROS graph for tests: nodes in this process or others, real DDS, waits with deadlines."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticSt
 
 
 def executable(name: str) -> list[str]:
-    """Return the command of an installed executable, as `ros2 run` finds it."""
+    """Return the command of an installed executable, found like by `ros2 run`."""
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         file = Path(prefix) / 'lib' / 'musculoskeletal_ae' / name
         if file.exists():
@@ -45,7 +45,7 @@ def executable(name: str) -> list[str]:
 class Process:
     """One command, ended when the test ends.
 
-    Its output goes to a file: a pipe that nobody reads would block the command once it is full.
+    Its output goes to a file, because an unread pipe would block the command when it is full.
     """
 
     def __init__(self, name: str, command: list[str], **options: Any) -> None:
@@ -58,11 +58,11 @@ class Process:
 
     @property
     def output(self) -> str:
-        """What it has written so far."""
+        """The output so far."""
         return Path(self._file.name).read_text('utf-8', errors='replace')
 
     def lines(self) -> Iterator[str]:
-        """Yield the lines of its output as they are written, until it ends."""
+        """Yield the lines of the output as they are written, until the command ends."""
         count, deadline = 0, time.monotonic() + PATIENCE
         while True:
             has_ended = not self.alive()  # asked first: nothing is written after the end
@@ -79,24 +79,24 @@ class Process:
             time.sleep(LOOK)
 
     def wait_for_output(self, text: str) -> str:
-        """Wait until a line contains a text; return that line."""
+        """Wait for a line that contains a text, and return it."""
         for line in self.lines():
             if text in line:
                 return line
         raise AssertionError(f'{self.name} ended without {text!r}: {self.output[-2000:]}')
 
     def alive(self) -> bool:
-        """Whether it still runs."""
+        """Whether the command still runs."""
         return self.process.poll() is None
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
-        """Stop it; return exit status and output."""
+        """Stop the command; return exit status and output."""
         if self.alive():
             self.process.send_signal(number)
         return self.ended()
 
     def ended(self) -> tuple[int, str]:
-        """Wait for its end; return exit status and output."""
+        """Wait for the end of the command; return exit status and output."""
         try:
             self.process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
@@ -106,7 +106,7 @@ class Process:
 
 
 class Graph:
-    """A node of the test, what it received, and the processes it started."""
+    """A node of the test, its received messages, and the processes that it started."""
 
     def __init__(self, namespace: str = '') -> None:
         """Join the graph of ROS_DOMAIN_ID."""
@@ -133,7 +133,7 @@ class Graph:
         return process
 
     def host(self, kind: type[Node], **parameters: Any) -> Any:
-        """Run a node with parameters in this process, where a process of its own adds nothing."""
+        """Run a node with parameters in this process."""
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
         node = kind(
             context=self.context,
@@ -152,23 +152,23 @@ class Graph:
         node.destroy_node()
 
     def ended(self, process: Process, number: int | None = None) -> tuple[int, str]:
-        """Return exit status and output of a process that ends, if need be by a signal."""
+        """Wait for the end of a process, or send a signal; return exit status and output."""
         self.processes.remove(process)
         return process.ended() if number is None else process.end(number)
 
     def listen(self, kind: type, topic: str, qos: QoSProfile | int = 50) -> list[Any]:
-        """Subscribe; return the list that messages are appended to."""
+        """Subscribe to a topic; return the list to which messages are appended."""
         self.node.create_subscription(kind, topic, self.received[topic].append, qos)
         return self.received[topic]
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile | int = 10) -> Any:
-        """Advertise a topic and wait until somebody listens."""
+        """Advertise a topic, and wait for a subscriber."""
         publisher = self.node.create_publisher(kind, topic, qos)
         self.wait(lambda: publisher.get_subscription_count() > 0, f'a subscriber of {topic}')
         return publisher
 
     def send_network(self, data: bytes, topic: str = 'mae_checkpoint') -> None:
-        """Publish the bytes of a checkpoint once somebody listens."""
+        """Publish the bytes of a checkpoint as soon as there is a subscriber."""
         if topic not in self.networks:
             self.networks[topic] = self.publisher(UInt8MultiArray, topic, LATCHED)
         self.networks[topic].publish(bytes_message(data))
@@ -180,7 +180,7 @@ class Graph:
             self.executor.spin_once(LOOK)
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
-        """Handle messages until a condition holds; fail with what was waited for."""
+        """Handle messages until a condition holds; fail with the name of the condition."""
         end = time.monotonic() + deadline
         while not (value := condition()):
             dead = [p for p in self.processes if not p.alive()]
@@ -202,7 +202,7 @@ class Graph:
         return messages[-1]
 
     def report(self, node: str) -> Report:
-        """Return what a node of this namespace said last on /diagnostics, which is listened to."""
+        """Return the last report on /diagnostics of a node of this namespace."""
         name = f'{self.namespace}/{node}: state'
         for message in reversed(self.received['/diagnostics']):
             for status in message.status:
@@ -237,7 +237,7 @@ class Graph:
         return result.successful, result.reason
 
     def close(self) -> None:
-        """Leave the graph and end what was started."""
+        """Leave the graph, and end all processes that were started."""
         for process in self.processes:
             process.end()
         self.executor.shutdown()  # before nodes are destroyed
@@ -247,7 +247,7 @@ class Graph:
 
 
 def no_number_of(graph: Graph, robot: Robot, muscle: str) -> Callable[[], None]:
-    """Isolate a muscle; return what publishes states in which its tension is NaN."""
+    """Isolate a muscle; return a function that publishes states in which its tension is NaN."""
     graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=muscle))
     publisher = graph.publisher(Float64MultiArray, 'muscle_states')
     rows = np.tile([[0.0], [61.0], [25.0]], robot.muscle_count)

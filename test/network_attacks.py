@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks that must not take over: changes of a sound one, for tests and for `bench gate`."""
+"""Networks that must be rejected: changes of a healthy one, for tests and `bench gate`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -29,7 +29,7 @@ def _noise(mae: Mae) -> Mae:
 
 
 def _last(quantity: int, change: Callable[[Array, Array, Array], None]) -> Attack:
-    """Change weight and bias of the decoder's last layer where it says θ (0), T (1) or l (2)."""
+    """Change weight and bias of the decoder's last layer for θ (0), T (1) or l (2)."""
 
     def attack(mae: Mae) -> Mae:
         joints, muscles = len(mae.joints), len(mae.muscles)
@@ -63,7 +63,7 @@ def _lengths(times: float) -> Attack:
 
 
 def _shifted(quantity: int, scaled: float) -> Attack:
-    """Let the decoder say so much more [scaled units] of the first joint or muscle."""
+    """Add an offset [scaled units] to the decoder's output for the first joint or muscle."""
 
     def attack(mae: Mae) -> Mae:
         row = (0, len(mae.joints), len(mae.joints) + len(mae.muscles))[quantity]
@@ -96,7 +96,7 @@ ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 
 
 def _other_lengths(times: float = 1.0, more: float = 0.0, part: slice = slice(None)) -> Attack:
-    """Let a network believe, consistently, that lengths are others, `more` in [m]."""
+    """Scale and shift all lengths of a network consistently; `more` is in [m]."""
 
     def attack(mae: Mae) -> Mae:
         std, mean = mae.std.copy(), mae.mean.copy()
@@ -111,7 +111,7 @@ def _other_lengths(times: float = 1.0, more: float = 0.0, part: slice = slice(No
 
 
 def _other_joint(mae: Mae) -> Mae:
-    """Let a joint turn the other way, in all that a network says and hears."""
+    """Reverse a joint in all inputs and outputs of a network."""
     std = mae.std.copy()
     std[0] *= -1.0
     return replace(mae, std=std)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control on the nominal body: no mismatch and no friction, so that what is left is the network's.
+"""Control of the nominal body. Without mismatch and friction, all errors are the network's.
 
 1. posture: error and ‖T‖ where the arm settles under each method's lengths, beside the bound: T by
    QP on the true G, lengths by the true body.
@@ -30,7 +30,7 @@ def nominal_arm(robot: Robot) -> EmulatedArm:
 
 
 def settle(arm: EmulatedArm, length: Array) -> None:
-    """Let the arm come to rest under a command [m] (M,)."""
+    """Run until the arm rests under a command [m] (M,)."""
     for _ in range(round(SETTLING / PERIOD)):
         arm.command_length(length)
         arm.step(PERIOD)
@@ -70,7 +70,7 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
 
 
 def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array) -> Array:
-    """Return by how much a small push turns the joints, (K_θ + ∂g/∂θ)⁻¹ Jᵀ F [rad], shape (D,).
+    """Return the deflection by a small push, (K_θ + ∂g/∂θ)⁻¹ Jᵀ F [rad], shape (D,).
 
     Args:
         robot: For its weight and hand.
@@ -116,7 +116,7 @@ def stiffness_ratios(
 
 
 def _pushed(arm: EmulatedArm, theta: Array, length: Array, wrench: Array) -> Array:
-    """Return half of what turns between a push and the opposite push [rad], shape (D,)."""
+    """Return half the rotation between a push and the opposite push [rad], shape (D,)."""
     arm.reset(theta)
     settle(arm, length)
     ends = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does the simulator rest where the nominal body rests, and give way to pushes as it does?
+"""Compares the rest of the simulator, and its response to pushes, with the nominal body.
 
 (Paper, section "Simulation".) On a network trained on the geometric model, against that model as a
 body: the emulated arm without individual differences and friction, and the equations of its rest,
@@ -62,7 +62,7 @@ def settle_arm(arm: EmulatedArm, command: Array) -> tuple[Array, Array]:
 def rest_errors(
     robot: Robot, mae: Mae, preset: str, commands: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return how far the simulator rests from the nominal body and drifts in 1000 steps.
+    """Return the distance of the simulator's rest from the nominal body, and its drift.
 
     Returns:
         |Δθ| of the rest [rad] (N, D), |ΔT| of the rest [N] (N, M), and the largest departure of θ
@@ -141,7 +141,7 @@ def nominal_rest(
 
 
 class Response(NamedTuple):
-    """How body and simulator answer a push or a forced joint, from the same rest.
+    """Responses of body and simulator to a push or a forced joint, from the same rest.
 
     Attributes:
         name: What was done.
@@ -159,7 +159,7 @@ class Response(NamedTuple):
 
 
 def responses(robot: Robot, mae: Mae, preset: str) -> list[Response]:
-    """Return the answers of the geometric model as a body, and of the simulator."""
+    """Return the responses of the geometric model and of the simulator."""
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[robot.joints.index(FLEXED)] = FLEXION
     tension = holding_tension(robot, theta, 2.0 * robot.tension.bias)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests ask of processes that others have started."""
+"""Queries about processes that others have started."""
 
 import os
 

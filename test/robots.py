@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot directories for tests: an arm that shares no name, size or order with the shipped ones."""
+"""Robot directories for tests: an arm with other names, sizes and order than the shipped ones."""
 
 import copy
 import shutil
@@ -102,7 +102,7 @@ def write_robot(
     """Write a sound arm of 3 joints and 8 muscles with foreign names.
 
     Args:
-        directory: Made if missing.
+        directory: Directory; it is created if it is missing.
         joints: Order of θ in muscles.yaml; the chain itself is lift, swing, bend.
         finger: Adds a joint to the URDF that muscles.yaml does not list.
         slider: Makes the wrist a prismatic joint, the last of θ, with a muscle on either side.
@@ -144,7 +144,7 @@ DRUM_ENDS = {'stays': (0.035, 0.0, -0.008), 'jumps': (0.035, 0.0, 0.0)}
 
 
 def behind_a_drum(directory: Path, end: Sequence[float]) -> Robot:
-    """Return the sound arm with a straightener that ends behind a drum that it wraps round."""
+    """Return the sound arm with a straightener that wraps around a drum and ends behind it."""
     document = read_muscles(write_robot(directory))
     route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
     route[1:] = [DRUM, {'link': 'lower', 'xyz': list(end)}]
@@ -157,20 +157,20 @@ def copy_robot(name: str, directory: Path) -> Path:
 
 
 def read_muscles(directory: Path) -> dict[str, Any]:
-    """Return muscles.yaml as data to change."""
+    """Return the content of muscles.yaml."""
     document: dict[str, Any] = yaml.safe_load((directory / 'muscles.yaml').read_text('utf-8'))
     return document
 
 
 def write_muscles(directory: Path, document: object) -> Path:
-    """Write muscles.yaml; returns the directory."""
+    """Write muscles.yaml; return the directory."""
     text = yaml.safe_dump(copy.deepcopy(document), sort_keys=False, allow_unicode=True)
     (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
     return directory
 
 
 def chain(links: int) -> str:
-    """Return a URDF of so many links, one below the other."""
+    """Return a URDF with a chain of this number of links."""
     joints = ''.join(
         f'<link name="l{i + 1}"/><joint name="j{i}" type="fixed"><parent link="l{i}"/>'
         f'<child link="l{i + 1}"/></joint>'

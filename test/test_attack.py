@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The attack of `bench.attack`: its judgement, and a quick form of it."""
+"""`bench attack`: its evaluation, and a quick run."""
 
 import random
 

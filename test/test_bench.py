@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m bench` lists and starts what is there."""
+"""`python -m bench` lists and starts all benches."""
 
 import importlib
 from pathlib import Path

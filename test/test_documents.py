@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the documents say is so."""
+"""Documents agree with the code."""
 
 import os
 import re

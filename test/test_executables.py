@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every executable: help at once, a clean end by Ctrl-C and SIGTERM, no option that is ignored."""
+"""Every executable: fast help, a clean end by Ctrl-C and SIGTERM, and no ignored option."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ MOMENTS = (0.3, 0.9, 2.0)
 
 
 def run(name, *arguments, before='', **environment):
-    """Run an executable in a process of its own, after other statements."""
+    """Run an executable in another process, after other statements."""
     code = (
         f'import sys\nfrom musculoskeletal_ae import executables\n'
         f'sys.argv[0] = {name!r}\n{before}\nsys.exit(executables.{name}())'
@@ -51,7 +51,7 @@ def run(name, *arguments, before='', **environment):
 
 
 def signalled(name, number, moment, *arguments):
-    """Run an executable that sends itself a signal at a moment [s] after its start."""
+    """Run an executable that sends itself a signal at a time [s] after its start."""
     timer = f'threading.Timer({moment}, os.kill, (os.getpid(), {number.value}))'
     start = f'import os, threading\ntimer = {timer}\ntimer.daemon = True\ntimer.start()'
     return run(name, *arguments, before=start)

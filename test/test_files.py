@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that a user names are read within limits, or refused in one line, by name."""
+"""Files of users are read within limits, or rejected with an error that names the file."""
 
 import os
 
@@ -16,7 +16,7 @@ COLUMNS = ['a', 'b']
 
 
 class Refused(Exception):  # noqa: N818
-    """What the caller's error is in these tests."""
+    """The error of the caller in these tests."""
 
 
 def refuse(file, problem):
@@ -145,7 +145,7 @@ def test_aliases_and_merge_keys_stand_for_what_they_say():
 
 
 def bomb(step):
-    """Return YAML in which each line says the one before it nine times."""
+    """Return YAML in which each line refers to the previous one nine times."""
     lines = ['a0: &a0 {k: x}'] + [
         f'a{i}: &a{i} ' + step.format(', '.join([f'*a{i - 1}'] * 9)) for i in range(1, 16)
     ]

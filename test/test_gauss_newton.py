@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robust solver: its steps, its weights, its ends."""
+"""The robust solver: its steps, its weights, and its termination."""
 
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ def test_eliminating_the_samples_gives_the_step_of_the_whole_system():
 
 
 class Line(NamedTuple):
-    """Slope and offset of a line, and what it leaves."""
+    """Slope and offset of a line, and its residuals."""
 
     values: np.ndarray
     residual: np.ndarray

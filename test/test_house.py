@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules of the whole repository, and the linters of a sourced Jazzy where it has them."""
+"""Rules of the whole repository, and the linters of a sourced Jazzy."""
 
 import ast
 import re

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every command line has in common."""
+"""Properties of every command line."""
 
 import argparse
 from importlib import import_module

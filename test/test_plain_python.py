@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package in plain Python: `pip install .` brings what it needs, and the example runs."""
+"""The package in plain Python: `pip install .` installs all dependencies; the example runs."""
 
 import ast
 import os
@@ -30,9 +30,9 @@ def imported(files):
 
 
 def extra_of(file):
-    """Return the extra with which the imports of a file come; '' if they always do.
+    """Return the extra that installs the imports of a file; '' without one.
 
-    Whatever uses MuJoCo comes with the experiments; the example shows that learning does not.
+    MuJoCo belongs to the extra `experiments`; the example shows that learning works without.
     """
     return 'experiments' if 'mujoco' in imported([file]) else EXTRAS.get(file.parent.name, '')
 
@@ -41,13 +41,13 @@ distributions = cache(packages_distributions)  # a second each time
 
 
 def distribution(module):
-    """Return the name under which a module is installed; pin keeps pinocchio in a folder apart."""
+    """Return the name of the distribution of a module; pin installs pinocchio in its own folder."""
     return 'pin' if module == 'pinocchio' else distributions()[module][0].lower()
 
 
 @pytest.fixture(scope='module')
 def requirements():
-    """Return the names of required distributions, by extra; '' for those that are always."""
+    """Return the names of required distributions by extra; '' for those always required."""
     program = (
         'import json, sys; from distutils.core import run_setup\n'
         'from unittest import mock\n'

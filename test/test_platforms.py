@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core and one node on other interpreters, where CI asks for it; see bench/platforms.py."""
+"""The core and one node on other interpreters, if CI requests it; see bench/platforms.py."""
 
 import os
 import shutil

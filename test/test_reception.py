@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is dropped as late, and under which names rejections are counted; no graph needed."""
+"""Late messages are dropped, and rejections are counted by reason; without a graph."""
 
 import pytest
 
@@ -10,7 +10,7 @@ SECOND = 1_000_000_000
 
 
 class Inbox:
-    """A topic with so many publishers."""
+    """A topic with this number of publishers."""
 
     def __init__(self, publishers=1):
         self.used = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that people read beside the limits that they break."""
+"""Numbers as text beside the limits that they exceed."""
 
 import math
 

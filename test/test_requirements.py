@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ranges in setup.cfg, pins in requirements.txt: what is tested is what is declared to work."""
+"""The tested versions in requirements.txt lie in the declared ranges of setup.cfg."""
 
 from configparser import ConfigParser
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is wrong with a value of a file is explained by place, value and what is legal."""
+"""Errors about a value of a file name its place, the value and the legal ones."""
 
 from typing import Annotated, Literal
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rules of validity and of order, on messages without a graph."""
+"""Rules for the validity and the order of messages, without a graph."""
 
 import math
 

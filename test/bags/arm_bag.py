@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of an arm that behaves exactly as its nominal model says."""
+"""A recording of an arm that behaves exactly like its nominal model."""
 
 import numpy as np
 

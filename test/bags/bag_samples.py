@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small bags of every kind that a reader meets."""
+"""Small bags in every format that the reader supports."""
 
 import random
 from pathlib import Path
@@ -36,7 +36,7 @@ def encode(message: object, type_name: str) -> bytes:
 
 
 def message_class(type_name: str) -> Any:
-    """Return the class of a type's messages, without ROS."""
+    """Return the message class of a type, without ROS."""
     return message_types.TYPESTORE.types[type_name]
 
 
@@ -90,7 +90,7 @@ def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
 def write_ours(
     path: Path, content: list[Sample], compression: str = 'zstd', finish: bool = True
 ) -> None:
-    """Write with our recorder's writer, chunks of ten messages; unfinished: as after SIGKILL."""
+    """Write a bag with our writer, in chunks of ten messages, finished or as after SIGKILL."""
     writer = BagWriter(path, compression)
     for i, sample in enumerate(content):
         if sample.topic not in writer.topics:
@@ -109,7 +109,7 @@ def write_ours(
 def write_mcap(
     path: Path, content: list[Sample], with_definitions: bool = True, **options: Any
 ) -> None:
-    """Write a bare file with the mcap library, as other recorders may."""
+    """Write a bare file with the mcap library, like other recorders."""
     with path.open('wb') as file:
         writer = Writer(file, **({'chunk_size': 2000, 'enable_data_crcs': True} | options))
         writer.start(profile='ros2')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bare mcap files with one message, right or wrong in one respect."""
+"""Bare mcap files with one message, valid or with a single error."""
 
 import struct
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags for tests, and the tools as processes on a ROS graph of their own."""
+"""Bags for tests, and the tools as processes on a private ROS graph."""
 
 import os
 import signal
@@ -24,13 +24,13 @@ def content():
 
 @pytest.fixture
 def bag(tmp_path, content):
-    """A sound bag of our own recorder's writer."""
+    """A valid bag of our writer."""
     samples.write_ours(tmp_path / 'bag', content, 'zstd', finish=True)
     return tmp_path / 'bag'
 
 
 class Tool:
-    """`record` or `replay` as a process; ended by the test that started it."""
+    """`record` or `replay` as a process; the test that started it also ends it."""
 
     def __init__(self, name: str, *arguments: str | Path) -> None:
         code = f'import sys; from musculoskeletal_ae.executables import {name}; sys.exit({name}())'
@@ -61,7 +61,7 @@ class Tool:
 
 @pytest.fixture
 def tool():
-    """Start tools; what is still running at the end of the test is killed."""
+    """Start tools, and kill those that still run at the end of the test."""
     started: list[Tool] = []
 
     def start(name: str, *arguments: str | Path) -> Tool:
@@ -77,6 +77,6 @@ def tool():
 
 @pytest.fixture(autouse=True, scope='session')
 def private_graph():
-    """Stay off the network when the tests are not run by test.sh, which sets these."""
+    """Keep the graph off the network if test.sh has not set these variables."""
     os.environ.setdefault('ROS_DOMAIN_ID', '67')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

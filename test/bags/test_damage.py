@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damaged recordings: read in full, read short and reported, or refused with one error."""
+"""Damaged recordings are read in full, read partly with a report, or rejected with one error."""
 
 import random
 import struct
@@ -33,7 +33,7 @@ def recording(request, tmp_path_factory, content):
 
 
 def damage(data, rng):
-    """Return bytes that were cut, or changed, removed or inserted in one place."""
+    """Return bytes after truncation, or after a change, removal or insertion in one place."""
     changed = bytearray(data)
     at = rng.randrange(len(changed))
     size = rng.choice((1, 4, 8, 30, 300))

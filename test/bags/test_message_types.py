@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bag says of its types is compared with those of ROS 2 Jazzy, and never used."""
+"""Type definitions in bags are compared with those of ROS 2 Jazzy, and never used."""
 
 import re
 import sys

@@ -39,7 +39,7 @@ def change(bag, **entries):
 @pytest.mark.parametrize('kind', samples.BARE)
 @pytest.mark.parametrize('with_definitions', [True, False])
 def test_mcap_files_of_every_kind_are_read(kind, with_definitions, tmp_path, content):
-    """Without definitions a type is known by its name: rosbag2 found no .msg files."""
+    """Without a definition a type is identified by its name, as if rosbag2 had no .msg files."""
     path = tmp_path / 'a.mcap'
     samples.write_mcap(path, content, with_definitions, **samples.BARE[kind])
     assert read(path) == expected(content)
@@ -63,7 +63,7 @@ def test_a_sqlite3_file_that_was_not_closed_is_reported(tmp_path, content):
 
 
 def test_records_that_a_reader_must_skip_are_skipped(tmp_path, content):
-    """The specification leaves opcodes from 0x80 to anybody's private records."""
+    """The specification reserves opcodes from 0x80 for private records."""
     samples.write_mcap(tmp_path / 'a.mcap', content, enable_data_crcs=False)
     data = (tmp_path / 'a.mcap').read_bytes()
     head = 8 + 9 + struct.unpack_from('<Q', data, 9)[0]  # the magic and the header

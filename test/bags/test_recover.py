@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a killed recorder left can be read, and be made a finished bag."""
+"""The recording of a killed recorder can be read, and be converted into a finished bag."""
 
 import pytest
 
@@ -22,7 +22,7 @@ def recover(path, *options):
 
 @pytest.fixture
 def killed(tmp_path, content):
-    """What is left of a recording after SIGKILL: chunks of ten messages, the last one cut."""
+    """A recording after SIGKILL: chunks of ten messages, of which the last one is incomplete."""
     samples.write_ours(tmp_path / 'bag', content, finish=False)
     file = tmp_path / 'bag' / 'bag_0.mcap'
     file.write_bytes(file.read_bytes()[:-100])

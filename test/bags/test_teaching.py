@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recordings of an arm that was taught a motion, of one that lost a muscle, of another body."""
+"""Shipped recordings: a demonstrated motion, a ruptured muscle, and another body."""
 
 from pathlib import Path
 

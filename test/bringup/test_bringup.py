@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""./bringup.sh as a user runs it: a fresh robot, two arms on one graph, faults, and a clean end."""
+"""./bringup.sh as users run it: a new robot, two arms on one graph, faults, and the shutdown."""
 
 import os
 import re
@@ -32,7 +32,7 @@ STATUS = re.compile(
 
 @pytest.fixture(scope='module')
 def environment(tmp_path_factory, trained_file):
-    """Return an environment in which all runs of this module share a cache of their own."""
+    """Return an environment with a cache that only the runs of this module share."""
     cache = tmp_path_factory.mktemp('cache')
     folders = {'XDG_CACHE_HOME': str(cache), 'XDG_STATE_HOME': str(cache / 'state')}
     return {**os.environ, **folders, 'TRAINED': trained_file}
@@ -46,22 +46,22 @@ def bringup(environment, *arguments):
 
 
 def running(run):
-    """Return the commands that run in the session of a bring-up, one a line."""
+    """Return the commands that run in the session of a bring-up, one per line."""
     command = ['ps', '-ww', '-s', str(run.process.pid), '-o', 'stat=,pid=,args=']
     lines = subprocess.run(command, capture_output=True, text=True).stdout.splitlines()
     return '\n'.join(line.split(maxsplit=1)[1] for line in lines if not line.startswith('Z'))
 
 
 def explore_fast(graph, controller):
-    """Explore by short movements, and however late messages are: the machine has other work."""
+    """Explore by short movements, and tolerate late messages on a busy machine."""
     for name, value in ('max_age', 5.0), ('first_duration', 2.0):
         assert graph.set_parameter(controller, name, value)[0]
 
 
 def left_behind(run):
-    """Return what goes on running after the end of a bring-up.
+    """Return the processes that still run after the end of a bring-up.
 
-    A training process notices the end of its node by itself, on a busy machine a moment later.
+    A training process ends on its own after its node has ended, which takes a moment.
     """
     end = time.monotonic() + DEADLINE
     while running(run) and time.monotonic() < end:
@@ -70,7 +70,9 @@ def left_behind(run):
 
 
 def ports_in_shared_memory(run):
-    """Return the threads that wait there for messages: who succeeds a killed node may be deaf."""
+    """Return the threads that wait for messages in shared memory.
+
+    A successor of a killed node may receive no messages there."""
     pids = [line.split()[0] for line in running(run).splitlines()]
     names = [file.read_text() for pid in pids for file in Path(f'/proc/{pid}/task').glob('*/comm')]
     assert any(name.startswith('dds.udp.') for name in names)
@@ -111,7 +113,7 @@ def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(envi
 
 
 def reaches(run):
-    """Return how much of the network each node of a bring-up shows itself to."""
+    """Return the discovery range of each node of a bring-up."""
     nodes = [line.split()[0] for line in running(run).splitlines() if '--ros-args' in line]
     variables = [Path(f'/proc/{pid}/environ').read_text().split('\0') for pid in nodes]
     name = 'ROS_AUTOMATIC_DISCOVERY_RANGE='
@@ -265,7 +267,7 @@ def test_an_emulated_arm_is_shown_to_the_network_on_request(environment):
 
 
 def driver(namespace):
-    """Run the template of a driver for arm26."""
+    """Run the driver template for arm26."""
     command = [sys.executable, str(REPOSITORY / 'examples' / 'driver.py')]
     return Process('driver.py', [*command, '--ros-args', '-r', f'__ns:=/{namespace}'])
 

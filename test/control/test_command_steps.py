@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random sequences of requests, faults and restarts: no published command makes a step.
+"""Random sequences of requests, faults and restarts never cause a step of the command.
 
 Every command is compared with the last one that was published, in every mode and across every
 change of mode. Commands of lengths and of tensions are compared by the tension that they demand of
@@ -33,7 +33,7 @@ MAE = ExactMae(ROBOT)
 
 
 class Arm(RuleBasedStateMachine):
-    """An emulated arm under control, whose commands are judged one by one."""
+    """A controlled emulated arm; each of its commands is checked."""
 
     def __init__(self):
         super().__init__()
@@ -43,7 +43,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(explores=st.booleans())
     def restart(self, explores):
-        """Kill the controller; a new one begins with nothing but the body state."""
+        """Kill the controller; a new one starts with the body state only."""
         self.core = Controller(ROBOT)
         self.core.use(MAE)
         self.core.use_body(self.core.stream.body.with_offsets(self.offsets))
@@ -147,7 +147,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(muscle=MUSCLES, by=st.floats(-0.02, 0.02), known=st.booleans())
     def find_offsets(self, muscle, by, known):
-        """Measure from other length offsets, as the estimator may find them."""
+        """Use other length offsets, as after a length calibration."""
         offset = self.offsets.offset.copy()
         offset[muscle] += by
         self.offsets = LengthOffsets(offset, np.zeros(COUNT))
@@ -169,7 +169,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(seconds=st.floats(0.01, 2.0))
     def sleeps(self, seconds):
-        """Let the controller alone be suspended for a while."""
+        """Suspend only the controller for a while."""
         self.arm.step(seconds)
         self.now += seconds
 

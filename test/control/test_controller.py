@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control as a whole, without an arm: sensor data is made up, time is counted by the test."""
+"""The whole controller without an arm: the test provides sensor data and time."""
 
 import numpy as np
 import pytest

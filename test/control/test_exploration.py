@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's three steps, at postures that the arm can hold."""
+"""Exploration in the three steps of the paper, at holdable postures."""
 
 from itertools import islice
 

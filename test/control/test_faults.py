@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulator, estimator and controller stepped together: what each fault of the arm may do."""
+"""Emulator, estimator and controller in one loop: the consequences of each fault of the arm."""
 
 import copy
 from contextlib import suppress
@@ -22,7 +22,7 @@ DT = 0.01
 
 
 class Loop:
-    """The arm under control, on a clock of its own."""
+    """The controlled arm on a simulated clock."""
 
     def __init__(self, mae):
         self.arm, self.estimator = EmulatedArm(ROBOT, 1), Estimator(ROBOT)
@@ -42,7 +42,7 @@ class Loop:
         return str(self.controller.supervisor.condition or '')
 
     def run(self, seconds):
-        """Let time pass as it does between the nodes."""
+        """Step all parts at the rates of their nodes."""
         for _ in range(round(seconds / DT)):
             self.now += DT
             self.arm.step(DT)
@@ -77,7 +77,7 @@ class Loop:
                 self.controller.anomaly(True)
 
     def mend(self):
-        """Do what a person does then."""
+        """Repair the arm and call the services that a user would call."""
         self.arm.faults.set([])
         self.arm.reset(self.arm.theta)
         self.run(3.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What control does while the arm rests: it corrects the posture and sheds needless tension."""
+"""At rest, the controller corrects the posture and reduces unnecessary tension."""
 
 import numpy as np
 import pytest

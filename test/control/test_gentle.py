@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves, and how, while the length offsets are unknown."""
+"""Motion while the length offsets are unknown: only exploration, with gentle limits."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ DT = 0.01
 
 
 class Loop:
-    """A controller whose arm reads lengths that are too long by `offset`."""
+    """A controller whose arm has length offsets."""
 
     def __init__(self, robot, mae):
         self.arm, self.core, self.now = EmulatedArm(robot, 1), Controller(robot), 0.0
@@ -27,12 +27,12 @@ class Loop:
         self.commands, self.pulls = [], []
 
     def know(self, offset):
-        """Let the controller know by how much lengths read too much."""
+        """Give the controller the length offsets."""
         offsets = LengthOffsets(offset, np.zeros(len(offset)))
         self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def sent(self, command):
-        """Return the length that the modules wind to, of what the controller measures."""
+        """Return the true target length of the modules."""
         return command.value + self.core.stream.body.offsets.offset - self.offset
 
     def run(self, seconds):

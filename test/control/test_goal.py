@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of an action's goal: reached, off its path, late at its end, replaced, stopped."""
+"""Results of an action's goal: reached, off its path, late at its end, replaced, stopped."""
 
 from types import SimpleNamespace
 
@@ -24,7 +24,7 @@ TIGHT = np.array([0.05, np.inf])
 
 
 class Followed:
-    """A bench that follows a second's trajectory, and what becomes of it."""
+    """A bench that follows a trajectory of one second, and the result of its goal."""
 
     def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0):
         self.bench = Bench()
@@ -39,7 +39,7 @@ class Followed:
         self.bench.core.trajectory(points, delay)
 
     def run(self, steps=1000, moves=True):
-        """Return what becomes of it, and after how many steps."""
+        """Return the result, and the number of steps until it is known."""
         for step in range(steps):
             if outcome := self.goal.outcome():
                 return outcome, step

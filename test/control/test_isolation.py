@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control without some muscles, and the winding in of a suspect."""
+"""Control without isolated muscles, and verification of a suspect."""
 
 from itertools import pairwise
 
@@ -29,7 +29,7 @@ ROBOT_WITHOUT = ROBOT.without([LOST])
 
 
 def held(theta, torque=0.0):
-    """Return whether the others hold a posture."""
+    """Return whether the remaining muscles hold a posture."""
     limits, weight = ROBOT.tension, ROBOT.kinematics.holding_torque(theta) + torque
     slope = ExactMae(ROBOT).muscle_jacobian(theta, limits.bias)
     try:
@@ -209,7 +209,7 @@ def test_a_path_avoids_postures_that_cannot_be_held():
 
 @pytest.fixture(scope='module')
 def sliding(tmp_path_factory):
-    """Return an arm whose last joint slides and has no muscle left, and what its weight asks."""
+    """Return an arm with a prismatic last joint without muscles, and the force of its weight."""
     robot = Robot.load(write_robot(tmp_path_factory.mktemp('slider'), slider=True))
     robot = robot.without(robot.muscle_indices(['slider_in', 'slider_out']))
     postures = robot.random_postures(100, np.random.default_rng(0))
@@ -235,7 +235,7 @@ def test_a_prismatic_joint_without_muscles_is_led_along_its_stop(sliding):
 
 
 class Verified(Bench):
-    """A stopped arm whose suspect is wound in; only its own module does anything."""
+    """A stopped arm whose suspect is verified; only the suspect's module moves."""
 
     def __init__(self, **chosen):
         super().__init__(**chosen)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is published is never faster, stronger or less finite than allowed, whatever is desired."""
+"""No published command exceeds the limits of rate and tension or is not finite."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lengths for a posture: on the geometric model, where the optimum is known, and on a network."""
+"""Target lengths of all methods, on the geometric model with a known optimum and on a network."""
 
 from functools import partial
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Following trajectories, without an arm: sensor data is made up, time is counted by the test.
+"""Following of trajectories without an arm: the test provides sensor data and time.
 
-Where the arm matters it is an emulated one.
+Some tests use an emulated arm.
 """
 
 import re
@@ -34,7 +34,7 @@ def points(goal, duration=1.0):
 
 
 def moved(bench, count):
-    """Let the arm be where it is desired to be."""
+    """Move the arm to the setpoint."""
     sent = []
     for _ in range(count):
         sent += bench.step()
@@ -216,7 +216,7 @@ def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(
 
 
 def driven(arm, intervals=(10,), push=0.0, **chosen):
-    """Return by how much an emulated arm is off the desired θ [rad] in a motion of 1 s, (N, 2).
+    """Return the tracking error [rad] of an emulated arm in a motion of 1 s, (N, 2).
 
     Messages come after some of these times [ms]; the hand is pushed by a force [N].
     """

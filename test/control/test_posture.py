@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ramp to a goal; goals themselves are tested with the controller."""
+"""The ramp to a target posture; `test_controller.py` tests the targets themselves."""
 
 import numpy as np
 from hypothesis import given

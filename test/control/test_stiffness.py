@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stiffness as the network sees it, against the geometric model and a push on the nominal arm."""
+"""Predicted stiffness, compared with the geometric model and with a push on the nominal arm."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stopped arm is held, then released, and never wound in."""
+"""A stopped arm is held and then released; no muscle is wound in."""
 
 import numpy as np
 from control_bench import sample

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm stops, and goes on, by one table."""
+"""The transition table of stops and modes."""
 
 import hypothesis.strategies as st
 import pytest
@@ -95,7 +95,7 @@ def test_every_cause_has_an_identifier_a_text_and_a_remedy():
 
 
 class Arm(RuleBasedStateMachine):
-    """Random sequences of events; what must hold after every single one."""
+    """Random sequences of events, with invariants that must hold after each of them."""
 
     def __init__(self):
         super().__init__()

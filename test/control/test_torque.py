@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torque by tension: exact on an exact image, and honest beyond the muscles."""
+"""Torque control: exact with an exact network, and with a report of missing torque."""
 
 import numpy as np
 import pytest
@@ -99,7 +99,7 @@ def test_torque_beyond_the_muscles_is_reported():
 
 
 def carried(control, theta):
-    """Return the torque beyond the weight [N·m] that a floating arm exerts at θ."""
+    """Return the torque besides gravity compensation [N·m] that the arm exerts at θ."""
     tension = settled(control, target=theta, theta=theta)
     pulled = -MAE.muscle_jacobian(theta, tension).T @ tension
     return pulled - ROBOT.kinematics.holding_torque(theta)

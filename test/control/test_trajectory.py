@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint trajectories: between points, slowed, replaced, cancelled."""
+"""Joint trajectories: interpolation, slowing, replacement and cancellation."""
 
 from contextlib import nullcontext
 
@@ -26,7 +26,7 @@ rows = st.lists(
 
 
 def made(rows, order):
-    """Return a trajectory through points within the limits, with so many derivatives."""
+    """Return a trajectory through points within the limits, with this number of derivatives."""
     table = np.array(rows)
     position = MIDDLE + REACH * table[:, 1:3]
     given_values = [0.3 * table[:, 3:5], table[:, 5:7]][:order] + [None] * (2 - order)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No message makes the controller do harm: glitches, lies, late data, heat, overload, clocks."""
+"""No message makes the controller do harm: glitches, false or late data, heat, overload, clocks."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ MUSCLE = ROBOT.muscles[0]
 
 
 class Lied(Bench):
-    """A bench whose messages are distorted on their way; what is refused is counted."""
+    """A bench that distorts its messages and counts the rejected ones."""
 
     def __init__(self, **chosen):
         super().__init__(first_duration=0.5, **chosen)
@@ -36,14 +36,14 @@ class Lied(Bench):
         self.step(100)
 
     def pull(self, tension):
-        """Let the muscles come to tensions as fast as motors do."""
+        """Change the tensions as fast as motors can."""
         before = np.full(ROBOT.muscle_count, ROBOT.tension.bias)
         for share in np.linspace(0.0, 1.0, 20):
             self.tension = before + share * (tension - before)
             self.step()
 
     def lies(self, count=1, **rows):
-        """Step with rows of the message replaced by functions of them."""
+        """Step with rows of the message transformed by functions."""
 
         def lie(read):
             return np.array([rows.get(name, np.array)(row) for name, row in zip(QUANTITIES, read)])
@@ -238,7 +238,7 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
 
 
 def run(pace, gap=0.0, at=150, count=250):
-    """Return the commands of messages every 10 ms of their own clock, and the cause of a stop."""
+    """Send messages every 10 ms of their clock; return the commands and the stop cause."""
     bench = Bench(first_duration=1.0, max_age=0.2)
     bench.target(OTHER)
     now, time, sent = 100.0, 5.0, []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A driver of the emulated arm, stepped without ROS, with faults that a test chooses."""
+"""A driver of the emulated arm without ROS, with faults that a test selects."""
 
 from collections import deque
 from collections.abc import Callable
@@ -20,7 +20,7 @@ PERIOD = 0.01  # [s]
 
 
 class Driver:
-    """Publishes muscle_states and follows muscle_length_command, each through what may be wrong."""
+    """Publishes muscle_states and follows muscle_length_command, with the selected faults."""
 
     def __init__(self, robot: Robot, seed: int = 0) -> None:
         self.robot, self.arm = robot, EmulatedArm(robot, seed)
@@ -41,7 +41,7 @@ class Driver:
         self._sent = -1.0
 
     def step(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Let 10 ms pass; return what is published then: each time θ (D,) and rows (3, M)."""
+        """Advance by 10 ms; return the published messages: θ (D,) and rows (3, M) of each."""
         self.now += PERIOD
         while self._commands and self._commands[0][0] <= self.now:
             self._target = self._commands.popleft()[1]
@@ -59,13 +59,13 @@ class Driver:
         return [(each.theta, self.publish(np.stack(each[1:]))) for each in read]
 
     def command(self, target: np.ndarray) -> None:
-        """Take a command as it came."""
+        """Take a command."""
         self._commands.append((self.now + self.late, self.take(target.copy())))
 
     def listen(
         self, seconds: float = 5.0, moved: bool = False, joints: bool = True, zeroed: bool = True
     ) -> Verdict:
-        """Return what `Listening` says, of the resting arm or while its hand is pushed about."""
+        """Return the verdict of `Listening`, for the arm at rest or with its hand pushed."""
         listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)
         for k in range(round(seconds / PERIOD)):
             if moved:
@@ -81,7 +81,7 @@ class Driver:
     def wind(
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
     ) -> Verdict:
-        """Return what `Winding` says, besides what was heard before."""
+        """Return the verdict of `Winding` or `Positioning`, without that of `Listening`."""
         kind = Positioning if self.robot.follows_position else Winding
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
@@ -92,12 +92,12 @@ class Driver:
 
 
 def array(rows: np.ndarray) -> SimpleNamespace:
-    """Return a Float64MultiArray without a layout, as its readers see it."""
+    """Return a stand-in for a Float64MultiArray without a layout."""
     return SimpleNamespace(data=rows.ravel(), layout=SimpleNamespace(dim=[], data_offset=0))
 
 
 def joint_state(values: dict[str, float]) -> SimpleNamespace:
-    """Return a JointState, as its readers see it."""
+    """Return a stand-in for a JointState."""
     return SimpleNamespace(
         name=list(values), position=list(values.values()), velocity=[], effort=[]
     )

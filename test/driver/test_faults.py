@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sound driver is found sound; each thing that a driver may get wrong is found, and named."""
+"""A correct driver passes the check; each fault that a driver may have is detected and named."""
 
 import copy
 import inspect
@@ -38,7 +38,7 @@ def _settled(seed):
 
 
 def settled(seed=0):
-    """Return a driver whose arm has come to rest: a copy of one, since most tests begin there."""
+    """Return a copy of a driver whose arm has come to rest."""
     return copy.deepcopy(_settled(seed))
 
 
@@ -270,14 +270,14 @@ def test_slow_repeated_and_frozen_messages_are_found():
 
 
 class Messages:
-    """Brings messages of a driver at rest to `Listening`, at times of the test's choice."""
+    """Passes messages of a driver at rest to `Listening`, at times that the test chooses."""
 
     def __init__(self):
         self.listening, self.driver = Listening(ROBOT, 100.0), settled()
         self.number = 0
 
     def bring(self, count, sent, came, lost=()):
-        """Bring messages; `sent` and `came` [s] are functions of their number."""
+        """Pass messages; `sent` and `came` compute their times [s] from their number."""
         for n in range(count):
             self.number += 1
             if n not in lost:
@@ -452,7 +452,7 @@ def stiff_and_strong(stiffness):
 
 
 def wound_in_stiff(stiffness, seed=0, of_law=None):
-    """Return the verdict on the driver that evaluates the law with the l that it reads."""
+    """Return the verdict on a driver that evaluates MSC with the measured l."""
     robot = stiff_and_strong(stiffness)
     driver = Driver(robot, seed)
     driver.in_tension = law(
@@ -503,7 +503,7 @@ def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, reporte
 
 
 def unclipped(robot):
-    """Return a driver at rest; the module of the emulator would clip by itself."""
+    """Return a driver at rest whose module does not clip; that of the emulator would."""
     driver = Driver(robot)
     driver.listen(2.0)
     constants = driver.arm._module_constants

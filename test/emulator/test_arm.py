@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The emulated arm: statics against mechanics, modules against their specification."""
+"""The emulated arm: its statics obey mechanics, and its modules their specification."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from musculoskeletal_ae.validity import MOST_WRENCH
 
 @pytest.fixture(scope='module', params=['kin', 'foreign'])
 def nominal(request, robot):
-    """Return what makes arms of either reality as the model has them."""
+    """Return a function that creates nominal arms of either emulator model."""
     if request.param == 'foreign':
         return lambda: ForeignArm(robot, 0, NONE)
     return lambda: EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
@@ -226,7 +226,7 @@ def test_the_sensor_of_a_prismatic_joint_errs_by_millimetres(tmp_path, reality):
 
 
 def test_a_prismatic_joint_stops_at_its_limits(tmp_path, reality):
-    """As firmly as a joint that turns, driven by a pinion: 200 N go some millimetres beyond."""
+    """The stop is as stiff as that of a revolute joint with a pinion: 200 N move it some mm."""
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
     urdf.write_text(urdf.read_text().replace('"0.25"', '"0.005"'))  # the tool
     robot = Robot.load(tmp_path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults on request: each does what it is named after, and only that, until it is mended."""
+"""Emulated faults: each has exactly the effect that its name states, until it is repaired."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def arm(robot):
 
 
 def numbered(robot, i):
-    """Return readings that say which they are."""
+    """Return readings whose values encode their index."""
     return Readings(np.zeros(robot.joint_count), *np.full((3, robot.muscle_count), float(i)))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second body: without effects it is the described one, each effect does what it is named."""
+"""Emulator model `foreign`: nominal without effects; each effect does what its name states."""
 
 import re
 from dataclasses import fields, replace
@@ -38,7 +38,7 @@ def coupled(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def imported(tmp_path_factory):
-    """Return a user's MJCF file, and the robot that `import_robot` makes of it."""
+    """Return a user's MJCF file, and the robot that `import_robot` creates from it."""
     folder = tmp_path_factory.mktemp('imported')
     file = folder / 'own.xml'
     file.write_text(bodies.MJCF, encoding='utf-8')
@@ -46,7 +46,7 @@ def imported(tmp_path_factory):
 
 
 def drive(arm, seconds=0.3, tension=80.0):
-    """Drive an arm to mid-range and return what happened on the way, (N, 2D + 3M)."""
+    """Drive an arm to mid-range and return the states on the way, (N, 2D + 3M)."""
     robot, rows = arm.robot, []
     command = to_mid_range(robot, tension)
     for _ in range(round(seconds / 0.02)):

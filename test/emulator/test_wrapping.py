@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The true routes: Jacobian against differences, individuals against each other."""
+"""Routes of emulated individuals: the Jacobian equals differences, and individuals differ."""
 
 import numpy as np
 import pytest

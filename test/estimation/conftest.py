@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A healthy message of the geometric model, and how to break it."""
+"""A healthy message of the geometric model, and faulty variants."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -31,7 +31,7 @@ def mae(trained) -> Mae:
 
 @pytest.fixture(scope='session')
 def calibrated(mae) -> Mae:
-    """Return the network with statistics that count as the real arm's; d beyond 8 is an anomaly."""
+    """Return the network with statistics that count as calibrated and a threshold of d of 8."""
     statistics = replace(mae.anomaly, calibrated=True, thresholds={DISTANCE: 8.0})
     return replace(mae, anomaly=statistics)
 

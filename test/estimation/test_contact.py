@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pushes the arm from outside: exact on an exact body image, silent where nothing does."""
+"""Contact: exact with an exact network, and not reported without an external force."""
 
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ def observer(spread=SPREAD, time=LEAST_MOTION, robot=ARM):
 
 
 def pulling(theta, force=(0.0, 0.0, 0.0), robot=ARM):
-    """Return T [N] and l [m] of the arm that rests at θ under a force of the hand [N]."""
+    """Return T [N] and l [m] of the arm at rest at θ, with a force on its hand [N]."""
     kin = robot.kinematics
     torque = kin.holding_torque(theta) - kin.end_effector_jacobian(theta)[:3].T @ np.array(force)
     jacobian = ExactMae(robot).muscle_jacobian(theta, np.full(robot.muscle_count, 60.0))
@@ -87,7 +87,7 @@ def test_known_tendon_friction_is_not_taken_for_a_force():
 
 
 def test_inertia_is_not_taken_for_a_force():
-    """A swing whose muscles give just the torque of inverse dynamics."""
+    """The muscles of a swinging arm exert exactly the torque of inverse dynamics."""
     core, largest, free, rate = observer(), 0.0, 0.0, 3.0
     for n in range(300):
         t = n * DT
@@ -159,7 +159,7 @@ def test_the_observer_is_stable_at_any_rate(dt):
 
 @dataclass
 class StatedPosture:
-    """An exact body image that estimates the posture it is given."""
+    """An exact network that estimates a stated posture."""
 
     theta: np.ndarray
     touch: TouchStatistics

@@ -16,7 +16,7 @@ DT = 0.01
 
 
 class Watched:
-    """A health monitor with a network, and what its modules are commanded."""
+    """A health monitor with a network, and the tensions commanded to its modules."""
 
     def __init__(self, robot, mae, threshold=0.0, preset='default'):
         self.mae, self.demand = mae, None
@@ -31,7 +31,7 @@ class Watched:
         return observation.estimate.anomaly, self.health.residual.reading, finding
 
     def findings(self, message, times=1):
-        """Return what is found when a message comes so many times."""
+        """Repeat a message, and return all findings."""
         return [self.step(message)[2] for _ in range(times)]
 
 

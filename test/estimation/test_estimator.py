@@ -32,7 +32,7 @@ class Stepped:
         self.core.use(mae)
 
     def step(self, message, times=1, dt=DT):
-        """Return the estimates of a message that comes so many times."""
+        """Repeat a message, and return its estimates."""
         estimates = []
         for _ in range(times):
             self.now += dt
@@ -40,7 +40,7 @@ class Stepped:
         return estimates
 
     def move(self, message):
-        """Let the lengths become those of a message, as fast as a muscle can."""
+        """Change the lengths to those of a message, as fast as a muscle can."""
         before = self.core.sample.length_read
         for share in np.linspace(0.0, 1.0, 21):
             length = before + share * (message.length - before)

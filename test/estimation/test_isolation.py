@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A suspect is isolated at once, and what it does when it is wound in decides."""
+"""A suspect is isolated at once, and its response to winding in determines the verdict."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
 
 
 def verdict(tension, length, likely=0.0):
-    """Wind in by 3 mm after a while; T and l are functions of T_ref and of the row's number."""
+    """Wind in by 3 mm after a while; functions compute T and l from T_ref and the row's number."""
     watched = Verification(0, ModuleLaw(BIAS, STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.003)
@@ -66,7 +66,7 @@ def test_a_suspect_that_is_not_wound_in_stays_isolated():
 
 
 class Loop:
-    """An estimator that isolates; the commands are the test's."""
+    """An estimator that isolates suspects, with commands of the test."""
 
     def __init__(self, robot, mae, healthy):
         self.core, self.now, self.command = Estimator(robot), 100.0, healthy.length.copy()
@@ -75,7 +75,7 @@ class Loop:
         self.rng, self.length = np.random.default_rng(0), healthy.length
 
     def step(self, message, times=1):
-        """Let a message come so many times; its lengths are reached as fast as is plausible."""
+        """Repeat a message; its lengths are approached as fast as is plausible."""
         for _ in range(times):
             self.now += DT
             self.core.commanded(self.now, length=self.command)
@@ -95,7 +95,7 @@ def loop(robot, calibrated, healthy):
 
 @pytest.fixture
 def cut(slack):
-    """Return a message in which muscle 2 is cut: its winch has wound in what is left."""
+    """Return a message in which muscle 2 has ruptured and its winch has wound in the rest."""
     return slack._replace(length=slack.length - 0.2 * (np.arange(6) == 2))
 
 

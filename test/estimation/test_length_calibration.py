@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Length offsets are found on the network's own body."""
+"""Length calibration of a body that the network describes exactly."""
 
 import re
 
@@ -22,7 +22,7 @@ def states(tension, length):
 
 
 def swinging(robot, mae):
-    """Return T [N] and l [m] at the t-th second of a slow swing, as the network's body holds it."""
+    """Return T [N] and l [m] of the network's body at time t [s] of a slow swing."""
 
     def at(t):
         middle, half = 0.5 * (robot.lower + robot.upper), 0.4 * (robot.upper - robot.lower)

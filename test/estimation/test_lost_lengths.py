@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Modules that lose their count: nothing relies on their lengths until they are found anew."""
+"""When modules lose their length offsets, nothing uses the lengths until a calibration."""
 
 from contextlib import suppress
 
@@ -19,7 +19,7 @@ ONE = 0.06 * (np.arange(6) == 2)
 
 
 class Wandering:
-    """An estimator, and a model arm that wanders; lengths and joint sensors may be off."""
+    """An estimator and a moving model arm, whose lengths and joint sensors may have offsets."""
 
     def __init__(self, robot, mae, **detection):
         self.robot, self.core, self.time = robot, Estimator(robot), 0.0

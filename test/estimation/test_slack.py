@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A muscle without tension: cut, or a slow winch that takes up slack."""
+"""A muscle without tension: ruptured, or slack that a slow winch winds in."""
 
 from dataclasses import replace
 
@@ -19,10 +19,10 @@ MUSCLE = 2
 
 @pytest.fixture
 def noticed(robot, mae, slack):
-    """Return a function that says after how long [s] a muscle without tension is called cut."""
+    """Return a function that returns the time [s] until a muscle without tension is reported."""
 
     def run(speed, until, longest=20.0, settings=None):
-        """Wind in at a speed [m/s] for so far [m], then stand."""
+        """Wind in a length [m] at a speed [m/s], then stand."""
         health, rng = HealthMonitor(robot, settings=settings), np.random.default_rng(0)
         health.use(mae)
         state = mae.estimate(*slack)
@@ -70,7 +70,7 @@ def test_noise_of_the_length_sensor_does_not_count_as_winding_in(noticed):
 def test_the_distance_waits_for_slack_but_not_for_a_rupture(
     robot, calibrated, healthy, loose, found
 ):
-    """By a slow winch both look alike, but what is left of a cut wire is too short."""
+    """With a slow winch both look alike, but the rest of a ruptured tendon is too short."""
     health = HealthMonitor(robot)
     health.use(calibrated)
     one = np.eye(6)[MUSCLE]
@@ -89,7 +89,7 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
 def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
     robot, calibrated, speed, commanded
 ):
-    """Before calibration, and before any command as well."""
+    """This also applies before calibration, and before the first command."""
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     arm.step(3.0)
     estimator, hold = Estimator(robot), arm.sense().length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What follows from a finding, by its kind and the parameter `on_anomaly`."""
+"""The consequences of a finding, by its kind and the parameter `on_anomaly`."""
 
 import pytest
 

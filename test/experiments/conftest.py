@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One quick run of every experiment, which all tests here look at."""
+"""One quick run of every experiment, for all tests of this folder."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ MINUTES = 0.35
 
 @pytest.fixture(scope='session')
 def quick(alone) -> Path:
-    """The folder of `experiment all --quick` on the small arm, from two processes; once a run."""
+    """The folder of `experiment all --quick` on arm26 with two processes, once per test run."""
     with alone('experiments') as common:
         folder, done = common / 'experiments', common / 'experiments_done'
         if not done.exists():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's control protocol on a small arm without mismatch: who comes nearer, and how taut."""
+"""The paper's control protocol on arm26 without mismatch: errors and tensions."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(end
 
 
 def test_a_posture_at_the_target_needs_the_bound(ended):
-    """Where an arm came close to θ_eval, holding it there takes what holding θ_eval takes."""
+    """If an arm comes close to θ_eval, holding it there requires the tension of θ_eval."""
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 

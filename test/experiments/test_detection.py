@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The script of grasps and cuts, and how alarms and scores are counted."""
+"""The script of grasps and ruptures, and the counting of alarms and scores."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from musculoskeletal_ae.experiments.recording import record
 
 
 class Fake:
-    """Records what a script does to an arm whose muscles all pull alike."""
+    """Records the actions of a script on an arm with equal tensions."""
 
     def __init__(self, robot, tension):
         self.time, self.done, self.off = 0.0, [], []

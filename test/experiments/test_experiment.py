@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`experiment`: what it writes, for any robot, and how it refuses."""
+"""`experiment`: its output for any robot, and its errors."""
 
 import importlib
 import json

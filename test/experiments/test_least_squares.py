@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares finds the posture of a body whose model it has, whichever body that is."""
+"""Least squares finds the posture of any body whose model it has."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_the_jacobian_of_the_learned_body_is_its_slope(robot):
 
 
 def test_the_oracle_without_friction_errs_only_by_its_sensors(robot):
-    """A recording whose lengths carry 3 mm of hysteresis besides."""
+    """The lengths of the recording also have 3 mm of hysteresis."""
     rng = np.random.default_rng(2)
     individual = Individual(robot, 0)
     theta = robot.random_postures(10 * COUNT, rng)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has to hold for the comparison to be fair: same motion, same stream, same seeds."""
+"""Conditions of a fair comparison: same motion, same stream, same seeds."""
 
 import math
 
@@ -59,7 +59,7 @@ def test_both_presets_learn_each_from_its_own_exploration(twice):
 
 
 def test_exploration_goes_through_the_controller_with_the_network_being_learned(twice):
-    """No command leaps, and its goals are those of networks that have learned on the way."""
+    """No command jumps, and the targets follow the network as it learns."""
     (study, _), _ = twice
     taken = study.stream(0, 'exploring')
     step = np.abs(np.diff(taken.command, axis=0)).max()

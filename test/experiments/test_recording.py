@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Driving an arm through commands, and what a script may do on the way."""
+"""Recording an arm that follows commands, with a script of events."""
 
 from dataclasses import replace
 

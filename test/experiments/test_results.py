@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What result.json says of several individuals, and of parts that failed; what they share."""
+"""result.json of several individuals, with parts that failed."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def kept(tmp_path):
 
 
 def changed(kept, name, **numbers):
-    """Change what an experiment brought."""
+    """Change the result of an experiment."""
     file = kept / name / 'result.json'
     result = json.loads(file.read_text('utf-8')) | numbers
     file.write_text(json.dumps(result), encoding='utf-8')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which joints play elbow and shoulder on robots that name none."""
+"""Selection of elbow and shoulder joints on robots without such names."""
 
 import math
 

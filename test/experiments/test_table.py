@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The results table is what its command makes of the committed results."""
+"""The table of results is the one that its command creates from the committed results."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A learned body as MJCF, and the whole way round: import, learn, export, load."""
+"""Export of a learned body as MJCF: import, learn, export, load."""
 
 import bodies
 import mujoco
@@ -48,7 +48,7 @@ def test_what_is_exported_loads_and_is_as_near_to_the_network_as_the_report_says
 
 
 def test_points_that_a_network_has_learned_are_those_of_the_model(imported):
-    """A network of an individual whose points are elsewhere gives these points' moment arms."""
+    """The moment arms of the export are those of an individual with displaced points."""
     robot, _, folder = imported
     individual = make_arm(robot, 3, str(folder / 'own.xml'), deviates=True).individual
     other = import_robot(folder / 'own.xml', folder / 'other').robot

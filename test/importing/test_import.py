@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every format: lengths against the source's own, cut chains, and files that are damaged."""
+"""Import of every format: lengths equal the source's, parts of chains, and damaged files."""
 
 import os
 import re
@@ -74,7 +74,7 @@ def test_what_mujoco_computes_with_is_computed_with_here(mjcf, tmp_path, old, ne
 
 
 def test_a_point_on_the_rim_of_what_it_wraps_round_is_tied_to_it(mjcf, tmp_path):
-    """MuJoCo decides by the last bit of a distance, which turns with the arm."""
+    """MuJoCo's choice would depend on rounding, and vary with the posture."""
     drum = (
         '<geom name="pulley" type="cylinder" size="0.03" fromto="0 -0.02 0 0 0.02 0" mass="0.01"/>'
     )
@@ -170,7 +170,7 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
 
 
 def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
-    """As of an unmodified file of MyoHub, which has no space between two attributes."""
+    """An unmodified file of MyoHub has no space between two attributes."""
     expected = import_robot(mjcf, tmp_path / 'sound')
     mjcf.write_text('<!-- own -->\n' + mjcf.read_text().replace('ball" type=', 'ball"type='))
     result = import_robot(mjcf, tmp_path / 'loose')
@@ -308,7 +308,7 @@ def test_a_model_without_routes_is_refused_with_what_was_dropped(tmp_path):
 
 
 def wires_and_weight(tmp_path, name, text):
-    """Return the lengths of an SDF's muscles (N, M), and what holds its weight (N, D)."""
+    """Return the muscle lengths of an SDF (N, M), and the torque of its weight (N, D)."""
     put(tmp_path, 'model.sdf', text)
     robot = import_robot(tmp_path / 'cardsflow.xml', tmp_path / name).robot
     theta = np.linspace(-1.0, 1.0, 5)[:, None]
@@ -498,7 +498,7 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
 @settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(['CARDSFLOW', 'URDF', 'SDF']), st.data())
 def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, format_, data):
-    """Words of a file are replaced or left out, elements cut away."""
+    """Words of a file are replaced or omitted, and elements are removed."""
     text = getattr(bodies, format_).format(mimic='<mimic joint="shoulder" multiplier="2"/>')
     words = re.split(r'(?<=[ >"])|(?=[<"])', text)
     for _ in range(data.draw(st.integers(1, 3))):

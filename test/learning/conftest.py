@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies that differ from the model, samples of them, and a network that has learned one."""
+"""Bodies that differ from the model, their samples, and a network that has learned one."""
 
 import copy
 
@@ -22,12 +22,12 @@ def arm26() -> Robot:
 
 @pytest.fixture(scope='session')
 def initial(trained):
-    """Return a network of the geometric model, trained for a moment."""
+    """Return a briefly trained network of the geometric model."""
     return trained['default']
 
 
 def drawn_body(robot, features: int, seed: int, scale: float) -> CalibratedBody:
-    """Return a body drawn from the prior, wrapping and all; it does not creep."""
+    """Return a body drawn from the prior, with wrapping but without creep."""
     body, rng = CalibratedBody(robot, seed=features), np.random.default_rng(seed)
     for m, layout in enumerate(body.layouts):
         draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
@@ -41,7 +41,7 @@ def other_body(arm26) -> CalibratedBody:
 
 
 class Stage:
-    """Gives samples of a body at rest."""
+    """Generates samples of a body at rest."""
 
     def __init__(self, body: CalibratedBody, seed: int = 0) -> None:
         self.body, self.rng = body, np.random.default_rng(seed)
@@ -98,5 +98,5 @@ def learned_once(arm26, initial, other_body):
 
 @pytest.fixture
 def learned(learned_once):
-    """Return a network that has learned a body of 20 samples, its updater, store and stage."""
+    """Return a network that has learned from 20 samples, its updater, store and stage."""
     return copy.deepcopy(learned_once)

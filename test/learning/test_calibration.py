@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector is calibrated on what is healthy, and on nothing else."""
+"""The detector is calibrated on healthy data only."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning without some muscles: nothing is learned of them, and all else goes on."""
+"""Learning without isolated muscles: nothing is learned of them, and everything else works."""
 
 import numpy as np
 

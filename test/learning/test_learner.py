@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's story, and its rules on time, which is the caller's."""
+"""The life cycle of the learner, and its rules on time, which the caller provides."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ DT = 0.01
 
 
 class Prepared(Trainer):
-    """Answers with the network that it began with, when the test lets it."""
+    """A trainer that returns its initial network when the test allows it."""
 
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
@@ -59,13 +59,13 @@ def accept(learner, stage, count):
 
 
 def between(start, end, count):
-    """Return samples on the way, without those at its ends, which rest."""
+    """Return the samples between two rests."""
     for share in np.linspace(0.0, 1.0, count + 2)[1:-1]:
         yield end._replace(length=(1.0 - share) * start.length + share * end.length)
 
 
 class Arm:
-    """Rests in one posture after another, on a clock of its own."""
+    """An arm that rests in one posture after another, on a simulated clock."""
 
     MOVES = 10  # messages on the way from one to the next
 
@@ -298,7 +298,7 @@ def test_a_replaced_network_drops_samples_and_continues_the_version_count(learne
 
 
 class Partly(Arm):
-    """Rests with readings of the given joints only."""
+    """An arm of which only some joints have sensors."""
 
     read = ()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Body and postures found together, from whatever sensors there are."""
+"""Joint fit of body and postures, with any combination of sensors."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 class Resting(Stage):
-    """Gives samples of a body that its muscles hold against its weight, as a real rest is."""
+    """Generates samples of a body whose muscles hold its weight, as in a real rest."""
 
     def observations(self, count: int) -> Observations:
         robot, body = self.body.robot, self.body
@@ -62,7 +62,7 @@ def blind(observed: Observations) -> Observations:
 
 
 def errors(arm26, observed, truth) -> tuple[float, float]:
-    """Return how far postures are off before and after the fit [rad]."""
+    """Return the errors of postures before and after the fit [rad]."""
     rng = np.random.default_rng(1)
     guess = truth + rng.normal(0.0, 0.15, truth.shape)
     fitted = fit_body(CalibratedBody(arm26), observed, guess=guess).theta

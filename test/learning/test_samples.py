@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rest, friction, novelty, the budgeted store, the gate."""
+"""Rest detection, friction, novelty, the store with its budget, and rejected samples."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
 
 
 def each_some(t, still=True):
-    """Return θ as two nodes publish it by turns, each for one joint."""
+    """Return θ as if two nodes published one joint each by turns."""
     angles = np.array([0.3, 0.3 if still else 0.3 + 0.05 * t])
     angles[round(t / 0.01) % 2] = np.nan
     return angles
@@ -170,7 +170,7 @@ def test_a_full_store_keeps_the_newest_and_its_coverage():
 
 
 class Messages:
-    """Sends messages of an arm to a collector, on a clock of its own."""
+    """Sends messages of an arm to a collector, on a simulated clock."""
 
     def __init__(self, robot):
         self.robot, self.time = robot, 0.0

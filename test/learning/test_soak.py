@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the soak would not tolerate."""
+"""Failures that `bench soak` reports."""
 
 import pytest
 

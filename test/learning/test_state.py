@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is on disk survives every way in which a learner or its disk can end."""
+"""The saved state survives a kill of the learner and failures of the disk at any moment."""
 
 import errno
 import resource
@@ -44,7 +44,7 @@ def written(directory, robot, stage, count, network=None):
 
 
 def read(directory, robot):
-    """Return samples, network, and what was not used."""
+    """Return samples, network, and the files that were not used."""
     store = SampleStore()
     with closing(StateStore(directory, robot)) as state:
         mae = state.load(store)
@@ -52,7 +52,7 @@ def read(directory, robot):
 
 
 def read_backup(directory, robot, scratch):
-    """Return samples and network of a backup that was made the newest state of a directory."""
+    """Make a backup the newest state of a directory; return its samples and network."""
     scratch.mkdir()
     shutil.copy(directory / BACKUP, scratch / NEWEST)
     store, mae, not_used = read(scratch, robot)
@@ -70,7 +70,7 @@ def assert_same(one, two):
 
 @contextmanager
 def full_disk():
-    """Let every write fail that makes a file larger, as on a full disk."""
+    """Make every write fail that enlarges a file, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
     try:
@@ -286,7 +286,7 @@ def test_a_directory_that_cannot_be_made_is_named_with_what_to_give(tmp_path, ar
 
 @pytest.fixture
 def begun(arm26, initial, tmp_path):
-    """Return what starts a learner in one directory, the last one's successor."""
+    """Return a function that starts a learner in one directory, as the successor of the last."""
     learners = []
 
     def begin():

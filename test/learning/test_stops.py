@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The zeros of joint sensors, told by where the joints stop."""
+"""Offsets of joint sensors, estimated from the stops of the joints."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ TRUE = np.array([0.05, -0.04, 0.0])  # zeros of the sensors [rad]
 
 
 def rests(count: int = 150, beyond: float = 0.3, seed: int = 0) -> np.ndarray:
-    """Return true θ [rad] (N, D) of an arm that is stopped at its limits."""
+    """Return true θ [rad] (N, D) of an arm with stops at its limits."""
     rng = np.random.default_rng(seed)
     theta = rng.uniform(LOWER - beyond, UPPER + beyond, (count, len(LOWER)))
     give = 0.003 * rng.exponential(size=theta.shape)
@@ -19,7 +19,7 @@ def rests(count: int = 150, beyond: float = 0.3, seed: int = 0) -> np.ndarray:
 
 
 def within(margin: float) -> np.ndarray:
-    """Return true θ [rad] of an arm that stays so far within its limits."""
+    """Return true θ [rad] of an arm that keeps a distance from its limits."""
     return np.random.default_rng(3).uniform(LOWER + margin, UPPER - margin, (150, 3))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever the training process does, it is replaced, and the node goes on."""
+"""However the training process fails, it is replaced, and the node continues."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ def process(arm26, monkeypatch):
 
 
 def answer(process):
-    """Return the next update, or None if a process was lost first."""
+    """Return the next update, or None if the process was lost before."""
     deadline = time.monotonic() + PATIENCE
     losses = process.restarts
     while process.restarts == losses:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network follows the body, and the paper what it prints."""
+"""The network follows the calibrated body; preset `paper` does what the paper states."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
 
 
 class Giving(Stage):
-    """An arm whose points give way, which no calibrated body can describe."""
+    """An arm with compliant route points, which no calibrated body can describe."""
 
     def sample(self):
         sample = super().sample()

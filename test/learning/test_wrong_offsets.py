@@ -16,7 +16,7 @@ POSTURE = 1.0 + MARGIN + 0.5  # [s] of rest after which there is a sample
 
 
 class Displaced(Arm):
-    """An arm whose lengths read too much."""
+    """An arm with length offsets."""
 
     off = np.zeros(6)
 

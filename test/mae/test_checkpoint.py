@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def small() -> Mae:
-    """One joint, two muscles, hidden layers of 4: small enough to break in every byte."""
+    """A network small enough to damage every byte: one joint, two muscles, hidden layers of 4."""
     rng = np.random.default_rng(0)
     sizes = (8, 4, 3, 4, 5)
     stack = [(rng.normal(size=(o, i)), rng.normal(size=o)) for i, o in pairwise(sizes)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body of several limbs: which groups its routes make, and a network with a block for each."""
+"""A body of several limbs: the groups that its routes form, and a network with a block for each."""
 
 import json
 from dataclasses import replace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Isolated muscles: the network without what their sensors read."""
+"""Networks with isolated muscles ignore the readings of these."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph per test."""
+"""A ROS graph for each test."""
 
 import itertools
 import os
@@ -19,7 +19,7 @@ def arm26() -> Robot:
 
 @pytest.fixture
 def graph():
-    """Return a graph whose topics no other test sees: a namespace of its own."""
+    """Return a graph with a private namespace."""
     graph = Graph(f'/test_{os.getpid()}_{next(_counter)}')
     yield graph
     graph.close()

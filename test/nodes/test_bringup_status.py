@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the status line says."""
+"""The content of the status line."""
 
 import math
 
@@ -67,7 +67,7 @@ def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
 
 
 def stopped(cause, mode='stopped'):
-    """Return what the controller in /left reports of a stop, as it reports it."""
+    """Return the report of a stop by the controller in /left."""
     values = {
         'mode': mode,
         'stop_cause': cause.identifier,

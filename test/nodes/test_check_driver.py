@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`check_driver` on the graph: it waits, judges a live driver, and moves nothing unasked."""
+"""`check_driver` on the graph: it waits, checks a live driver, and moves only if asked to."""
 
 import signal
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimator and controller in one process: the same nodes, and one end."""
+"""Estimator and controller in one process: the same nodes, and a common shutdown."""
 
 import signal
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller moving an emulated arm on a real graph, by every method."""
+"""The controller moves an emulated arm on a real graph, with every method."""
 
 from pathlib import Path
 

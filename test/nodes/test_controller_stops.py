@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every cause of a safe stop on a real graph, and what lets the arm go on."""
+"""Every stop cause on a real graph, and how the arm resumes."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 
 @pytest.fixture
 def moving(graph, arm26, trained_file):
-    """Return a function that starts an arm and sends it on its way."""
+    """Return a function that starts an arm and makes it move."""
 
     def start(*processes, **hardware):
         arm = ControlledArm(graph, arm26, trained_file, processes, **hardware)

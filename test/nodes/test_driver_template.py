@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driver to start from, and what the controller asks of any."""
+"""The driver template meets the requirements of the controller."""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator as users meet it, over DDS."""
+"""The node `estimator` over DDS."""
 
 import shutil
 import signal
@@ -49,7 +49,7 @@ def values(graph):
 
 
 def answer(graph, message):
-    """Publish until an estimate comes back: best-effort may lose the first one."""
+    """Publish until an estimate arrives, because best-effort may lose the first messages."""
     before = len(graph.received['estimated_joint_states'])
 
     def arrived():

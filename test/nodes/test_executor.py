@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every executor runs a node; asynchronous callbacks work; one that does not fit is refused."""
+"""Every executor runs a node, asynchronous callbacks work, and unsuitable versions are rejected."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ from musculoskeletal_ae.nodes.bringup_status import BringupStatus
 
 @pytest.fixture
 def version(monkeypatch):
-    """Return what sets the version of rclpy that is found."""
+    """Return a function that fakes the version of rclpy."""
     monkeypatch.delenv(executor.VARIABLE, raising=False)
     return lambda *numbers: monkeypatch.setattr(executor, '_rclpy_version', lambda: numbers)
 

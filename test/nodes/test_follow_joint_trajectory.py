@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action, by a client of control_msgs where that is installed; actions are served at once."""
+"""The action `follow_joint_trajectory`, with a client where control_msgs is installed."""
 
 import sys
 import threading
@@ -23,7 +23,7 @@ from .test_motion import HERE, THERE, trajectory
 
 
 class SentGoal:
-    """A goal that a client has sent, and what it receives about it."""
+    """A goal that a client has sent, and the responses to it."""
 
     def __init__(self, graph, client, goal):
         self._graph = graph
@@ -101,7 +101,7 @@ def test_without_control_msgs_there_is_no_action(graph, arm26, trained_file, mon
 
 
 class Asked(Waitable):
-    """Something that is waited for as an action server is."""
+    """A stand-in for an action server in a wait set."""
 
     def __init__(self, node):
         super().__init__(ReentrantCallbackGroup())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A muscle is cut, verified and isolated, and the arm moves on, over DDS."""
+"""A muscle ruptures, is verified and isolated, and the arm moves on, over DDS."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The learner's node: it learns, gates, saves, resumes, and ends with all that it started."""
+"""The node `learner`: it learns, validates, saves, resumes, and ends with its processes."""
 
 import os
 import shutil
@@ -34,7 +34,7 @@ DT = 0.01
 
 
 class Arm:
-    """Plays the hardware: rests in one posture after another."""
+    """Stands in for the hardware; it rests in one posture after another."""
 
     def __init__(self, graph, robot):
         self.graph, self.robot = graph, robot
@@ -45,7 +45,7 @@ class Arm:
         self.theta, self.tension = self.draw()
 
     def draw(self):
-        """Return a posture and tensions at random."""
+        """Return a random posture and random tensions."""
         tension = self.rng.uniform(30.0, 150.0, self.robot.muscle_count)
         return self.robot.random_postures(1, self.rng)[0], tension
 
@@ -73,7 +73,7 @@ class Arm:
 
 
 class HostedLearner:
-    """A learner in this process, whose time passes as fast as messages can be taken."""
+    """A learner in this process, faster than real time."""
 
     def __init__(self, graph, robot, **parameters):
         self.graph = graph
@@ -112,12 +112,12 @@ class HostedLearner:
             self.graph.executor.spin_once(LOOK)
 
     def run(self, seconds):
-        """Let time pass."""
+        """Advance the time."""
         for _ in range(round(seconds / DT)):
             self.step()
 
     def learn(self, condition, what):
-        """Let time pass until a condition holds."""
+        """Advance the time until a condition holds."""
         deadline = time.monotonic() + DEADLINE
         while not condition():
             assert time.monotonic() < deadline, f'waited in vain for {what}'
@@ -133,7 +133,7 @@ def state(tmp_path):
 
 @pytest.fixture
 def host(graph, arm26, trained_file, monkeypatch):
-    """Return what makes a learner that trains here, or in a process of its own."""
+    """Return a function that creates a learner that trains in this process or in another one."""
 
     def make(process=False, **parameters):
         if not process:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What RViz, Foxglove and PlotJuggler get: arms that can be told apart, names, frames."""
+"""Topics for RViz, Foxglove and PlotJuggler: distinguishable arms, names and frames."""
 
 import json
 import sys
@@ -67,7 +67,7 @@ def test_render_writes_a_picture_and_refuses_an_unknown_file_type(graph, tmp_pat
 
 
 def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
-    """As with an arm of one's own; an estimator that waits for a network draws nothing yet."""
+    """There is no emulator with a physical arm. Nothing is drawn before there is a network."""
     publisher = graph.node.create_publisher(MarkerArray, 'estimated/markers', 10)
     bone = Marker(type=Marker.LINE_STRIP, points=[Point(), Point(z=0.3)])
     out = tmp_path / 'arm.png'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One table of parameters, and what is made from it."""
+"""The table of parameters, and the declarations and pages that follow from it."""
 
 import subprocess
 import sys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node that hangs ends with a status, and says where it hung."""
+"""A node that hangs exits with a status, and logs where it hung."""
 
 import signal
 import subprocess

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A command that is refused, or that a node cannot receive, is shown where people look."""
+"""The status shows commands that are refused or that a node cannot receive."""
 
 import pytest
 from builtin_interfaces.msg import Duration

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rights in config/security_policy.xml are those that the running nodes use."""
+"""config/security_policy.xml grants exactly the rights that the running nodes use."""
 
 import importlib
 import os

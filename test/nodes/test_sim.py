@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated arm on the graph: beside a robot, and in its place."""
+"""The node `sim` on the graph, beside a robot or instead of one."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def mae(arm26, trained_file):
 
 @pytest.fixture
 def core(arm26, mae):
-    """Return the same simulated arm without ROS."""
+    """Return the simulated arm without ROS."""
     core = Simulation(arm26, mae)
     core.settle()
     return core

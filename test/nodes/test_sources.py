@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may publish what: judged from the graph, from reports and from stamps."""
+"""Second publishers are detected from the graph, from reports and from stamps."""
 
 import numpy as np
 import pytest

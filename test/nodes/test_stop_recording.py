@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is kept of the seconds before a stop."""
+"""The recording of the seconds before a stop."""
 
 import errno
 import os

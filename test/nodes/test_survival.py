@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No request and no message of any kind ends a node, and every request is answered."""
+"""No request or message ends a node, and every request gets a response."""
 
 import math
 import os

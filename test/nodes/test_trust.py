@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strangers on the graph: networks, second sources, values no arm has, and odd clocks."""
+"""Unwanted data on the graph: networks, second publishers, implausible values, and clocks."""
 
 import time
 from dataclasses import replace

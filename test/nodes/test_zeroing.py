@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Zeros of the lengths as users find them, over DDS."""
+"""Length calibration over DDS."""
 
 import numpy as np
 import pytest

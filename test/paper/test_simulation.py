@@ -17,7 +17,7 @@ def test_preset_paper_moves_towards_forced_joint_angles(trained):
 
 
 def test_preset_paper_moves_towards_the_commanded_lengths_without_stiffness_control(trained):
-    """Where nothing is forced, w₅ outweighs the others: l goes to what was sent, not beyond it."""
+    """Without external force, w₅ outweighs the others: l reaches the command and not more."""
     robot = Robot.load('arm26')
     arms = Simulation(robot, trained['paper'], 'paper')
     resting = arms.step(0.2).length[0]

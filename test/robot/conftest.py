@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms that every claim about the geometric model is tested on."""
+"""The arms on which every claim about the geometric model is tested."""
 
 import pytest
 from robots import write_robot
@@ -11,7 +11,7 @@ ARMS = ['musashi_left_arm', 'arm26', 'other', 'finger', 'slider']
 
 @pytest.fixture(scope='session', params=ARMS)
 def robot(request, tmp_path_factory) -> Robot:
-    """Shipped arms; a permuted one; with a joint to lock; with a prismatic joint."""
+    """Shipped arms, and arms with permuted joints, a locked joint or a prismatic joint."""
     name = request.param
     if name in ('musashi_left_arm', 'arm26'):
         return Robot.load(name)

@@ -29,7 +29,7 @@ def change(directory, edit):
 
 
 def mirror(muscle):
-    """Leads a muscle along the other side of every joint axis about y."""
+    """Move a muscle to the other side of every joint axis that is parallel to y."""
 
     def edit(document):
         (entry,) = (m for m in document['muscles'] if m['name'] == muscle)
@@ -302,7 +302,7 @@ FINGER = """<robot name="finger"><link name="palm"/>
 
 
 def finger(directory, **top):
-    """A finger whose muscles pull 5 N at most, with moment arms of 3 to 5 mm."""
+    """Write a finger with tensions up to 5 N and moment arms of 3 to 5 mm."""
     directory.mkdir()
     (directory / 'robot.urdf').write_text(FINGER)
     muscles = [
@@ -442,7 +442,7 @@ def test_a_wire_that_touches_nowhere_what_it_should_wrap_round_is_told(change, t
 
 
 def remedies_of(directory, kind, postures=60):
-    """Return what is said to help against a fault, and the check that found it."""
+    """Return the suggested remedies for a fault, and the check that detected it."""
     check = check_robot(Robot.load(directory), postures)
     (fault,) = (fault for fault in check.faults if fault.kind == kind)
     return remedies(check, fault), check

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coupled joints, several end effectors, and what each muscle may have of its own."""
+"""Coupled joints, several end effectors, and values of single muscles."""
 
 import re
 

@@ -14,7 +14,7 @@ from musculoskeletal_ae.robot.urdf import MOST_PARTS, read_urdf
 
 
 def refused(directory, *fragments):
-    """Reading a robot directory ends in an error that says all of these."""
+    """Check that reading a robot directory raises an error that contains all these texts."""
     with pytest.raises(RobotDescriptionError) as error:
         load_description(directory)
     for fragment in fragments:
@@ -22,7 +22,7 @@ def refused(directory, *fragments):
 
 
 def put(path, value):
-    """An edit of muscles.yaml: the entry at `path` becomes `value`."""
+    """Return an edit of muscles.yaml that sets the entry at `path` to `value`."""
 
     def edit(document):
         at = document

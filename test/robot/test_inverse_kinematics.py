@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""IK(P_marker, θ_est): it goes where the pose says, and elsewhere stays with the estimate."""
+"""IK(P_marker, θ_est): the pose determines θ; undetermined joints keep the estimate."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def test_an_estimate_that_agrees_with_the_pose_is_not_changed():
 
 
 def test_noise_of_the_camera_turns_joints_by_less_than_0_2_rad():
-    """A search to the end turns them by 0.41 rad; one that is pulled to within 0.2 rad, by 0.17."""
+    """Without the end of the search by noise, they would move by 0.41 rad."""
     rng = np.random.default_rng(1)
     theta = ARM.random_postures(400, rng)
     observed = [camera_reading(ARM.kinematics.end_effector_pose(each), rng) for each in theta]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Springs of the joints: one torque, in the torque balance of everything that has one."""
+"""Joint springs: their torque is part of every torque balance."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ SPRINGS = [
 
 
 def one_sided(document):
-    """Takes away the muscles that straighten the bend."""
+    """Remove the muscles that straighten the bend."""
     muscles = document['muscles']
     muscles[:] = [m for m in muscles if not m['name'].startswith('straightener')]
 
@@ -134,7 +134,7 @@ def test_a_simulated_arm_rests_where_muscles_hold_weight_and_springs(springy):
 
 
 def test_a_spring_takes_the_place_of_an_antagonist(tmp_path):
-    """Five muscles at three joints, fewer than two for each, hold what a spring turns back."""
+    """Five muscles hold three joints, fewer than two for each, if a spring opposes them."""
     document = read_muscles(write_robot(tmp_path))
     one_sided(document)
     without = check_robot(Robot.load(write_muscles(tmp_path, document)))
@@ -230,7 +230,7 @@ SPRUNG = '<joint name="elbow" stiffness="2" springref="0.4" damping="0.5" '
 
 
 def test_springs_are_learned_from_rest_samples(springy):
-    """Half as stiff and 0.2 rad elsewhere: what is left of both errors after 60 rest samples.
+    """With half the stiffness and an offset of 0.2 rad: the remaining errors after 60 rest samples.
 
     The balance of a joint counts to 0.3 of what its muscles exert, so that weak springs beside
     strong muscles stay as stated.

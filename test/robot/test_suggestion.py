@@ -17,7 +17,7 @@ WRAP = {'wrap': 'sphere', 'link': 'upper_arm', 'xyz': [0.0, 0.0, -0.2], 'radius'
 
 
 def poor_arm(directory, spread=0.03):
-    """The small arm as it would come out if each of its via points were placed by eye."""
+    """Write arm26 with inaccurate via points, as if placed by eye."""
     document = read_muscles(copy_robot('arm26', directory))
     rng = np.random.default_rng(3)
     for muscle in document['muscles']:

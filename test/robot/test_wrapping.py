@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wires round spheres, cylinders and through rings: lengths, gradients, lift-off, drawing."""
+"""Tendons around spheres and cylinders and through rings: lengths, gradients, lift-off, drawing."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def wire(start, end, radius, axis=(0, 0, 0), side=NONE):
 
 @pytest.fixture(scope='module', params=WRAPS)
 def robot(request, tmp_path_factory):
-    """An arm whose straightener wraps at the elbow."""
+    """Return an arm whose straightener wraps at the elbow."""
     directory = write_robot(tmp_path_factory.mktemp('wraps'))
     document = read_muscles(directory)
     route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
@@ -109,7 +109,7 @@ def test_a_mirrored_or_reversed_tendon_has_the_same_length(axis, side):
 
 
 def test_length_and_direction_are_continuous_where_the_tendon_lifts_off():
-    """The pull turns by angles of the square root of the height that is left: bounded by that."""
+    """The bound is the angle of the tangent, which grows with the square root of the height."""
     for axis in ((0, 0, 0), (0, 0, 1)):
         for gap in (1e-6, -1e-6):
             length, leave, _ = wire([0.3, 0.1 + gap, 0], [-0.3, 0.1 + gap, 0.1], 0.1, axis)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windings' temperatures are learned from the housings', and limit what muscles may pull."""
+"""Winding temperatures are estimated from those of the housings, and limit the tensions."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def warm(wound, muscle, command, steps):
 
 
 class Motors:
-    """The modules of an emulated arm, which pull as they are told."""
+    """The modules of an emulated arm with stated tensions."""
 
     def __init__(self, seed=0, hold=10, most=TENSION.limit):
         self.rng, self.hold, self.most = np.random.default_rng(seed), hold, most
@@ -41,7 +41,7 @@ class Motors:
         self.errors, self.pulled, self.read = [], TENSION.bias, None
 
     def run(self, seconds, tension=None):
-        """Let time pass with given tensions [N], or random ones."""
+        """Advance the time with stated tensions [N], or random ones."""
         arm = self.arm
         for n in range(round(seconds)):
             if tension is None and n % self.hold == 0:
@@ -56,12 +56,12 @@ class Motors:
         return np.abs(self.errors[-round(seconds) :])
 
     def hand_on(self):
-        """Hand on what was read."""
+        """Pass on the readings."""
         self.heat.step(self.pulled, self.read, 1.0)
 
 
 class Watched(Motors):
-    """The same, watched by the estimator."""
+    """The same modules, observed by the estimator."""
 
     def __init__(self, mae, **options):
         super().__init__(**options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of the messages of a ros2_control robot, by the rules of its two controllers."""
+"""Conversion of the messages of a ros2_control robot, with the rules of its two controllers."""
 
 import math
 from dataclasses import replace

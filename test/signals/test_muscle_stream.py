@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a message of the muscle modules."""
+"""Processing of a message of the muscle modules."""
 
 from contextlib import suppress
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ def message(states):
 
 
 def resting(**changes):
-    """Return sound l, T and temperature, with single values changed: length=(muscle, value)."""
+    """Return plausible l, T and temperature with single values changed: length=(muscle, value)."""
     states = np.stack([np.zeros(M), ROBOT.tension.bias, np.full(M, 30.0)])
     for row, quantity in enumerate(('length', 'tension', 'temperature')):
         if quantity in changes:
@@ -102,7 +102,7 @@ def test_a_jump_of_one_length_is_rejected_until_it_has_lasted_and_names_its_musc
 
 
 def jump_together(stream, size=0.05, pause=0.0):
-    """Let several lengths jump in a stream; return which the samples name as jumped."""
+    """Make several lengths of a stream jump; return the muscles that the samples name."""
     jumped, stream_time = [], 0.0
     for n in range(200):
         stream_time += PERIOD + pause * (n == 20)

@@ -34,7 +34,7 @@ def test_a_clock_that_goes_back_starts_pairing_anew():
 
 
 def paired_live(joints, muscles, period):
-    """Return for each muscle message the number of its θ, or None, in the order of arrival."""
+    """Return the index of θ for each muscle message, or None, paired in the order of arrival."""
     pairing = Pairing(period)
     given_out = []
     for time, kind, number in sorted(
@@ -49,7 +49,7 @@ def paired_live(joints, muscles, period):
 
 
 def paired_by_definition(joints, muscles, period):
-    """The same from all times at once: who is nearest to whom."""
+    """Return the same from all times at once, by the definition: the nearest θ."""
     owners = [min(muscles, key=lambda m: abs(m - time), default=None) for time in joints]
     return [
         min(
@@ -71,7 +71,7 @@ def test_each_angle_is_paired_once_with_the_message_it_is_nearest_to(joints, mus
 
 @given(st.lists(st.tuples(times, st.integers(1, 7)), max_size=3), times, st.integers(2, 40))
 def test_each_joint_is_paired_as_if_it_were_alone(publishers, muscles, period):
-    """Several nodes publish some of three joints each."""
+    """Each of several nodes publishes some of three joints."""
     sent = {}  # when and what, no two at once
     for moments, joints in publishers:
         for time in moments:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator with its network by torch: what numpy computes, and where it was asked for."""
+"""The simulator with its network in torch: results of numpy, and on the requested device."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ ARMS = 5
 
 
 class Devices(TorchFunctionMode):
-    """Notes where the tensors are that functions return."""
+    """Records the devices of all tensors that torch functions return."""
 
     def __init__(self):
         super().__init__()

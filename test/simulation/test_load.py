@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gravity and pushes for many arms at once are what pinocchio says for each."""
+"""Gravity and pushes of many arms at once equal pinocchio's results for each."""
 
 import numpy as np
 import pinocchio as pin
@@ -11,7 +11,7 @@ from musculoskeletal_ae.simulation.load import Load
 
 
 def sliding_tree():
-    """Return a branching tree with a sliding joint, its joints listed in a foreign order."""
+    """Return a branching tree with a prismatic joint, and its joints in another order."""
     model = pin.Model()
     rng = np.random.default_rng(1)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator on a body whose lengths are exact, so that only it can be wrong; on networks."""
+"""The simulator on bodies with exact lengths, which exclude network errors, and on networks."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation, on_all_cores
 
 
 class GeometricBody:
-    """Answers as a network without any error would."""
+    """Behaves like a network without error."""
 
     def __init__(self, robot, friction=0.0):
         self.robot, self.friction = robot, np.full(robot.muscle_count, friction)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium, driven by its DevTools protocol: what a visitor sees and clicks."""
+"""A headless Chromium that tests control by the DevTools protocol."""
 
 import base64
 import itertools
@@ -104,11 +104,11 @@ class Browser:
 
     @property
     def text(self) -> str:
-        """All that can be read on the page."""
+        """All text on the page."""
         return self.evaluate(TEXT) or ''
 
     def wait_for(self, text: str) -> None:
-        """Wait until a text can be read."""
+        """Wait until the page shows a text."""
         self._wait(lambda: text in self.text, f'{text!r} on the page')
 
     def mouse(self, kind: str, x: float, y: float, pressed: bool = False) -> None:
@@ -140,7 +140,7 @@ class Browser:
             time.sleep(0.06)
 
     def centre(self, button: str) -> tuple[float, float]:
-        """Return where the button with a text is."""
+        """Return the position of the button with a text."""
         result = self._wait(
             lambda: self.evaluate(
                 '(() => { const b = [...document.querySelectorAll("button")].find('
@@ -153,13 +153,13 @@ class Browser:
         return result[0], result[1]
 
     def close_notifications(self) -> None:
-        """Click away what covers the arm, such as the warning that there is no graphics card."""
+        """Close notifications that cover the arm, such as a warning of a missing graphics card."""
         button = '.mantine-Notification-closeButton'
         self.evaluate(f'document.querySelectorAll("{button}").forEach(each => each.click())')
         time.sleep(0.5)
 
     def screenshot(self, file: Path) -> bytes:
-        """Save what is seen as a PNG."""
+        """Save a screenshot as a PNG."""
         data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
         file.write_bytes(data)
         return data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph per test, as for the nodes."""
+"""A ROS graph for each test, as for the nodes."""
 
 from nodes.conftest import arm26, graph
 

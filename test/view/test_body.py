@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page draws stands where the kinematics say, and tells muscles apart."""
+"""Objects of the page are where the kinematics place them, and muscles are distinguishable."""
 
 import os
 import shutil

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page as a visitor sees it: a real Chromium, real nodes. Screenshots stay in log/view."""
+"""The page in a real Chromium, with real nodes. Screenshots stay in log/view."""
 
 import gzip
 import math
@@ -55,7 +55,7 @@ def free_port() -> int:
 def view(graph):
     """Start the page of arm26 with options; return its port once it lets visitors in.
 
-    It says so: who comes before that is turned away, and a browser would come again.
+    The page logs that moment; it rejects earlier connections, and a browser would retry.
     """
 
     def start(*options: str) -> int:
