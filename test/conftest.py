@@ -19,10 +19,10 @@ import musculoskeletal_ae  # noqa: F401  # chooses the pinocchio that tests impo
 if worker := os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw'):
     os.environ['ROS_DOMAIN_ID'] = str(int(os.environ.get('ROS_DOMAIN_ID', '1')) + int(worker))
 
-# What a shell starts in the background is deaf to Ctrl-C, and so would all be that tests start.
+# A shell makes its background processes ignore Ctrl-C; processes of tests would inherit this.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Compiled code is loaded in somebody's first example; no test here judges time.
+# The first example loads compiled code, so examples have no deadline.
 settings.register_profile('no deadline', deadline=None)
 settings.load_profile('no deadline')
 
@@ -30,7 +30,7 @@ settings.load_profile('no deadline')
 @contextmanager
 def _alone(factory: pytest.TempPathFactory, what: str) -> Iterator[Path]:
     folder = factory.getbasetemp()
-    folder = folder.parent if worker else folder  # what pytest-xdist's processes have in common
+    folder = folder.parent if worker else folder  # the common folder of pytest-xdist's processes
     with (folder / f'{what}.lock').open('w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield folder
@@ -52,7 +52,7 @@ def both_cores(alone) -> Iterator[None]:
 @pytest.fixture(scope='session')
 def trained_files(alone) -> dict[str, Path]:
     """Return the files of briefly trained networks of arm26 by preset, trained once per run."""
-    # Torch is loaded for tests that want a network only.
+    # Load torch only for tests that need a network.
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.mae.training import initial_mae
     from musculoskeletal_ae.presets.registry import PRESETS

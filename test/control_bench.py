@@ -59,7 +59,7 @@ class Bench:
     """A controller with healthy sensor data, unless a test changes them."""
 
     def __init__(self, mae=None, **chosen):
-        # Ramps of lengths need no arm that comes along.
+        # Ramps of lengths do not need a moving arm.
         self.core = Controller(ROBOT, Settings(**{'target_duration': 0.0, **chosen}))
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)

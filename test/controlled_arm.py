@@ -42,7 +42,7 @@ class ControlledArm:
         self.estimator = self.start('estimator', checkpoint=checkpoint)
         self.controller = self.start_controller()
         self.targets = graph.publisher(JointState, 'target_joint_states')
-        self.says('no target')  # it knows posture and network
+        self.says('no target')  # it has received posture and network
 
     def start(self, name, **parameters):
         if name in self.processes:
@@ -56,7 +56,7 @@ class ControlledArm:
             first_duration=1.0,
             second_duration=0.5,
             rate_limit=RATE_LIMIT,
-            max_age=1.0,  # a loaded machine is not the cause of a stop
+            max_age=1.0,  # avoids stops because of a loaded machine
         )
 
     def kill(self, process):

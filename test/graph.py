@@ -27,9 +27,9 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_mess
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
-DEADLINE = 180.0  # [s] a wait may take on a loaded machine before the test fails
-PATIENCE = 600.0  # [s] a process may take to write its next line or to end
-LOOK = 0.05  # [s] until a condition is looked at again
+DEADLINE = 180.0  # [s] for a wait on a loaded machine, after which the test fails
+PATIENCE = 600.0  # [s] for a process to write its next line or to end
+LOOK = 0.05  # [s] between two checks of a condition
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
 
@@ -65,7 +65,7 @@ class Process:
         """Yield the lines of the output as they are written, until the command ends."""
         count, deadline = 0, time.monotonic() + PATIENCE
         while True:
-            has_ended = not self.alive()  # asked first: nothing is written after the end
+            has_ended = not self.alive()  # checked first, because nothing is written after the end
             lines = self.output.splitlines(keepends=True)
             if lines and not has_ended and not lines[-1].endswith('\n'):
                 lines.pop()  # the rest of this line is still to come

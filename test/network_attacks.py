@@ -78,7 +78,7 @@ def _shifted(quantity: int, scaled: float) -> Attack:
 
 ATTACKS: Mapping[str, Attack] = {
     **{f'weights × {k:g}': _weights(lambda w, k=k: k * w) for k in (1.5, 1.7, 2.0, -1.0)},
-    'noise of 100 %': _noise,  # of 50 % is at the limits, and passes now and then
+    'noise of 100 %': _noise,  # 50 % is close to the limits, and sometimes passes
     'lengths × 10': _lengths(10.0),
     'lengths × 2': _lengths(2.0),
     'two joints swapped': _last(0, _swap),
@@ -91,7 +91,7 @@ ATTACKS: Mapping[str, Attack] = {
     'standardisation × 2': _scaled_std(2.0, slice(None)),
 }
 SCALED = 10.0  # scaled units of a length of a metre
-#: what only the arm's own messages tell
+#: networks that only the arm's own messages reveal
 ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 
 
@@ -117,7 +117,7 @@ def _other_joint(mae: Mae) -> Mae:
     return replace(mae, std=std)
 
 
-#: networks that agree with themselves, but not with the arm
+#: consistent networks that do not agree with the arm
 CONSISTENT: Mapping[str, Attack] = {
     'all lengths × 0.5': _other_lengths(0.5),
     'all lengths × 1.5': _other_lengths(1.5),

@@ -29,7 +29,7 @@ LONGEST_WAIT = 20.0  # [s]
 TENSION_UNIT = 100.0  # [N] per unknown, so that all are of one size
 FLEXED, FLEXION = 'elbow_pitch', np.radians(-90.0)
 FORCED, FORCED_TO = 'shoulder_pitch', np.radians(30.0)
-#: a joint has to move this far in the body before its direction and size are judged
+#: motion of a joint of the body above which its direction and size are compared
 NOTICEABLE = 0.05  # [rad]
 
 
@@ -75,7 +75,7 @@ def rest_errors(
         arm = EmulatedArm(robot, 0, body)
         true.append(settle_arm(arm, command))
     theta, tension = (np.stack(part) for part in zip(*true, strict=True))
-    # As the emulated arms: from hanging, under the command of the posture.
+    # Start like the emulated arms: hanging, with the command of the posture.
     simulated.command = commands
     rest = simulated.settle()
     drift, tension_drift = np.zeros((2, len(commands)))

@@ -12,8 +12,8 @@ import yaml
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 
-# Written from the hand inwards, and with a fixed link and a turned frame on the way, so that
-# nothing works by the accident of order or of identity rotations.
+# Written from the hand inwards, with a fixed link and a rotated frame in between, so that
+# no test passes only because of the order or of identity rotations.
 URDF = """<?xml version="1.0"?>
 <robot name="other">
   <link name="base"/>
@@ -139,7 +139,7 @@ DRUM = {
     'wrap': 'cylinder', 'link': 'upper', 'axis': [0.1, 2.0, 0.0], 'xyz': [0.0, 0.0, -0.3],
     'radius': 0.03, 'side': [-0.2, 0.0, -0.3],
 }  # fmt: skip
-#: where the wire stays on its side of the drum, and where it comes to the end of that
+#: ends with which the tendon stays on its side of the drum, and slips over its end
 DRUM_ENDS = {'stays': (0.035, 0.0, -0.008), 'jumps': (0.035, 0.0, 0.0)}
 
 

@@ -31,7 +31,7 @@ def test_commands_that_change_too_fast_are_found():
     (violation,) = steps(jump).too_fast
     assert 'muscle 1 by -11.0 mm' in violation
     assert steps(jump).largest_in == pytest.approx(0.011)
-    # Of a message that was missed the change is known, the tick's is not.
+    # After a missed message the change is known, but not that of a single tick.
     assert steps(jump, NUMBER + (NUMBER >= 20)).largest_in == pytest.approx(0.001)
     assert steps(np.where(TIME[:, None] > 0.2, np.nan, ramp)).too_fast
 

@@ -19,7 +19,7 @@ def test_every_bench_is_listed_with_what_it_measures(capsys):
 
 
 def test_every_bench_is_explained():
-    # One that lost its main would else leave the list without a word.
+    # Otherwise a bench without `main` would silently be missing.
     text = (Path(__file__).parents[1] / 'bench' / 'README.md').read_text(encoding='utf-8')
     assert {line.split('`')[1] for line in text.splitlines() if line[:3] == '| `'} == set(benches())
 

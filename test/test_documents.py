@@ -142,7 +142,7 @@ def test_no_two_commands_of_the_documents_write_to_the_same_place():
     makers = {}
     for page in PAGES:
         for command in commands(ROOT / page):
-            if command.line.startswith('[ -d '):  # it makes nothing where there is something
+            if command.line.startswith('[ -d '):  # it keeps an existing file
                 continue
             for made in MAKES.findall(command.line):
                 makers.setdefault(made.rstrip('/'), []).append((page, command.line))

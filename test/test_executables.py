@@ -64,7 +64,7 @@ def test_there_is_an_executable_for_every_node_and_tool():
 
 @pytest.mark.parametrize('name', [*NODES, *TOOLS])
 def test_help_loads_nothing_that_takes_long(name):
-    # All of them together take 0.1 to 0.4 s of CPU. A terminal may not show every letter.
+    # Each takes 0.1 to 0.4 s of CPU time. Some terminals cannot show all letters.
     heavy = "{'numba', 'torch', 'scipy', 'matplotlib'} & set(sys.modules)"
     done = run(
         name,
@@ -94,7 +94,7 @@ def test_a_signal_ends_a_tool_without_a_traceback(name, number, tmp_path):
     done = signalled(name, number, MOMENTS[number == signal.SIGTERM], *arguments)
     output = done.stdout + done.stderr
     assert not any(word in output for word in ('Traceback', 'Exception ignored')), output
-    # Some are done before, and some have nothing to do.
+    # Some have ended before, and some have nothing to do.
     assert done.returncode in (0, 1, 130), output
 
 
@@ -147,7 +147,7 @@ def test_what_a_terminal_cannot_show_is_replaced(encoding):
     done = run('check_robot', 'arm26', PYTHONIOENCODING=f'{encoding}:strict')
     assert done.returncode == 0, done.stderr
     assert 'arm26: sound' in done.stdout
-    assert ('?' in done.stdout) == (encoding == 'ascii')  # the other one has all of these letters
+    assert ('?' in done.stdout) == (encoding == 'ascii')  # UTF-8 has all of these letters
 
 
 def test_the_experiments_are_those_that_the_help_names():

@@ -59,7 +59,7 @@ class Line(NamedTuple):
 class LineFit:
     """Fits y = a x + b, without unknowns of single samples."""
 
-    usual = np.zeros(0), np.full(2, 1e-6)  # a prior that says next to nothing
+    usual = np.zeros(0), np.full(2, 1e-6)  # a very weak prior
 
     def __init__(self, x, y):
         self.y, self.jacobian = y[:, None], np.stack([x, np.ones_like(x)], axis=1)

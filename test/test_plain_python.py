@@ -37,7 +37,7 @@ def extra_of(file):
     return 'experiments' if 'mujoco' in imported([file]) else EXTRAS.get(file.parent.name, '')
 
 
-distributions = cache(packages_distributions)  # a second each time
+distributions = cache(packages_distributions)  # takes a second per call
 
 
 def distribution(module):

@@ -104,7 +104,7 @@ def test_what_isolated_muscles_say_does_not_count(unknown):
 
 def test_measured_joints_are_matched_by_name_and_foreign_ones_ignored():
     message = JointState(name=['b', 'x', 'a'], position=[2.0, math.nan, 1.0])
-    message.velocity, message.effort = [math.nan] * 3, [math.nan] * 3  # measured by nobody
+    message.velocity, message.effort = [math.nan] * 3, [math.nan] * 3  # not measured
     assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
 
 
@@ -263,7 +263,7 @@ def test_a_pose_may_say_its_position_only_and_frames_must_be_right():
     with pytest.raises(MessageError, match='wrong frame'):
         read_pose(message, 'hand', position_only=True)
     turn = message.pose.orientation
-    turn.z = turn.w = 1.005 * math.sqrt(0.5)  # nearly a unit
+    turn.z = turn.w = 1.005 * math.sqrt(0.5)  # nearly of unit length
     np.testing.assert_allclose(
         read_pose(message, 'base').rotation @ [1, 0, 0], [0, 1, 0], atol=1e-9
     )

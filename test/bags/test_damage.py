@@ -77,7 +77,7 @@ def test_damage_is_never_read_without_a_word(recording, content, tmp_path):
             continue
         if all(file.has_checksums for file in bag.files):
             assert messages == (expected[: len(messages)] if bag.unfinished else expected), trial
-        else:  # what nothing protects may be changed, but not lost
+        else:  # without checksums, data may be changed but not lost
             assert bag.unfinished or len(messages) == len(expected), trial
 
 

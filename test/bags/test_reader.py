@@ -124,7 +124,7 @@ def test_only_files_of_the_directory_itself_are_read(bag, tmp_path):
 def test_a_bag_that_was_split_is_read_in_order(tmp_path, content):
     bag = tmp_path / 'bag'
     samples.write_ours(bag, content)
-    # Times of the two files overlap, as those of a recorder that splits while messages wait.
+    # The times of the two files overlap, as if the recorder had split while messages waited.
     samples.write_mcap(bag / 'a.mcap', content[:20] + content[30:40])
     samples.write_mcap(bag / 'b.mcap', content[20:30] + content[40:])
     change(bag, relative_file_paths=['b.mcap', 'a.mcap'])
@@ -149,7 +149,7 @@ def test_messages_are_ordered_by_time_and_equal_times_as_in_the_file(
     samples.write_mcap(tmp_path / 'a.mcap', disordered)
     in_order = sorted(disordered, key=lambda sample: sample.log_time)
     assert read(tmp_path / 'a.mcap') == expected(in_order)
-    # Bounded memory comes before order.
+    # The order is not exact, because memory is bounded.
     monkeypatch.setattr(reader, 'MOST_HELD', 1000)
     assert sorted(read(tmp_path / 'a.mcap')) == sorted(expected(disordered))
 

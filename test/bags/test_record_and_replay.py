@@ -58,7 +58,7 @@ def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
         assert 'Traceback' not in output
     first = messages(tmp_path / 'first', '/left_arm')
     second = messages(tmp_path / 'second', graph.namespace)
-    # On their way messages are padded to whole words, once and for all.
+    # DDS pads messages to whole words.
     assert second == [(topic, data + bytes(-len(data) % 4)) for topic, data in first]
     assert messages(tmp_path / 'third', graph.namespace) == second
 
@@ -106,7 +106,7 @@ def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
     assert match, output
     bag = Bag.open(tmp_path / 'bag')
     assert bag.start == bag.end == 1000 * 10**9
-    # A busy recorder may hear the clock late, and miss some of what is published.
+    # A busy recorder may receive the clock late, and miss some messages.
     assert 2 <= bag.message_count <= 31 - int(match[1]), output
 
 

@@ -113,7 +113,7 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
         rows = [arm.length[i // 2], arm.tension[i // 2].copy(), np.full(count, 30.0)]
         rows[1][lost] = np.nan
         arm.content[i] = arm.content[i]._replace(data=array(rows))
-    arm.add('/isolated_muscles', STRING, 0.501, string(first))  # as latched: heard late
+    arm.add('/isolated_muscles', STRING, 0.501, string(first))  # a latched message may arrive late
     arm.add('/isolated_muscles', STRING, 0.999, string(second))
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
@@ -122,7 +122,7 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
     assert (pairs.tension[:100, 0] == 0.0).all() and (pairs.tension[100:, 1] == 0.0).all()
     assert_array_equal(pairs.tension[:100, 1:], arm.tension[:100, 1:])
     swapped = pairs._replace(length=pairs.length[:, [1, 0, *range(2, count)]])
-    assert misplaced_muscles(swapped, robot) == []  # that is not known
+    assert misplaced_muscles(swapped, robot) == []  # too little data
 
 
 def test_who_is_isolated_is_not_known_where_nothing_says_it(arm, robot, tmp_path):
@@ -138,7 +138,7 @@ def test_some_joint_sensors_will_do(robot, tmp_path):
     pairs = streams(arm, robot, tmp_path).pairs()
     assert_array_equal(pairs.theta[:, 1:], arm.theta[:, 1:])
     assert np.isnan(pairs.theta[:, 0]).all()
-    assert misplaced_muscles(pairs, robot) == []  # that is not known
+    assert misplaced_muscles(pairs, robot) == []  # too little data
 
 
 def test_a_message_that_was_sent_before_the_last_one_is_left_out(arm, robot, tmp_path):

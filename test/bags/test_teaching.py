@@ -32,8 +32,8 @@ def test_the_recorded_arm_was_moved_by_hand_and_repeated_what_it_was_shown():
     spans = [point.time_from_start for point in trajectory.points]
     after = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     desired = np.array([point.positions for point in trajectory.points])
-    assert np.ptp(desired, axis=0).max() > 0.3  # the hand moved it
-    # By the joint sensors: the network knows the geometric model only.
+    assert np.ptp(desired, axis=0).max() > 0.3  # a hand moved the arm
+    # Joint sensors are the reference, because the network knows the geometric model only.
     shown = truly(pushed[0] - 1.0), truly(pushed[-1] + 1.0)
     begun, ended = truly(sent + after[0]), truly(sent + after[-1])
     moved = np.linalg.norm(shown[1] - shown[0])

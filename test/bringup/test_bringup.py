@@ -40,7 +40,7 @@ def environment(tmp_path_factory, trained_file):
 
 def bringup(environment, *arguments):
     command = [str(REPOSITORY / 'bringup.sh'), *arguments]
-    if 'arm26' in arguments:  # another robot's network is trained here
+    if 'arm26' in arguments:  # the network of another robot has to be trained
         command += ['--checkpoint', environment['TRAINED']]
     return Process('bringup.sh', command, env=environment, start_new_session=True)
 
@@ -105,7 +105,7 @@ def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(envi
     _, output = run.ended()
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
     lines = statuses(output)
-    assert lines, output  # on a busy machine the sensors are heard late
+    assert lines, output  # on a busy machine, sensor data arrive late
     # Seeds 0 to 4: 0.08 to 0.30 rad. The middle of the joint range would be 0.58 rad off.
     assert np.median([float(line['error']) for line in lines]) < 0.45
     assert all(0.0 < float(line['a']) < 2.0 for line in lines)
@@ -146,7 +146,7 @@ def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(env
         assert left_behind(right) == ''
         # An emulated arm stays on this machine.
         assert set(reaches(left)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'}
-        # Parameters of a file and of the command line win.
+        # Parameters of a file and of the command line take precedence.
         request = GetParameters.Request(names=['max_age', 'hold_time', 'explore'])
         values = graph.call(GetParameters, '/left_arm/controller/get_parameters', request).values
         assert (values[0].double_value, values[1].double_value) == (3.0, 4.0)
@@ -290,7 +290,7 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned(environment):
     assert 'the driver keeps its contract' in transcript + output
     assert status == 130 and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
-    assert kept.is_dir()  # for the next time
+    assert kept.is_dir()  # it is kept for the next run
 
 
 def test_a_namespace_that_is_in_use_is_refused_by_name(environment):

@@ -83,7 +83,7 @@ def test_second_runs_after_first_and_reads_the_tension_once():
     done = bench.step(200)[-1].value
     wanted = ROBOT.muscle_lengths(REST, bench.tension) - 50.0 / ROBOT.stiffness
     np.testing.assert_allclose(done, wanted, atol=1e-9)
-    # A new network solves the held goal anew, with the tension that was read.
+    # The held target is solved again for a new network, with the measured tension.
     bench.tension = np.full(ROBOT.muscle_count, 150.0)
     bench.core.use(shifted())
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted + 0.01, atol=1e-9)
@@ -227,7 +227,7 @@ def test_exploration_started_again_continues_its_stream_of_postures():
     observed = []
     for _ in range(3):
         bench.core.explore(True)
-        bench.core.explore(True)  # asking twice starts nothing anew
+        bench.core.explore(True)  # a second request does not restart the exploration
         bench.step(5)
         observed.append(bench.core.target_state.theta)
         bench.core.explore(False)
@@ -311,7 +311,7 @@ def test_a_new_network_keeps_the_correction_of_rest_feedback():
     bench = Bench(first_duration=0.5)
     bench.target(REST)
     bench.step(50)
-    bench.theta = REST + 0.05  # where friction leaves it
+    bench.theta = REST + 0.05  # friction keeps the arm off its target
     bench.step(1000)
     correction = bench.core.activities.follower.feedback.correction.copy()
     assert np.abs(correction).max() > 0.02
@@ -326,7 +326,7 @@ def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
     bench.target(REST)
     bench.step(200)
-    if chosen['method'] == 'stiffness':  # it plans them higher than an arm at T_bias has them
+    if chosen['method'] == 'stiffness':  # its tensions are above T_bias
         bench.tension = bench.core.activities.follower.tension
     still = bench.step(200)[-1].value
     bench.theta = REST + 0.05

@@ -49,7 +49,7 @@ def test_every_explored_posture_can_be_held_and_lies_within_the_joint_limits(pre
 def test_joints_are_sent_to_their_limits_at_the_given_rate_and_pressed_there():
     asked = steps(2, 300, 'default')[2::3]
     way = np.array([(s.theta == ROBOT.upper) * 1.0 - (s.theta == ROBOT.lower) for s in asked])
-    # Fewer of those at limits can be held; there are 200 targets of single joints.
+    # Fewer postures at joint limits can be held; there are 200 targets of single joints.
     assert 0.12 < np.abs(way).mean() < 0.38
     assert {*np.unique(way)} == {-1.0, 0.0, 1.0}
     mean = 0.5 * (BIAS + LIMIT)
@@ -57,7 +57,7 @@ def test_joints_are_sent_to_their_limits_at_the_given_rate_and_pressed_there():
         if np.abs(side).sum() == 1.0:
             jacobian = ROBOT.routes.muscle_jacobian(step.theta)
             assert ((step.tension >= BIAS) & (step.tension <= LIMIT)).all()
-            assert side @ (jacobian.T @ (mean - step.tension)) > 0.0  # more than evenly pulled
+            assert side @ (jacobian.T @ (mean - step.tension)) > 0.0  # above the mean
     never = steps(2, 300)
     assert not any(((s.theta == ROBOT.upper) | (s.theta == ROBOT.lower)).any() for s in never)
 

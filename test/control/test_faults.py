@@ -60,7 +60,7 @@ class Loop:
         with suppress(MessageError):
             states = read_muscle_states(message, ROBOT.muscle_count)
             self.estimator.joints(reading.theta, self.now)
-            # Each node reads the message by itself.
+            # Each node has its own stream.
             for take in (self.control, self.estimate):
                 with suppress(MessageError):
                     take(states)
@@ -99,7 +99,7 @@ def loop(settled):
     return copy.deepcopy(settled)
 
 
-#: what may stop the arm under a fault, '' for going on
+#: start of the stop cause under each fault; '': the arm continues
 PROMISES = {
     'drop:0.5': '',
     'drop:1': 'older than',
@@ -112,7 +112,7 @@ PROMISES = {
     f'bias:length:{MUSCLE}:0.3': 'muscle_states',
     f'bias:tension:{MUSCLE}:400': 'tension above',
     f'bias:temperature:{MUSCLE}:90': 'overheated',
-    f'overheat:{MUSCLE}': '',  # it pulls with T_bias only
+    f'overheat:{MUSCLE}': '',  # the module then exerts T_bias only
     f'overheat:{MUSCLE}:120': 'overheated',
     f'freeze:{MUSCLE}': None,
     'freeze': None,
@@ -122,7 +122,7 @@ PROMISES = {
     f'stuck_motor:{MUSCLE}': None,
     f'slack:{MUSCLE}': None,
     f'winch_speed:{MUSCLE}:0.009': None,
-    f'unzeroed:{MUSCLE}:0.1': 'length',  # beyond what joints allow, or a jump
+    f'unzeroed:{MUSCLE}:0.1': 'length',  # implausible lengths, or a jump
 }
 
 

@@ -48,7 +48,7 @@ NOT_THERE = next(theta for theta in POSTURES if not held(theta))
 @pytest.mark.parametrize('method', METHODS)
 def test_no_method_commands_tension_of_an_isolated_muscle(method, duration):
     bench = Bench(method=method, first_duration=1.0, second_duration=0.5, target_duration=duration)
-    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # its sensor says so, too
+    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # also of the isolated muscle
     bench.isolate([LOST])
     if method != 'float':
         bench.theta = THERE
@@ -91,7 +91,7 @@ def test_the_sensors_of_an_isolated_muscle_do_not_move_the_arm():
 @pytest.mark.parametrize(
     ('temperature', 'tension', 'cause'),
     [
-        (150.0, 60.0, f'overheated: {ROBOT.muscles[LOST]}'),  # its motor burns all the same
+        (150.0, 60.0, f'overheated: {ROBOT.muscles[LOST]}'),  # an isolated motor can still overheat
         (500.0, 60.0, ''),
         (np.nan, 60.0, ''),
         (90.0, 450.0, ''),  # a tension that it cannot have warms it no further
@@ -119,7 +119,7 @@ def test_the_arm_stops_when_all_remaining_muscles_are_overheated():
     bench.target(REST)
     bench.step(10)
     bench.temperature = np.where(USED, bench.core.settings.temperature_limit + 10.0, 30.0)
-    bench.step(500)  # a temperature that jumps is not believed at once
+    bench.step(500)  # a jump of temperature is not accepted at once
     assert bench.condition.startswith('overheated')
 
 
@@ -270,7 +270,7 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
     bench = Verified()
     bench.step(50)
     length, tension = rest_readings(ROBOT, REST)
-    for _ in range(50):  # it is gone
+    for _ in range(50):  # messages have stopped
         bench.now += 0.01
         bench.core.muscles(np.array([length, tension, np.full(6, 30.0)]), bench.now)
         bench.core.step(bench.now)
@@ -313,7 +313,7 @@ def test_a_requested_stop_outlasts_a_verification(first):
 def test_the_end_of_an_anomaly_without_a_suspect_does_not_end_the_stop():
     bench = Bench()
     bench.target(REST)
-    bench.isolate([LOST])  # long before
+    bench.isolate([LOST])  # isolated long before
     bench.step(150)
     bench.core.anomaly(True)
     lengths = bench.step(300)[-1].value
@@ -327,7 +327,7 @@ def test_exploration_resumes_after_the_suspect_was_verified():
     bench = Bench()
     bench.core.explore(True)
     bench.step(20)
-    bench.core.anomaly(True)  # whichever comes first
+    bench.core.anomaly(True)  # in either order
     bench.isolate([0])
     bench.step(300)
     bench.isolate([])  # it was healthy

@@ -49,7 +49,7 @@ def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_h
         demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
         tense = pull > ROBOT.tension.limit
         assert (demanded <= np.minimum(limit, ROBOT.tension.limit) + 1e-6)[tense].all()
-        # Paying out faster is what the tension limit may do, and no further than the muscle is.
+        # The tension limit may pay out faster, but not beyond the measured length.
         assert ((sent - before)[~tense] <= rate * DT + 1e-12).all()
         assert (sent <= np.maximum(before + rate * DT, length) + 1e-12).all()
         before = sent

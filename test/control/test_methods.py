@@ -47,7 +47,7 @@ def test_with_an_exact_body_image_the_arm_settles_at_the_target_with_the_least_t
         arm.command_length(solution.length)
         arm.step(0.02)
     assert np.linalg.norm(arm.theta - theta) < 0.01
-    # The wire's stretch grows with its length, which lowers its torque by up to half a percent.
+    # The tendon's stretch grows with its length, which lowers its torque by up to 0.5 %.
     assert np.linalg.norm(solution.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
     assert not solution.missing_torque.any()
 
@@ -116,7 +116,7 @@ def test_the_methods_agree_with_an_implementation_by_autograd(trained, seed):
     ):
         mae = trained[preset]
         plain = theirs(robot, from_mae(mae), theta, torque, tension)
-        # Single precision there; a wrong term moves lengths by millimetres.
+        # The network has single precision; a wrong term would change lengths by millimetres.
         solution = ours(robot, mae, theta, torque, tension)
         np.testing.assert_allclose(solution.length, plain, atol=1e-5)
 
@@ -128,5 +128,5 @@ def test_with_a_network_proposed_settles_nearer_than_first_and_near_the_least_te
     assert error < 0.03
     assert error < 0.2 * table['first'].mean(axis=0)[0]
     assert tension == pytest.approx(bound, rel=0.02)
-    # The true body's own lengths for the least tension leave nothing.
+    # With the true body's lengths for the least tension, there is no error.
     assert table['bound: QP on the true body'][:, 0].max() < 0.01

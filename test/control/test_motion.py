@@ -26,7 +26,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 
 STILL = np.zeros((1, 2))
-PEAK_SPEED = 1.875  # of a quintic, times its mean speed
+PEAK_SPEED = 1.875  # peak speed of a quintic over its mean speed
 
 
 def points(goal, duration=1.0):
@@ -280,7 +280,7 @@ def test_a_desired_stiffness_is_kept_during_a_trajectory_and_at_its_end(bench):
 
 
 def test_sudden_changes_of_planned_tension_slow_a_trajectory_little():
-    # Near postures that are hard to hold tensions change suddenly, however slowly the arm moves.
+    # Near the limits of holdability, tensions change suddenly even in slow motion.
     mae, chosen, slowed = Bench().mae, Settings(), []
     postures = ROBOT.random_postures(60, np.random.default_rng(0))
     bias = np.tile(ROBOT.tension.bias, (100, 1))
@@ -290,7 +290,7 @@ def test_sudden_changes_of_planned_tension_slow_a_trajectory_little():
         way = np.abs(np.diff(mae.lengths(theta, bias), axis=0)).sum(axis=0).max()
         fastest = PEAK_SPEED * way / (SHARE * chosen.rate_limit)
         slowed.append(slowness(ROBOT, mae, trajectory, chosen) / max(1.0, fastest / 0.5))
-    # A wire need not be fastest when the joints are, as `fastest` has it.
+    # The speed of a tendon may peak at another time than that of the joints.
     assert 0.9 < min(slowed) <= max(slowed) < 1.5
 
 
@@ -316,7 +316,7 @@ def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
 
 
 def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch):
-    # It starts in motion: slowed for slow winches it takes another way, beyond the joint limits.
+    # It starts in motion; slowed for slow winches, its path would leave the joint limits.
     bench = Bench(rate_limit=0.05)
     start = Setpoint(np.array([0.5, -0.5]), np.array([-1.4, 1.8]), np.zeros(2))
     Trajectory.through(start, points((-0.8, -1.1), 0.3), 0.0).check(ROBOT)
@@ -366,7 +366,7 @@ def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(be
 def test_a_hand_pose_that_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
     strong, half = bench.mae.muscle_jacobian, 0.5 * np.abs(OTHER - REST)
 
-    def weak(theta, tension):  # beyond half of the way
+    def weak(theta, tension):  # in the second half of the motion
         return strong(theta, tension) * (np.abs(theta - REST) < half).all()
 
     monkeypatch.setattr(bench.mae, 'muscle_jacobian', weak, raising=False)
@@ -392,7 +392,7 @@ def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
         bench.core.activities.follower.desired.theta
     ).translation
     assert np.linalg.norm(at - wanted) < 0.006
-    moved(bench, 150)  # no other comes
+    moved(bench, 150)  # no other twist arrives
     assert not bench.core.activities.follower.is_moving
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(

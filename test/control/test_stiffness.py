@@ -35,7 +35,7 @@ def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
     jacobian = robot.routes.muscle_jacobian
     k = robot.muscle_stiffness(THETA, tension)
     true = joint_stiffness(jacobian(THETA), muscle_hessian(jacobian, THETA), k, tension)
-    # A hundredth: the cubic through the elongation, the wire's stretch, the wide step of the slope.
+    # 1 %: the cubic approximation of the elongation, tendon stretch, and the step of the slope.
     np.testing.assert_allclose(model.joint_stiffness(tension), true, atol=0.01 * np.trace(true))
     np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
 
@@ -93,11 +93,11 @@ def test_torque_beyond_the_muscles_leaves_no_range_and_is_reported(robot, mae):
 def test_a_push_turns_the_nominal_arm_by_the_predicted_ratio(robot, mae):
     measured, predicted = stiffness_ratios(robot, mae, 3).T
     np.testing.assert_allclose(measured / predicted, 1.0, atol=0.05)
-    assert predicted.max() > 1.2  # and not because both are one
+    assert predicted.max() > 1.2  # the ratio is not trivially one
 
 
 def test_a_push_turns_bodies_with_friction_by_about_the_predicted_ratio(robot, mae):
-    # A push that is large against friction; single arms scatter by 0.1 about the prediction.
+    # The push is large compared with friction; single arms differ by 0.1 from the prediction.
     arms = [EmulatedArm(robot, seed) for seed in range(4)]
     ratios = [stiffness_ratios(robot, mae, 2, arm, push=3.0)[1] for arm in arms]
     measured, predicted = np.mean(ratios, axis=0)

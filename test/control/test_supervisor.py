@@ -168,14 +168,14 @@ class Arm(RuleBasedStateMachine):
     def check(self):
         supervisor = self.supervisor
         started = supervisor.is_running and self.before is not StopState.RUNNING
-        # A stop ends only where it may, and a latched one by a reset or a verification.
+        # A stop ends only by legal transitions, and a latched one by a reset or a verification.
         assert not started or self.may_start
         if supervisor.state is StopState.RESUMING:
             assert all(c.clears is Clears.VERIFICATION for c in self.latched_by)
         # Every stop has one cause, with a remedy; a running arm has none.
         assert (supervisor.condition is None) == supervisor.is_running
         assert supervisor.is_running or supervisor.condition.cause.remedy
-        # A latched arm does not explore or move when it goes on, unless it is told to again.
+        # After a latched stop, the arm neither explores nor moves without a new request.
         assert not (supervisor.is_latched and supervisor.activity is Activity.MOVING)
         assert not (supervisor.is_latched and supervisor.explores)
 

@@ -97,7 +97,7 @@ def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(ro
     assert cause in str(bench.core.reset(bench.now))
     steps = np.diff(values([before, *sent]), axis=0)
     assert steps.min() >= -TICK - 1e-9
-    # Only a muscle that pulls too hard is paid out faster.
+    # Only a muscle above its tension limit is paid out faster.
     assert 'tension above' in cause or steps.max() <= TICK + 1e-9
     bench.step(500)
     assert bench.core.reset(bench.now) is None
@@ -190,7 +190,7 @@ def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_t
     assert bench.core.reset(bench.now) is None
 
 
-# -- late for a moment, or gone -------------------------------------------------------------------
+# -- late messages, and no messages ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize('what', ['muscles', 'estimate'])
@@ -199,7 +199,7 @@ def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
     bench.core.explore(True)
     bench.step(50)
     bench.blind = {what}
-    held = bench.step(60)  # late after 0.2 s, gone after 0.7 s
+    held = bench.step(60)  # stale after 0.2 s, released after 0.7 s
     assert 'older' in bench.condition
     assert bench.report().level == 'warn'
     assert len({tuple(command.value) for command in held[25:]}) == 1
@@ -243,7 +243,7 @@ def run(pace, gap=0.0, at=150, count=250):
     bench.target(OTHER)
     now, time, sent = 100.0, 5.0, []
     for k in range(count):
-        for _ in range(round(gap / DT) if k == at else 0):  # nothing but the watch steps
+        for _ in range(round(gap / DT) if k == at else 0):  # only the watchdog steps
             now, time = now + DT, time + pace * DT
             sent.append(bench.core.step(now, time))
         now, time = now + DT / pace, time + DT

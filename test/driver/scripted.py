@@ -24,12 +24,12 @@ class Driver:
 
     def __init__(self, robot: Robot, seed: int = 0) -> None:
         self.robot, self.arm = robot, EmulatedArm(robot, seed)
-        # Rows (3, M) as published, targets (M,) as taken, period of messages, commands on the way.
+        # Faults: functions of published rows (3, M) and of received targets (M,), and delays.
         self.publish: Callable = lambda rows: rows
         self.take: Callable = lambda target: target
         self.names = robot.joints
         self.angles: Callable = lambda theta: theta  # (D,) as published
-        # Turns rows (3, M) at a time into messages of ros2_control, which `motors` reads.
+        # Converts rows (3, M) at a time into messages of ros2_control, which `motors` reads.
         self.message: Callable = lambda rows, _: array(rows)
         self.motors: MotorInterface | None = None
         self.period, self.late = PERIOD, 0.0

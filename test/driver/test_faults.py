@@ -384,7 +384,7 @@ def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max[0], clip=True, gain=1.0):
     return follow
 
 
-def spring(target, rows):  # no max(0, …): it lets go where l_target is beyond l
+def spring(target, rows):  # without max(0, …): the tension falls below T_bias if l_target > l
     return np.maximum(0.0, BIAS + K * (rows[0] - target))
 
 
@@ -433,7 +433,7 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
     driver = settled()
     home = driver.arm.sense().length
 
-    def mirrored(rows):  # at the length from which it is wound in, so that the law seems to hold
+    def mirrored(rows):  # mirrored at the initial length, so that the law seems to hold
         return np.stack([2.0 * home - rows[0], *rows[1:]])
 
     driver.publish = mirrored
@@ -445,7 +445,7 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
 def stiff_and_strong(stiffness):
     """Return the arm with K [N/m] and muscles of some kilonewtons."""
     tension = TensionRange(*np.outer([100.0, 2000.0, 3000.0], np.ones(M)))
-    units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))  # stiffer than K, or it hums
+    units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))  # stiffer than K, or the module oscillates
     elastic = SeriesElastic(*units)
     parts = {'tension': tension, 'stiffness': np.full(M, stiffness), 'series_elastic': elastic}
     return Robot(replace(ROBOT.description, **parts))
@@ -474,7 +474,7 @@ def test_a_fault_of_a_stiff_robot_is_found(wrong):
 
 
 def test_oscillation_of_a_stiff_robot_is_reported():
-    verdict = wound_in_stiff(7.0e5)  # with each of 8 seeds by 1.27 times what is tolerated, or more
+    verdict = wound_in_stiff(7.0e5)  # 8 seeds: at least 1.27 times the tolerance
     assert 'N (standard deviation) while it is held' in str(verdict)
     assert 'latency' not in verdict.wrong, str(verdict)
 

@@ -43,7 +43,7 @@ def drive(arm, length, seconds):
 def test_tension_from_elongation_inverts_the_elongation(tension, force, rate, stretch):
     elastic = SeriesElastic(np.array([force]), np.array([rate]), np.array([stretch]))
     elongation = elastic.elongation(np.array([1.0]), np.array([tension]))[0]
-    if rate * elongation < 6.0:  # the cut-off of the compiled inverse
+    if rate * elongation < 6.0:  # the compiled inverse is limited to this range
         solved = tension_from_elongation(elongation, force, rate, stretch)
         assert solved == pytest.approx(tension, rel=1e-6, abs=1e-6)
 
@@ -155,7 +155,7 @@ def test_temperatures_settle_at_the_steady_state_of_the_thermal_model(robot):
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
     muscle, module = arm._muscle, arm._module_constants
     assert np.ptp(module.loss) > 0.1 * module.loss.mean()  # no two modules are the same
-    for _ in range(20):  # the housing's time constant is minutes: start it near its end
+    for _ in range(20):  # skip most of the housing's time constant of minutes
         muscle.housing[:] = modules.AMBIENT + module.housing_resistance * (
             module.loss * muscle.tension**2
         )

@@ -142,7 +142,7 @@ def test_ending_slack_causes_no_peak_of_tension(robot, reality):
             arm.command_length(command)
             arm.step(0.001)
             most = max(most, arm.tension[MUSCLE])
-    assert most < 200.0  # 2996 N, had it become short at once
+    assert most < 200.0  # a sudden change would cause 2996 N
     arm.set_faults([f'slack:{name}'])
     arm.reset()
     assert arm.tension[MUSCLE] == pytest.approx(robot.tension.bias[MUSCLE])

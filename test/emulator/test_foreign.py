@@ -68,7 +68,7 @@ def test_a_foreign_body_without_effects_is_the_described_body(robot, coupled, im
             np.testing.assert_allclose(jacobian, slopes, atol=1e-6)
         tension = np.broadcast_to(model.tension.limit, lengths.shape)
         off = true.muscle_lengths(theta, tension) - model.muscle_lengths(theta, tension)
-        # Its wire stretches as it does at θ = 0, wherever the arm is.
+        # Its tendon stretch is that at θ = 0 in all postures.
         stretch = model.series_elastic.wire_stretch * tension * (lengths - true.length_at_zero)
         np.testing.assert_allclose(off, stretch, atol=2e-5)
 
@@ -95,11 +95,11 @@ def test_a_prismatic_joint_coupled_to_a_revolute_one_does_not_lag(tmp_path):
 @pytest.mark.parametrize('name', EFFECTS)
 def test_each_effect_alone_changes_the_motion(robot, name, monkeypatch):
     sprung = JointElasticity(np.eye(2), np.zeros(2), np.zeros(2))
-    robot = robot.with_elasticity(sprung)  # joints without springs cannot show theirs
+    robot = robot.with_elasticity(sprung)  # joint springs are required to see their errors
     monkeypatch.setattr(foreign, 'SLIP_TIME', 0.01)
     monkeypatch.setattr(foreign, 'HOUR', 0.1)
     size = EFFECTS[name] if name != 'dropouts' else 0.5
-    # Stiction is of friction, late stretch of a wire, and a heavy creep shows at once.
+    # Each effect requires another: stiction needs friction, late stretch and creep need stretch.
     others = {'stiction': {'guide_friction': 0.25}, 'jitter': {'delay': 0.0125}}.get(name, {})
     bare = replace(NONE, **others)
     lives = [drive(ForeignArm(robot, 1, e)) for e in (bare, bare, replace(bare, **{name: size}))]
@@ -137,7 +137,7 @@ def test_creep_is_the_same_in_every_decade_of_time(robot):
         arm.step(seconds)
         crept.append(arm._memory.slow[:, :4].sum(axis=1) / arm._memory.elongation)
     decades = np.diff(crept, axis=0) / [[1.0], [np.log10(5.0)]]
-    # Of 2/3 to 4/3 of 4 % of the elongation, and half of that for so few elements.
+    # 2/3 to 4/3 of 4 % of the elongation; half of that with these few elements.
     assert np.all((decades > 0.5 * 0.04 * 2.0 / 3.0) & (decades < 1.5 * 0.04 * 4.0 / 3.0))
 
 
@@ -146,7 +146,7 @@ def test_tendon_friction_grows_with_the_bends_of_the_tendon(robot):
     bends, losses = [], []
     for theta in (robot.lower, robot.upper):
         arm.reset(theta)
-        for _ in range(20):  # winding in, so that every wire slides
+        for _ in range(20):  # wind in, so that every tendon slides
             arm.command_tension(np.full(robot.muscle_count, 150.0))
             arm.step(0.01)
         muscle = arm._muscle
@@ -169,10 +169,10 @@ def test_kinks_lengthen_some_routes_by_about_their_size():
     longer = kinked - straight
     assert longer.min() > -1e-9
     most = longer.max(axis=0)
-    # A route of several runs has several; some cannot be bent so much.
+    # A route with several segments has several of them; some cannot be bent as much.
     assert np.median(most) > 0.004
     assert np.all(most < 0.035)
-    assert np.mean(longer < 1e-6) > 0.3  # a wire that is free of them is straight
+    assert np.mean(longer < 1e-6) > 0.3  # a tendon that does not touch them is straight
 
 
 def test_joint_friction_follows_the_load_of_each_joint():
@@ -224,7 +224,7 @@ def test_a_users_mjcf_file_stands_at_the_root_of_the_robot(tmp_path, old, new, b
     arm.step(0.001)
     applied = arm._data.qfrc_applied[arm._order]
     due = robot.kinematics.end_effector_jacobian(theta).T @ push
-    np.testing.assert_allclose(applied[:2], due[:2], atol=0.01)  # beside what is coupled
+    np.testing.assert_allclose(applied[:2], due[:2], atol=0.01)  # besides the coupled joint
 
 
 def test_actuator_settings_of_a_users_mjcf_file_do_not_act_on_the_modules(imported, tmp_path):
@@ -337,7 +337,7 @@ def test_an_unknown_reality_is_refused_with_the_legal_ones(robot):
         make_arm(robot, 0, 'dream')
 
 
-#: an elbow with two wires and, in its places, what may go wrong
+#: an elbow with two tendons, with places for faults
 ELBOW = """<mujoco>{options}<worldbody>
   <site name="o" pos=".05 0 0"/><site name="o2" pos="-.05 0 0"/>
   <body name="mount" pos="0 0 1">{held}<geom name="g1" size=".02"/>
@@ -359,7 +359,7 @@ HINGE = '<joint name="held" axis="1 0 0" range="-60 60"/>'
         {'options': '<compiler fusestatic="true"/>'},
         {'options': '<compiler fusestatic="true"/>', 'hand': ''},
         {'hand': ''},
-        {'held': HINGE},  # beside a body that stands, once the joint is left out
+        {'held': HINGE},  # the body is fixed if the joint is omitted
     ],
 )
 def test_an_mjcf_file_has_the_lengths_of_the_robot_imported_from_it(tmp_path, change):

@@ -172,7 +172,7 @@ def test_preset_paper_decides_by_a_alone_once_it_is_calibrated(
     assert finding.evidence.startswith('A = ') if known else finding is None
     watched.health.reset()
     assert not any(watched.findings(healthy, IN_A_ROW))
-    watched.health.configure(Detection(1e6))  # larger than any A: physics does not decide either
+    watched.health.configure(Detection(1e6))  # never reached; detectors by physics remain
     assert not any(watched.findings(slack, round(2 * DEAD_TIME / DT)))
 
 
@@ -185,7 +185,7 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, w
     reported = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
     for n in range(300):
         length = state.length + 1e-4 * rng.standard_normal(6)
-        length[0] -= 0.01 * n * (n < 200) / 200  # another lags behind its command, but moves
+        length[0] -= 0.01 * n * (n < 200) / 200  # another muscle lags behind its command, but moves
         reported[0] = 140.0 if n < 200 else 60.0
         watched.demand = reported
         if kind == 'length':

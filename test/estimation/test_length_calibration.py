@@ -43,7 +43,7 @@ def swinging(robot, mae):
 
 @pytest.fixture
 def seldom(monkeypatch):
-    # A guess takes long, and with fewer guesses the offsets are found as soon.
+    # Fits take long; fewer of them find the offsets in the same time.
     monkeypatch.setattr(length_calibration, 'AGAIN', 5.0)
 
 
@@ -55,7 +55,7 @@ def moment(robot, mae):
 def run(calibration, moment, seconds, sees, begin=0.0):
     for n in range(round(seconds / WINDOW)):
         theta, tension, length = moment(begin + n * WINDOW)
-        for k in range(25):  # angles come more seldom than lengths
+        for k in range(25):  # joint angles arrive less often than lengths
             calibration.step(
                 tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None
             )
@@ -103,7 +103,7 @@ def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
         with pytest.raises(MusculoskeletalError, match='legal'):
             estimator.calibrate_lengths(posture)
     assert estimator.body.offsets.known
-    on_stop = tuple(robot.upper + 0.002)  # what a joint reads that rests on its stop
+    on_stop = tuple(robot.upper + 0.002)  # reading of joints at their stops
     estimator.calibrate_lengths(on_stop)
     assert not estimator.body.offsets.known
 
@@ -133,7 +133,7 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibration(
     monkeypatch, robot, mae, moment, sees
 ):
-    monkeypatch.setattr(length_calibration, 'AGAIN', 10.0)  # without a muscle it takes longer still
+    monkeypatch.setattr(length_calibration, 'AGAIN', 10.0)  # fits without a muscle take longer
     rng = np.random.default_rng(0)
 
     def disturbed(t):
@@ -177,7 +177,7 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert re.search('calibrating the lengths: [1-4] of', reported)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == reported
-    estimator.use(mae)  # another network, for all it knows
+    estimator.use(mae)  # counts as another network
     assert 'calibrating the lengths: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):
         _, tension, length = moment(0.01 * n)

@@ -41,7 +41,7 @@ def test_the_elongation_is_removed_exactly(robot, motion):
 def test_the_polynomial_filter_follows_the_motion(robot, motion):
     theta, tension, length = motion
     estimate = PolynomialFilter(robot).estimate(tension, length)
-    # What polynomials of degree 3 leave of these muscles is a few hundredths of a radian.
+    # Polynomials of degree 3 have errors of a few hundredths of a radian for these muscles.
     assert errors(estimate, theta)[20:].mean() < 0.05
 
 

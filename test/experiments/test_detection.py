@@ -61,7 +61,7 @@ def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(
     Fake(arm26, arm26.tension.bias).follow(plan, plan.duration)
     assert not plan.carried.any()
     np.testing.assert_allclose((plan.rupture - 4.0) % SLOT, LATEST_RUPTURE, atol=0.011)
-    assert plan.counted.tolist() == list(range(arm26.muscle_count))  # rather all than none
+    assert plan.counted.tolist() == list(range(arm26.muscle_count))  # all, as none qualifies
 
 
 def test_a_switched_off_muscle_is_not_ruptured_but_commanded_no_tension(arm26):
@@ -98,9 +98,9 @@ def test_only_an_alarm_that_begins_after_the_rupture_counts_as_detection(arm26, 
     plan.rupture, plan.carried = 4.0 + SLOT * np.arange(muscles) + 1.0, np.ones(muscles, dtype=bool)
     alarm, suspect = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
     starts = np.round(plan.rupture / 0.01).astype(int)
-    alarm[starts[0] + 9 : starts[0] + 20] = True  # noticed after 0.1 s, named rightly
-    alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, and muscle 0 is named
-    alarm[starts[2] - 50 : starts[2] + 400] = True  # was on before
+    alarm[starts[0] + 9 : starts[0] + 20] = True  # detected after 0.1 s, with the right muscle
+    alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, with muscle 0 as the suspect
+    alarm[starts[2] - 50 : starts[2] + 400] = True  # the alarm began before
     observed = DetectorOutput(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
     well = DetectorOutput(*(np.zeros(5, dtype=bool) for _ in range(5)))
     numbers = detection(arm26, plan, observed, well, trained['default'])

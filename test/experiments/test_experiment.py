@@ -92,7 +92,7 @@ def test_robustness_has_both_emulator_models_and_says_why_a_number_is_missing(qu
     content = result(quick, 'robustness')
     for reality in ('kin', 'foreign'):
         assert set(REALITY.split()) <= set(content[reality])
-    # Sensors and friction of the first body are all that is wrong with it beside its geometry.
+    # Besides geometry, only sensors and friction of emulator model `kin` deviate.
     kin = content['kin']
     assert kin['informed_oracle_rad'] < min(kin['oracle_rad'], kin['least_squares_rad'])
     assert content['kin']['after_rad'] == result(quick, 'online_learning')['after_rad']

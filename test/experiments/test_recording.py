@@ -80,4 +80,4 @@ def test_a_recording_is_estimated_as_by_the_estimator(arm26, mae, plain):
         estimated.append(core.step(states, now, now).state.theta)
     tension = end_tensions(mae, plain)
     np.testing.assert_allclose(mae.estimate(tension, plain.length).theta, estimated, atol=1e-6)
-    assert np.abs(np.log(tension / plain.tension)).max() > 0.09  # it did rub
+    assert np.abs(np.log(tension / plain.tension)).max() > 0.09  # friction had an effect

@@ -148,7 +148,7 @@ FORCES = 'forcelimited="true" forcerange="-100 500"'
         (f'<motor gear="-2" {RANGE}"-50 100"/>', 200.0),
         (f'<motor {RANGE}"-250 0"/><motor gear="-1" {RANGE}"0 100"/>', 350.0),
         (f'<muscle tendon="out" force="150" {FORCES}/>', 100.0),
-        (f'<position kp="100" {RANGE}"0 0.1"/>', 18.1),  # its longest way
+        (f'<position kp="100" {RANGE}"0 0.1"/>', 18.1),  # its longest travel
         (f'<motor {RANGE}"0 250"/>', None),
     ],
 )
@@ -431,7 +431,7 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
 
 
 def test_an_opensim_model_is_refused_with_the_way_to_convert_it(tmp_path):
-    # Tags as OpenSim writes them are no XML.
+    # Such tags of OpenSim are not valid XML.
     text = '<?xml version="1.0"?><OpenSimDocument Version="40000"><A::B/></OpenSimDocument>'
     with pytest.raises(SourceError, match='convert it to MJCF with MyoConverter'):
         read_source(put(tmp_path, 'own.osim', text))
@@ -447,7 +447,7 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
     assert 'dropped: muscle front: fastened to base, which was cut off' in output
     assert 'largest length error over 1000 postures: 0.000 mm' in output
-    assert 'check_robot: not sound' in output  # nothing holds it open against its weight
+    assert 'check_robot: not sound' in output  # no muscle holds it open against its weight
 
 
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):

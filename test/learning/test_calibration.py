@@ -107,7 +107,7 @@ def test_every_second_message_is_learned_and_the_others_validate():
     [
         {'theta': np.nan},  # not read
         {'tension': 0.0},  # isolated, or slack
-        {'spread': np.full(2, 0.01)},  # a camera's
+        {'spread': np.full(2, 0.01)},  # θ from a camera
     ],
 )
 def test_messages_that_do_not_determine_the_posture_are_not_learned(unfit):

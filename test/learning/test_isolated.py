@@ -27,7 +27,7 @@ def test_readings_of_an_isolated_muscle_do_not_change_its_body(learned):
         store.add(lost, known.copy())
     update = updater.update(job(store)._replace(isolated=(LOST,)))
     moved = np.abs(lengths() - before).max()
-    assert moved < 3e-4  # by what the others' lengths say of where the arm was
+    assert moved < 3e-4  # the lengths of the others still improve the posture
     assert update.mae.isolated == (LOST,)
     assert update.changed == ()
     assert np.isfinite(update.loss)
@@ -52,7 +52,7 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     assert again.isolated == again.mae.isolated == (LOST,)
     assert len(again.samples) == 4
     assert [sample.isolated for sample in again.samples.samples] == [()] * 3 + [(LOST,)]
-    assert again.body.version > again.samples.body_version  # versions are used once
+    assert again.body.version > again.samples.body_version  # a version number is never used twice
     again.isolate(())
     assert checkpoint.from_bytes(again.checkpoint, arm26).isolated == ()
     again.close()
@@ -63,7 +63,7 @@ def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
     learner.anomaly(True)
     version = learner.mae.version
     learner.isolate((LOST,))
-    learner.isolate(())  # it was healthy
+    learner.isolate(())  # the muscle was healthy
     learner.anomaly(False)
     assert learner.mae.version == version
     learner.anomaly(True)

@@ -120,7 +120,7 @@ def test_two_centimetres_of_a_prismatic_joint_are_another_posture(tmp_path):
     learner, pull = Learner(robot), np.full(robot.muscle_count, 60.0)
     theta = 0.5 * (robot.lower + robot.upper)
     theta[-1], length = 0.01, robot.muscle_lengths(theta, pull)
-    for k in range(1200):  # it rests, slides at 5 mm/s as its wires do not tell, and rests
+    for k in range(1200):  # rest, slow motion of 5 mm/s that the tendons do not show, and rest
         theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (400 <= k < 800)]
         learner.step(DT * k, theta, pull, length)
     angles = [sample.theta[-1] for sample in learner.samples.samples]
@@ -131,7 +131,7 @@ def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner
     learner.accept(stage.sample())
     for now in np.arange(0.0, 5.0, 0.25):
         learner.poll(now)
-    assert learner.trainer.jobs == []  # two samples at least
+    assert learner.trainer.jobs == []  # at least two samples are required
     times = []
     for now in np.arange(5.0, 10.0, 0.25):
         if now < 6.0:
@@ -221,7 +221,7 @@ def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage)
     assert len(learner.samples) == 0
     assert 'length calibration' in learner.report().message
     learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
-    arm.rest(3.0 * MARGIN)  # they are compared with the messages first
+    arm.rest(3.0 * MARGIN)  # the offsets are compared with messages first
     assert [sample.body_version for sample in learner.samples.samples] == [learner.body.version]
 
 
@@ -320,7 +320,7 @@ def test_without_joint_sensors_rest_is_detected_from_the_muscles(arm26, initial,
         arm.rest(1.1)
     assert len(learner.samples) >= 20
     assert np.isnan(learner.samples.observations().theta).all()
-    assert len(learner.trainer.jobs[0].observed) == 20  # fewer say too little
+    assert len(learner.trainer.jobs[0].observed) == 20  # fewer samples are not enough
 
 
 def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial, stage):
@@ -391,12 +391,12 @@ def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stag
     learner.trainer.released = True
     published = learner.poll(4.0)
     assert learner.trainer.ready and learner.updates == updates
-    if not goes_back:  # to the network before, as on an anomaly
+    if not goes_back:  # to the previous network, as after an anomaly
         assert published is None and learner.checkpoint == checkpoint
     stop(learner, False)
     jobs = len(learner.trainer.jobs)
     learner.poll(6.0)
-    assert len(learner.trainer.jobs) == jobs + 1  # it is learned then
+    assert len(learner.trainer.jobs) == jobs + 1  # the sample is learned then
 
 
 NAN = np.nan
@@ -409,7 +409,7 @@ NAN = np.nan
         ([9.0, 0.0], 0.0, 'joint limits'),
         ([0.1, 0.2], 5.0, 'muscle_states are rejected'),
         (None, 0.0, 'without usable joint angles'),
-        ([0.1, NAN], 0.0, ''),  # the other joint is learned from
+        ([0.1, NAN], 0.0, ''),  # the other joint provides a sample
     ],
 )
 def test_a_learner_that_gets_nothing_to_learn_from_warns_and_names_why(

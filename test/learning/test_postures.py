@@ -135,7 +135,7 @@ def test_measured_positions_of_a_prismatic_joint_stay_where_they_were_measured(t
     for seed in range(4):
         observed = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
         off.append(fit_body(CalibratedBody(robot), observed).theta[:, -1] - observed.theta[:, -1])
-    # 0.2 mm; 0.7 mm if zeros of sensors were thought to be off by 2° in metres.
+    # 0.2 mm; 0.7 mm if the prior of sensor offsets were 2° interpreted as metres.
     assert np.abs(off).mean() < 4e-4
 
 
@@ -153,7 +153,7 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
             body.parameters[m][k] = at + step
             moved = model.residuals(unknowns)
             body.parameters[m][k] = at
-            # Residuals are what was seen less the body's.
+            # Residuals are measured values minus those of the body.
             slope = -(moved.length[:, m] - rows.length[:, m]) / step
             np.testing.assert_allclose(rows.by_body[m][:, k], slope, atol=1e-5)
             slope = -(moved.torque - rows.torque) / step
@@ -164,7 +164,7 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
 
 def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_samples(arm26):
     inside = []
-    for seed in (0, 2, 4):  # bodies that are found worst
+    for seed in (0, 2, 4):  # the bodies with the largest errors
         resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
         observed, test = resting.observations(60), resting.observations(40)
         body = CalibratedBody(arm26)

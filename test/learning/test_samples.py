@@ -17,7 +17,7 @@ from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.limits import LIMITS
 
 DT = 0.01
-SLIDES = np.array([1.0, RACK])  # what counts as a radian where the second of two joints slides
+SLIDES = np.array([1.0, RACK])  # travel per radian if the second joint is prismatic
 
 
 def reading(theta, length):

@@ -79,7 +79,7 @@ def full_disk():
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-# -- what comes back ------------------------------------------------------------------------------
+# -- loading --------------------------------------------------------------------------------------
 
 
 def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
@@ -130,7 +130,7 @@ def test_a_learner_killed_while_it_saves_has_the_state_before_or_after(
         done.append(target)
         return replace_file(file, target)
 
-    def die(*_, **__):  # a process that was killed removes nothing
+    def die(*_, **__):  # a killed process does not clean up
         raise Killed
 
     with closing(StateStore(tmp_path, arm26)) as state, monkeypatch.context() as patch:
@@ -255,7 +255,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
         np.testing.assert_array_equal(np.array(loaded.known)[:, kept], store.known)
         assert not np.array(loaded.known)[:, added].any()
         assert arm26.muscles[added] in learner.report().values['saved state not used']
-        # They bring as many updates as when they came; then all waits for new ones.
+        # They cause as many updates as at first; then the learner waits for new samples.
         for now in range(10):
             learner.poll(2.0 * now)
         assert learner.updates == 4
@@ -341,7 +341,7 @@ def test_a_directory_that_became_read_only_is_an_error_until_it_is_not(begun, st
     def read_only(*_):
         raise OSError(errno.EROFS, 'Read-only file system')
 
-    with monkeypatch.context() as patch:  # the superuser may write whatever the mode says
+    with monkeypatch.context() as patch:  # file modes do not restrict the superuser
         patch.setattr(states, 'write_whole', read_only)
         accept(learner, stage, 1)
         assert 'Read-only' in learner.report().message
@@ -397,7 +397,7 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
     with monkeypatch.context() as patch:
         patch.setattr(CheckpointValidator, 'check', refuse)
         messages = []
-        for _ in range(2):  # no network replaces it
+        for _ in range(2):  # no network replaces the state
             with closing(Learner(arm26, trainer=Prepared, directory=tmp_path / 'state')) as again:
                 assert_same(again.samples, before.samples)
                 messages.append(again.report().values.get('saved state not used', ''))

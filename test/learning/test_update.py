@@ -129,7 +129,7 @@ def test_a_slipped_joint_sensor_is_not_taken_for_a_changed_muscle(arm26, initial
 
 def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_body):
     data = synthetic_samples(other_body, np.zeros(6), 200, np.random.default_rng(0))
-    with torch.device('meta'):  # computes nothing, so that a loss has no value in the end
+    with torch.device('meta'):  # computes nothing, so that the final loss has no value
         trainer = NetworkTrainer(from_mae(initial))
         with pytest.raises(RuntimeError, match='item'):
             trainer.train(data, 1)
@@ -180,7 +180,7 @@ def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26):
 def test_an_update_on_few_samples_keeps_most_of_a_learned_network(learned, arm26, initial):
     mae, _, _, stage = learned
     states, two = stage.states(1000), job(stage.store(2))
-    # Four seeds, because a network of so few steps wanders: 1.1 to 2.5 times what it was before.
+    # Four seeds, because a network with so few steps varies: 1.1 to 2.5 times the earlier error.
     going_on, anew = (
         np.mean([error(BodyUpdater(arm26, each, s).update(two).mae, *states) for s in range(4)])
         for each in (mae, initial)
@@ -234,7 +234,7 @@ def test_the_covariance_of_a_network_covers_its_errors_and_is_saved(arm26, learn
     error = mae.estimate(tension, length).theta - theta
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
     inside = (distance <= chi2.ppf(0.95, 2)).mean()
-    assert inside > 0.8  # of a body of the very kind that is looked for, without friction
+    assert inside > 0.8  # a frictionless body from the same distribution as the prior
     spread = np.sqrt(np.diag(mae.covariance))
     assert (spread < 5.0 * error.std(axis=0)).all()
     again = checkpoint.from_bytes(checkpoint.to_bytes(mae), arm26)

@@ -64,7 +64,7 @@ def test_false_zeros_are_not_believed_and_cost_nothing(learner, arm, false):
     assert 'length offsets disagree' in report.message
     assert 'estimator/zero' in report.message
     use(learner, np.zeros(6), known=False)
-    use(learner, np.full(6, 0.001))  # as estimator/zero finds them
+    use(learner, np.full(6, 0.001))  # as determined by estimator/zero
     arm.rest(2.0 * POSTURE)
     arm.rest(POSTURE)
     assert len(learner.samples) >= 3
@@ -122,10 +122,10 @@ def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
     history.use(wrong)
     for sample in true[2:]:
         store.add(sample._replace(length=sample.length - wrong))
-    if is_interrupted:  # a power cycle may be why they are others
+    if is_interrupted:  # a power cycle may have changed the offsets
         history.interrupt()
     history.use(np.zeros(6))
-    assert history.corrected == corrected  # the first two with the wrong ones as well
+    assert history.corrected == corrected  # the first two also had wrong offsets
     if not is_interrupted:
         for sample, expected in zip(store.samples, true, strict=True):
             np.testing.assert_allclose(sample.length, expected.length)

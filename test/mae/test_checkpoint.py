@@ -268,7 +268,7 @@ def test_any_changed_byte_gives_a_sound_network_or_a_checkpoint_error(place, fli
         mae = from_bytes(bytes(data))
     except CheckpointError:
         return
-    # A flipped bit of a weight is another weight; it must still be one that computes.
+    # A flipped bit of a weight gives another valid weight.
     assert all(np.isfinite(part).all() for part in arrays(mae))
 
 

@@ -54,7 +54,7 @@ def test_the_remaining_muscles_determine_the_posture(trained, states):
     mae, (theta, tension, length) = trained['default'], states
     for lost in range(6):
         off = mae.without((lost,)).estimate(tension, length).theta - theta
-        # A network trained for a moment is off by 0.1 rad; a wrong number in its place by 0.5.
+        # A briefly trained network has an error of 0.1 rad; a wrong input would cause 0.5 rad.
         assert np.linalg.norm(off, axis=1).mean() < 0.25
     at = mae.encode(Mask.THETA_TENSION, theta, tension)
     assert at.shape == mae.without((1,)).encode(Mask.THETA_TENSION, theta, tension).shape
@@ -81,7 +81,7 @@ def test_the_statistics_are_those_of_the_remaining_muscles(trained):
     )
     np.linalg.cholesky(reduced.anomaly.covariance)
     assert reduced.anomaly.calibrated
-    assert not reduced.without(()).anomaly.calibrated  # nobody knows what is normal for it
+    assert not reduced.without(()).anomaly.calibrated  # there are no statistics for it
 
 
 def test_a_checkpoint_stores_the_isolated_muscles(trained):

@@ -25,7 +25,7 @@ def diagnostics(
 
 def test_before_the_first_sample_it_says_why_the_error_may_rise():
     situation = Situation('/left')
-    assert situation.hint() == ''  # nobody learns
+    assert situation.hint() == ''  # there is no learner
     situation.diagnosed(diagnostics('/left/learner', samples='0'))
     assert 'error may rise' in situation.hint()
     situation.diagnosed(diagnostics('/left/learner', samples='3', checkpoints='2'))
@@ -206,7 +206,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert second('sim', 'learner') == ('ok', '')
     situation.diagnosed(diagnostics('/left/second', 'wrong', DiagnosticStatus.ERROR))
     assert second('sim', 'learner')[1] == '/left/second: wrong'
-    for _ in range(6):  # it has ended, and is none of the arm's own nodes
+    for _ in range(6):  # it has ended, and does not belong to the arm
         second('sim', 'learner')
     assert second('sim', 'learner') == ('ok', '')
 

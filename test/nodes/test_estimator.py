@@ -65,7 +65,7 @@ def test_estimates_are_published_by_name_and_near_the_truth(estimator, arm26, he
     joints = answer(estimator, healthy)
     assert tuple(joints.name) == arm26.joints
     assert joints.header.stamp.sec > 0
-    # 600 steps of training leave 0.01 rad on average; that it is ② of (T, l) is the core's test.
+    # After 600 training steps the mean error is 0.01 rad; core tests check the estimate itself.
     np.testing.assert_allclose(joints.position, 0.5 * (arm26.lower + arm26.upper), atol=0.1)
     muscles = estimator.received['estimated_muscle_states']
     restored = estimator.wait(lambda: muscles, 'the restored muscles')[-1]
@@ -143,7 +143,7 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
     assert estimator.set_parameter('estimator', 'anomaly_threshold', 0.2)[0]
     detected = estimator.received['anomaly_detected']
     sick = deepcopy(healthy)
-    sick.data[0] -= 0.025  # less than a jump, after which the lengths had to be found anew
+    sick.data[0] -= 0.025  # less than a jump, which would revoke the length offsets
 
     def observed():
         answer(estimator, sick)

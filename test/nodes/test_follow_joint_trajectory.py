@@ -64,7 +64,7 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     status, result = first.ended()
     assert (status, result.error_code) == (GoalStatus.STATUS_SUCCEEDED, kind.Result.SUCCESSFUL)
     assert tuple(first.feedback[0].joint_names) == arm.robot.joints
-    # rclpy's client drops what has not arrived when the result does: the last feedback is missing.
+    # rclpy's client drops feedback that arrives after the result.
     desired = np.array([feedback.desired.positions for feedback in first.feedback])
     distance = np.linalg.norm(desired - HERE, axis=1)
     assert (np.diff(distance) <= 0.0).all() and distance[-1] < distance[0]
@@ -77,7 +77,7 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     third.cancel()
     assert third.ended()[0] == GoalStatus.STATUS_CANCELED
     arm.says('holding')
-    # One that cannot be kept to.
+    # A goal that the arm cannot follow.
     tolerance = JointTolerance(name=arm.robot.joints[0], position=1e-6)
     fourth = send(trajectory(arm, THERE), path_tolerance=[tolerance])
     status, result = fourth.ended()
@@ -111,7 +111,7 @@ class Asked(Waitable):
         node.add_waitable(self)
 
     def is_ready(self, _wait_set):
-        return self.pending  # as a request, until it is taken
+        return self.pending  # like a request that waits to be taken
 
     def take_data(self):
         self.pending = False
@@ -138,7 +138,7 @@ class Asked(Waitable):
 
 
 def test_requests_of_an_action_are_served_at_once(monkeypatch):
-    monkeypatch.setattr(executor, 'FULL_ROUND_PERIOD', 600)  # only what is served at once is served
+    monkeypatch.setattr(executor, 'FULL_ROUND_PERIOD', 600)  # serve only urgent entities
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('asked', context=context)

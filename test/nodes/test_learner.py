@@ -122,7 +122,7 @@ class HostedLearner:
         while not condition():
             assert time.monotonic() < deadline, f'waited in vain for {what}'
             self.step()
-            if not self.node.core.trainer.ready:  # what trains may have the processor
+            if not self.node.core.trainer.ready:  # leave the processor to the training
                 time.sleep(DT)
 
 
@@ -189,7 +189,7 @@ def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     graph.node.create_service(Trigger, 'estimator/check_health', confirm)
     detected.publish(Bool(data=False))
     learner.learn(lambda: learner.updates > updates, 'learning again')
-    assert not graph.call(Trigger, 'learner/save').success  # nothing is kept
+    assert not graph.call(Trigger, 'learner/save').success  # nothing can be saved
 
 
 def test_learner_enable_stops_and_resumes_learning(host, graph):
@@ -246,7 +246,7 @@ def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, gra
     assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
     assert not any(known[1] for known in learner.node.core.samples.known)
-    # What came since then is forgotten again by the service.
+    # The service discards what arrived since then.
     samples = learner.samples
     learner.learn(lambda: learner.samples > samples, 'a sample')
     assert any(known[1] for known in learner.node.core.samples.known)
@@ -282,7 +282,7 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
     assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
     assert not together(fresh=True, checkpoint='').successful
     assert learner.samples >= 2 and all(known.all() for known in core.samples.known)
-    # One start, and one backup of all that was known.
+    # One start, and one backup of the earlier state.
     assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
     assert learner.samples == 0
     assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1.state']
@@ -300,7 +300,7 @@ def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
     def known():
         return learner.node.core.mae.isolated
 
-    isolated.publish(String(data=''))  # of an estimator that has just started
+    isolated.publish(String(data=''))  # from an estimator that has just started
     graph.wait(lambda: learner.node.has_heard_isolated, 'what it says')
     assert known() == (4,)
     for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
@@ -362,7 +362,7 @@ def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, tra
 
 
 def test_learning_works_without_joint_sensors_and_with_an_accelerometer(host, graph):
-    graph.listen(JointState, 'joint_states')  # the learner does not
+    graph.listen(JointState, 'joint_states')  # the learner does not subscribe to it
     learner = host(joint_source='none')
     learner.learn(lambda: learner.samples >= 2, 'samples without angles')
     assert np.isnan(learner.node.core.samples.observations().theta).all()
@@ -413,7 +413,7 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
     shutil.rmtree(state)
     before = len(levels())
     graph.wait(lambda: DiagnosticStatus.ERROR in levels()[before:], 'the error')
-    # The one report that may have been due, and the one that the loss itself brings.
+    # One report that may have been due, and one that the loss causes.
     assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
     learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
     graph.wait(lambda: levels()[-1] != DiagnosticStatus.ERROR, 'its end')

@@ -31,7 +31,7 @@ def test_the_file_of_parameters_is_the_one_that_the_table_makes():
 
 @pytest.mark.parametrize('node', PARAMETERS)
 def test_the_file_holds_every_parameter_of_every_node_with_its_default(node):
-    # A name means the same in all nodes, since one file serves them all.
+    # A name has the same meaning in all nodes, because they share one file.
     held = yaml.safe_load(yaml_text())['/**']['ros__parameters']
     for name, parameter in PARAMETERS[node].items():
         default = parameter.default
@@ -79,7 +79,7 @@ def test_every_parameter_that_is_settable_is_followed(graph, monkeypatch, tmp_pa
     monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
     node = graph.host(kind, robot='arm26')
     settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
-    assert settable - {'stop_recordings'} == set(node._setters)  # it is read at every stop
+    assert settable - {'stop_recordings'} == set(node._setters)  # it is evaluated at every stop
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
             {'checkpoint': '', 'isolate_muscles': ['tail']},
             lambda node: id(node.core.mae),
         ),
-        # Another method ends what goes on.
+        # A change of method ends the present activity.
         (
             Controller,
             {'method': 'float', 'joint_stiffness': [1.0]},

@@ -130,7 +130,7 @@ def test_what_a_stranger_says_for_the_estimator_stops_the_arm_and_changes_nothin
         arm.says('several publishers', 'estimator')
         graph.node.destroy_publisher(stranger)
         graph.wait(lambda: graph.call(Trigger, 'controller/reset').success, 'the reset')
-        # The estimator's own value has come again, and is as it was.
+        # The estimator's own value has been received again.
         assert core.stream.body.isolated == before.isolated == ()
         assert core.stream.body.offsets.known and not core.stream.body.offsets.offset.any()
         assert core.mae is network or core.mae.version == network.version

@@ -132,7 +132,7 @@ def test_a_second_driver_of_the_same_name_stops_the_arm(arm):
     try:
         publisher = twin.create_publisher(Float64MultiArray, 'muscle_states', 10)
 
-        def repeat(message):  # what the first one says, by a second one
+        def repeat(message):  # a second publisher repeats the message
             if (data := bytes(message.data)) not in reported:
                 reported.add(data)
                 publisher.publish(message)
@@ -148,11 +148,11 @@ def test_impossible_lengths_stop_the_arm_with_their_cause_and_without_a_jump(arm
     arm.goes_to(HERE)
     done, _ = arm.graph.set_parameter('hardware_emulator', 'length_offset', [0.15])
     assert done
-    # Jumped, or beyond what the joints allow.
+    # A jump, or implausible lengths.
     arm.says('stopped: muscle_states are implausible: length ')
     assert any(reason.startswith('muscle_states: length ') for reason in arm.estimator.rejected)
     arm.never_jumped()
-    # The modules wind by their own law until the stop, which a busy machine handles late.
+    # Until the stop, which may be late, the modules follow MSC.
     assert np.linalg.norm(arm.posture() - HERE) < 0.7
 
 
@@ -192,14 +192,14 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         graph.spin(0.01)
         assert time.monotonic() - started < 60.0
     assert node.core.supervisor.is_running
-    # By the steady clock it would be over after 0.6 s of this one.
+    # With the steady clock it would end after 0.6 s of simulated time.
     assert follower.trajectory.duration >= 2.0
     assert done_at - begun >= 0.9 * follower.trajectory.duration
     assert len(sent) > 0
 
 
 def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
-    # The estimate without it is so far off that the controller does not even start.
+    # Without the length the estimate is so wrong that the controller does not start.
     muscle = 'deltoid_anterior'
     graph.host(HardwareEmulator, robot='arm26', seed=0, ruptured_muscles=[muscle])
     graph.listen(Float64MultiArray, 'muscle_states')

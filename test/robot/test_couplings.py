@@ -96,7 +96,7 @@ def test_the_emulated_joint_follows_its_master(robot):
     arm.command_length(arm.sense().length - 0.01)
     arm.step(0.4)
     assert np.abs(arm.theta - before).max() > 0.01
-    # One of them is fastened to the link that the coupled joint turns.
+    # One muscle is attached to the link of the coupled joint.
     np.testing.assert_allclose(
         arm.route_points(), robot.routes.points(arm.theta[None])[0], atol=1e-9
     )

@@ -243,7 +243,7 @@ def test_a_urdf_that_is_still_to_be_expanded_is_refused(tmp_path, old, new):
     refused(tmp_path, str(file), 'expand it first, by xacro FILE')
 
 
-# -- URDFs that nobody writes by mistake ----------------------------------------------------------
+# -- malicious or strange URDFs -------------------------------------------------------------------
 
 
 def in_arm26(old, new):

@@ -38,7 +38,7 @@ from musculoskeletal_ae.simulation.load import Load
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.tools.robot_report import summary
 
-#: the bend springs out against its bender, and lift and swing share a soft link
+#: a spring opposes the bender, and lift and swing are coupled by a soft spring
 SPRINGS = [
     {'joint': 'bend', 'stiffness': 9.0, 'rest_angle': 0.3, 'damping': 0.4},
     {'joint': 'lift', 'stiffness': 3.0, 'rest_angle': 0.1, 'coupled': {'swing': -1.5}},

@@ -21,7 +21,7 @@ def test_muscle_jacobian_is_the_derivative_of_length(robot):
 def test_muscle_jacobian_is_the_derivative_of_length_beyond_the_limits_too(angles):
     theta = np.array(angles)
     expected = slopes(MUSASHI.routes.absolute_lengths, theta)
-    # A line that runs through a joint's centre bends sharply: hence the relative part.
+    # A line through a joint's centre has a large curvature, so a relative tolerance is needed.
     np.testing.assert_allclose(
         MUSASHI.routes.muscle_jacobian(theta), expected, atol=1e-6, rtol=1e-3
     )
@@ -73,5 +73,5 @@ def test_a_flexor_shortens_when_its_joint_flexes():
     robot = Robot.load('arm26')
     jacobian = robot.routes.muscle_jacobian(np.array([0.0, -0.8]))
     flexor, elbow = robot.muscles.index('brachialis'), robot.joints.index('elbow')
-    # Flexion is negative: l falls as the angle falls, and tension's torque −G is negative.
+    # Flexion is negative: l decreases with the angle, and the torque −G of a tension is negative.
     assert jacobian[flexor, elbow] > 0.0

@@ -23,7 +23,7 @@ def poor_arm(directory, spread=0.03):
     for muscle in document['muscles']:
         for point in muscle['route']:
             point['xyz'] = (point['xyz'] + rng.uniform(-spread, spread, 3)).tolist()
-    # What must be kept: a wrap, a point given twice, numbers of one muscle, an unequal default.
+    # These must be kept: a wrap, a repeated point, values of one muscle, another default.
     document['muscles'][4]['route'].insert(2, WRAP)
     document['muscles'][5]['route'].insert(1, dict(document['muscles'][5]['route'][0]))
     document['muscles'][0]['tension'] = {'limit': 190.0}
@@ -70,7 +70,7 @@ def test_a_poor_arm_becomes_sound_by_via_points_moved_within_reach(tmp_path, cap
     printed = capsys.readouterr().out
     assert 'better: sound' in printed
     assert 'changes the sign of its main action' not in printed.split(str(out))[1]
-    # In postures that neither the search nor the check above has seen.
+    # In postures that neither the search nor the check above used.
     assert check_robot(Robot.load(out), 400, seed=9).faults == ()
     distance = np.linalg.norm(points(out) - points(arm), axis=1)
     assert 0.0 < distance.max() < reach

@@ -62,7 +62,7 @@ def test_the_programme_is_solved_with_muscles_of_equal_bounds(seed, share):
     rng = np.random.default_rng(seed)
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
     torque = -share * jacobian.T @ rng.uniform(LOW, HIGH, 8)
-    high = np.where(rng.random(8) < 0.5, LOW, HIGH)  # half of them as hot as may be
+    high = np.where(rng.random(8) < 0.5, LOW, HIGH)  # half of them limited to T_bias by heat
     tension, missing = least_tension(jacobian, torque, LOW, high)
     assert (tension >= LOW - 1e-6).all()
     assert (tension <= high + 1e-6).all()

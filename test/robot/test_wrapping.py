@@ -63,7 +63,7 @@ point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
 
 
 @given(point, point, st.floats(0.001, 0.1))
-@example((0.0, 0.001, 1.4641753369134492e-12), (0.0, 0.25, 0.0), 0.001)  # hardly a plane
+@example((0.0, 0.001, 1.4641753369134492e-12), (0.0, 0.25, 0.0), 0.001)  # almost no plane
 def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
     straight = np.linalg.norm(np.subtract(end, start))
     value, leave, arrive = wire(start, end, radius)
@@ -74,7 +74,7 @@ def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
 
 
 def test_a_tendon_over_a_drum_is_the_geodesic():
-    # Half a turn from tangent to tangent, and up by 0.2 as it goes.
+    # Half a turn from tangent to tangent, with a rise of 0.2.
     flat = 2 * 0.3 + np.pi * 0.1
     length, leave, _ = wire([0.1, -0.3, 0], [-0.1, -0.3, 0.2], 0.1, (0, 0, 1), [0, 5, 0])
     assert length == pytest.approx(np.hypot(flat, 0.2))

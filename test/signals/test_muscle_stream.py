@@ -161,7 +161,7 @@ def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
 def test_tendon_friction_is_removed_by_the_direction_of_sliding():
     stream = MuscleStream(ROBOT)
     stream.use_friction(np.full(M, 0.1))
-    for n in range(100):  # every tendon is wound in: the motor pulls more than the bone feels
+    for n in range(100):  # every tendon is wound in, so T exceeds T_end
         states = resting()
         states[0] -= 1e-4 * n
         sample = stream.take_states(states, n * PERIOD)

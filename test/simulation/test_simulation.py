@@ -169,7 +169,7 @@ def test_a_command_out_of_reach_ends_at_the_limits_and_is_reported(robot, body):
     arms.isolate([0])
     assert robot.muscles[0] not in arms.limits()
     arms.isolate([])
-    # Nothing has wound up meanwhile: half a second later the tension is gone.
+    # No error has accumulated: half a second later the tension is gone.
     arms.command = np.full((1, robot.muscle_count), 1e9)
     assert arms.step(0.5).tension.max() < robot.tension.bias[0] + 1.0
 
@@ -233,7 +233,7 @@ def test_friction_holds_the_arm_after_winding_in(robot, commands, friction):
     left = robot.kinematics.holding_torque(before.theta) + pull
     free = (before.theta > robot.lower) & (before.theta < robot.upper)
     np.testing.assert_allclose(left[free], 0.0, atol=1e-3)
-    # Wound in further and back, it does not come back, as it does without friction.
+    # With friction, winding in and back does not restore the state.
     for way in (0.01, 0.0):
         arms.command = commands - way
         arms.settle()
@@ -263,7 +263,7 @@ def test_with_a_network_one_arm_and_a_batch_agree(arm26, mae):
         single.command, single.wrench = commands[[i]], batch.wrench[[i]]
         for name, ours in single.step(0.3)._asdict().items():
             theirs = getattr(batch.state, name)[i]
-            # A micrometre, which single precision allows, is more of a way to slide than of others.
+            # An error of 1 µm by single precision is relatively large for a prismatic joint.
             atol = 1e-6 / REVERSAL if name == 'slid' else 1e-5
             np.testing.assert_allclose(ours[0], theirs, rtol=1e-5, atol=atol)
 

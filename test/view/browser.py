@@ -26,7 +26,7 @@ OPTIONS = (
     '--hide-scrollbars',
 )
 DEADLINE = 120.0  # [s]
-#: pictures a second are few: without a graphics card each takes a core for a while
+#: a low frame rate, because without a graphics card each frame occupies a core
 SLOWLY = """
 const soon = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 300);
@@ -94,7 +94,7 @@ class Browser:
         while True:
             answer = json.loads(self._socket.recv(timeout=DEADLINE))
             if answer.get('id') == message['id']:
-                # While a page is loaded there is nothing to evaluate in.
+                # While a page is loading there is no context for evaluation.
                 return answer.get('result') or {'result': {}, 'error': answer.get('error')}
 
     def evaluate(self, expression: str) -> Any:

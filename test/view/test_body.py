@@ -90,7 +90,7 @@ def test_ruptured_isolated_and_suspect_muscles_look_different(robot, theta):
     ).all()
     looks = {tuple(colour) for colour in tubes['batched_colors']}
     assert len(looks) == 4
-    # Nobody tells colours apart by hue alone: their luminance differs too.
+    # Colours differ in luminance as well as in hue.
     light = sorted(np.dot(look, [0.2126, 0.7152, 0.0722]) for look in looks)
     assert np.diff(light).min() > 15.0
 
@@ -99,7 +99,7 @@ def test_links_are_drawn_by_the_meshes_of_the_urdf_or_else_by_capsules(tmp_path)
     folder = tmp_path / 'arm'
     shutil.copytree(Robot.load('arm26').description.directory, folder)
     solids, notes = link_solids(Robot.load(folder))
-    assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down from the joints
+    assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down
     elbow = Robot.load('arm26').kinematics.tree.placement_translation[2, 2]
     low, high = solids[0][1].bounds[:, 2]
     assert low < elbow < low + 0.03 and high - 0.03 < 0.0 < high

@@ -36,7 +36,7 @@ from musculoskeletal_ae.view.readings import History, scale_top
 from view.browser import Browser, find_chromium
 
 SCREENSHOTS = Path(__file__).parents[2] / 'log' / 'view'
-#: what a browser says first: where its visitor looks from
+#: first message of a browser: the visitor's camera
 CAMERA = {
     'wxyz': (1.0, 0.0, 0.0, 0.0), 'position': (1.0, 1.0, 1.0), 'fov': 0.8, 'near': 0.01,
     'far': 100.0, 'image_height': 100, 'image_width': 100, 'look_at': (0.0, 0.0, 0.0),
@@ -181,14 +181,14 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
     graph.wait(lambda: graph.received['estimated_joint_states'], 'the estimate')
     port = view()
     topic = f'{graph.namespace}/anomaly'
-    assert graph.node.count_subscribers(topic) == 0  # nobody looks
+    assert graph.node.count_subscribers(topic) == 0  # there is no visitor
     page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}')
 
     def see(text: str) -> None:
         graph.wait(lambda: text in page.text, f'{text!r} on the page')
 
     try:
-        # Nodes are found one after the other.
+        # Nodes are discovered one after the other.
         for text in ('Faults of the', 'error 0.', 'triceps_long', 'Explore', 'Stop', 'payload'):
             see(text)
         assert 'Recording' not in page.text  # no bag is played
@@ -209,7 +209,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.click(*page.centre('Cut'))
         see('ANOMALY: ')
         assert detected[-1].data
-        page.click(*page.centre('Reset after a stop'))  # it would stop again
+        page.click(*page.centre('Reset after a stop'))  # otherwise it would stop again
         see('press "Mend" first')
         assert 'controller/reset' not in page.text
         graph.spin(1.0)
@@ -260,7 +260,7 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.wait(lambda: graph.report('view').message == 'nobody views the page', 'its diagnostics')
 
-    def answer(request, response):  # as a node without these parameters does
+    def answer(request, response):  # like a node without these parameters
         asked.append(request)
         response.values = [ParameterValue() for _ in request.names]
         return response
@@ -294,7 +294,7 @@ def test_a_browser_can_change_only_the_values_of_controls(graph, arm26):
             mine.send(b'no message')
             for updates in {'update_cb': []}, 5, {'value': float(slider.max)}:
                 mine.send(msgspec.msgpack.encode({**control, 'updates': updates}))
-            # Without its listeners the slider would move, and nobody would hear of it.
+            # Otherwise the slider would move without an effect.
             graph.wait(lambda: asked, 'what the visitor asked for')
         assert asked == [('targets', {arm26.joints[0]: pytest.approx(slider.max)})]
     finally:
