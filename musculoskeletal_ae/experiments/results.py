@@ -259,10 +259,11 @@ def readme_table(results: Results) -> str:
     about = next(iter(results.values()))['about']
     text = (
         f'\n\n{about["robot"]}, emulated {individuals(about["seeds"])}, '
-        f'{about["minutes"]:g} minutes of exploration. {NOTHING}: not printed, or nothing to '
-        'compare. Reference: least squares on the true body (estimate), the least ‖T‖ that can '
-        'hold the posture where the arm came to rest (control), the true body without friction '
-        '(simulator).\n\n'
+        f'{about["minutes"]:g} minutes of exploration. {NOTHING} means that the paper gives no '
+        'number, or that there is nothing to compare. The reference of an estimate is least '
+        'squares with the true routes and elastic constants. The reference of control is the '
+        'least ‖T‖ with which the true body can hold the posture in which the arm came to rest. '
+        'The reference of the simulator is a simulation of the true body without friction.\n\n'
         f'| | paper, on Musashi | preset `{AS_PRINTED}` | preset `default` | reference | goal |\n'
         '|---|---|---|---|---|---|'
     )
