@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# Runs the whole system on the emulated arm, or on your own. This is the launch file: what is started, with which
-# parameters, stands at the end, under "The system".
+# Runs the whole system on an emulated arm or on your own. This is the launch file: the section
+# "The system" at the end starts the nodes with their parameters.
 set -u
-unset CDPATH # with it, cd would print where it went
+unset CDPATH # otherwise cd may print the directory
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
 
 usage() {
@@ -13,44 +13,44 @@ Usage: ./bringup.sh [options]
 
 Sets up what is missing, then runs the whole system on an emulated arm and prints one status line a
 second: estimation error, anomaly A, samples learned, number of checkpoints. Ctrl-C stops it all.
-doc/howto/your_robot.md leads from a robot of your own to one that learns.
+doc/howto/your_robot.md is the guide for your own robot.
 
   --robot NAME|DIR           a robot under config/, or a directory with robot.urdf and muscles.yaml
                              (default: musashi_left_arm)
-  --mujoco FILE.xml          a MuJoCo model instead of a robot: imports it, says what that changed,
+  --mujoco FILE.xml          a MuJoCo model instead of a robot: imports it, reports the changes,
                              trains, and plays the model itself (doc/howto/mujoco.md); with
                              --joints, --muscles, --without NAME,… and --base, --end NAME as of
                              import_robot
   --checkpoint FILE          MAE to start from (default: train one, once, and keep it in the cache)
   --hardware                 your own driver instead of the emulator: waits for its muscle_states,
-                             says what is wrong with them, and starts once nothing is
+                             reports faults, and starts when all checks pass
   --no-controller            nothing may move the arm
   --combined                 estimator and controller in one process
   --bag DIR                  a recording instead of the emulator: no controller, no emulator
   --explore | --no-explore   random exploration, so that learning has data (default: on; with
                              --hardware off: a real arm moves only on request)
   --no-learner               no online learning
-  --preset default|paper     the best we can measure, or as printed in the paper (default: default)
-  --seed N                   which individual arm the emulator is (default: 0; of a MuJoCo model:
-                             the model as it is)
+  --preset default|paper     our own methods, or exactly those of the paper (default: default)
+  --seed N                   seed of the emulated individual (default: 0; for a MuJoCo model:
+                             the model without deviations)
   --reality kin|foreign|FILE.xml
-                             its body: the first, a second one whose mechanics are foreign to the
-                             learner, or a MuJoCo model with the robot's names (default: kin)
+                             emulator model: kin, foreign (with mechanics that the learner does not
+                             model), or a MuJoCo model with the robot's names (default: kin)
   --joint-source sensor|marker|none
-                             what the learner knows of joint angles: all of them, what a camera sees of
-                             the hand, or nothing (then the first network takes 20 samples, some two
+                             joint angles for the learner: from sensors, from a camera that observes
+                             the hand, or none (the first network then takes 20 samples, about two
                              minutes); the status line shows the emulator's own angles
                              (default: sensor)
-  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml; of a
-                             ros2_control robot, how its motors are connected
+  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml, including
+                             the connection of the motors of a ros2_control robot
                              (doc/howto/ros2_control.md)
   -p NODE:NAME:=VALUE        one parameter of one node, such as -p estimator:on_anomaly:=isolate;
-                             this and --params-file may be given several times, and win over all else
+                             it and --params-file may be repeated, and take precedence
   --namespace NS             run everything under /NS
-  --network                  show an emulated arm to as much of the network as
-                             ROS_AUTOMATIC_DISCOVERY_RANGE says, as --hardware does (default: to
+  --network                  make an emulated arm visible in the network as far as
+                             ROS_AUTOMATIC_DISCOVERY_RANGE permits, as with --hardware (default: on
                              this machine only)
-  --duration S               stop after S seconds, counted from when the system is up
+  --duration S               stop after S seconds, counted from the first estimate
                              (default: run until Ctrl-C)
   --record DIR               record the topics to an mcap bag
   --view                     show the arm on a page, http://localhost:8080
@@ -58,7 +58,7 @@ doc/howto/your_robot.md leads from a robot of your own to one that learns.
   --read-only                a page without controls
   -h, --help                 this text
 
-Exit status: 0 at the end of --duration, 130 on Ctrl-C, 1 if a part died, 2 for a wrong option.
+Exit status: 0 at the end of --duration, 130 on Ctrl-C, 1 if a process failed, 2 for a wrong option.
 EOF
 }
 
@@ -68,7 +68,7 @@ refuse() {
 }
 
 # --- options -------------------------------------------------------------------------------------
-# The nodes and tools check the values, and say what is wrong with them.
+# The nodes and tools check the values and report errors.
 
 robot=musashi_left_arm
 mujoco=
@@ -174,15 +174,15 @@ robot_directory=$repository/config/$robot
 . "$repository/.ci/environment.sh"
 environment_setup
 
-# An emulated arm is nobody else's business. A driver may well run on another machine.
+# Keep an emulated arm off the network. A driver may run on another machine.
 if [ $hardware = false ] && [ $network = false ]; then
   export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
   unset ROS_STATIC_PEERS
 fi
 use_udp
 
-# One arm to a namespace. The lock is held until the last of what is started here has ended, which
-# after Ctrl-C takes a moment.
+# A namespace contains one arm. The lock is held until the last process has ended, which takes a
+# moment after Ctrl-C.
 in_use=/tmp/musculoskeletal_ae-${ROS_DOMAIN_ID:-0}-${namespace//\//.}.lock
 [ -e "$in_use" ] || (umask 022 && : >>"$in_use") || exit 1
 exec {arm_lock}<"$in_use"
@@ -199,10 +199,10 @@ say "logs in $logs"
 declare -A name_of=() # by pid
 
 launch() { # NAME ARGUMENT…
-  # If this script is killed with SIGKILL, the kernel ends what it started, or sh does, if that
-  # happened before the kernel knew. The interpreter is named, because a #! line cannot name a path
-  # with a space in it.
-  # shellcheck disable=SC2016  # it is for sh to expand
+  # If this script is killed with SIGKILL, the kernel ends its processes. sh checks the parent in
+  # case that happened before setpriv. The interpreter is stated because a path in a #! line cannot
+  # contain a space.
+  # shellcheck disable=SC2016  # expanded by sh
   setpriv --pdeathsig TERM sh -c '[ "$PPID" = "$0" ] && exec "$@"' $$ \
     "$python" "$executables/$1" "${@:2}" </dev/null &
   name_of[$!]=$1
@@ -213,8 +213,8 @@ start() { # NAME ARGUMENT…   Output goes to NAME.log.
   launch "$@" >"$logs/$1.log" 2>&1
 }
 
-# With the parameters of all nodes and those of this one. What --params-file and -p say comes last,
-# and wins.
+# Starts a node with the common parameters and its own. Those of --params-file and -p come last and
+# take precedence.
 start_node() { # NAME PARAMETER…
   local file parameter nodes_here=" $1 "
   local -a chosen=()
@@ -232,8 +232,8 @@ died() { # NAME STATUS
   exit 1
 }
 
-# wait_for NAME: waits until the process of this name has ended, and returns its status. If another
-# one ends first, bring-up has failed, unless that is a recording that was played to its end.
+# wait_for NAME: waits until this process has ended, and returns its status. If another process ends
+# first, bring-up has failed, except for a replay that has reached the end of its recording.
 wait_for() {
   local pid name status
   wait -n -p pid "${!name_of[@]}"
@@ -244,12 +244,12 @@ wait_for() {
   return "$status"
 }
 
-# shellcheck disable=SC2329  # the trap calls it
+# shellcheck disable=SC2329  # called by the trap
 stop() {
   local pid deadline=$((SECONDS + 5))
   local -a pids
   trap '' INT TERM HUP PIPE
-  # Not those of name_of: a signal may come between the start of a process and its entry there.
+  # Do not use name_of: a signal may arrive between the start of a process and its entry there.
   mapfile -t pids < <(jobs -pr)
   [ ${#pids[@]} -gt 0 ] || return
   say stopping
@@ -267,8 +267,7 @@ trap 'exit 129' HUP
 
 # --- checkpoint ----------------------------------------------------------------------------------
 
-# Sets $checkpoint. The file is named after what a network is made from, so that another robot or
-# another network is another file.
+# Sets $checkpoint. The name of the file contains a hash of everything that determines the network.
 train_once() {
   local cache=${XDG_CACHE_HOME:-${HOME:-$repository}/.cache}/musculoskeletal_ae hash
   local package=$repository/musculoskeletal_ae
@@ -283,7 +282,7 @@ train_once() {
     say "checkpoint from an earlier run: $checkpoint"
     return
   fi
-  [ -t 1 ] || export TQDM_MININTERVAL=5 # a progress bar in a file: a line now and then
+  [ -t 1 ] || export TQDM_MININTERVAL=5 # fewer lines of a progress bar in a file
   say "training the MAE of $robot, once (a minute or two)"
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
     > >(tee "$logs/train.log") 2>&1
@@ -292,8 +291,8 @@ train_once() {
 
 # --- a MuJoCo model ------------------------------------------------------------------------------
 
-# Sets $robot to a directory that is imported anew each time: it takes seconds, and checkpoints are
-# named after what is in it.
+# Sets $robot to a directory that is imported again each time, which takes seconds. The names of
+# checkpoints depend on its content only.
 import_mujoco() {
   local status name
   name=$(basename "$mujoco" .xml)
@@ -313,15 +312,15 @@ import_mujoco() {
 
 # --- The system ----------------------------------------------------------------------------------
 
-# What config/nodes.yaml says or, if they say something, the last of --params-file and -p.
+# Prints the value of a parameter: the last one of config/nodes.yaml, --params-file and -p.
 chosen_value() { # NAME
   { cat "$repository/config/nodes.yaml" "${parameter_files[@]}" && printf '%s\n' "${parameters[@]}"; } |
     sed -n -e "s/^[^#]*\b$1: \+\([A-Za-z0-9.]\+\).*/\1/p" -e "s/^[a-z_]*:$1:=//p" | tail -n 1
 }
 
-quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, which ROS parameters are
+quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, the format of ROS parameters
 
-own_clock=false # of an emulated arm that is slower than real time
+own_clock=false # whether the emulated arm is slower than real time
 [ -z "$mujoco" ] || import_mujoco
 [ -n "$checkpoint" ] || train_once
 
@@ -332,12 +331,12 @@ common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
   -p "checkpoint:=$(quoted "$checkpoint")")
 if [ -n "$bag" ] || [ $own_clock = true ]; then common+=(-p use_sim_time:=true); fi
 
-# Tools need them as well: they say how the motors of a ros2_control robot are connected.
+# Tools need these files for the connection of the motors of a ros2_control robot.
 files=()
 for file in "${parameter_files[@]}"; do files+=(--params-file "$file"); done
 
 if [ $hardware = true ]; then
-  # Nothing that could move the arm is there before its driver says what it must.
+  # Start no node that could move the arm before the driver has passed the check.
   check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)" "${files[@]}")
   [[ ! $(chosen_value zero_at_start) =~ ^([Tt]rue|yes|on)$ ]] || check+=(--unzeroed)
   launch check_driver "${check[@]}" --ros-args "${under[@]}"
@@ -349,7 +348,7 @@ elif [ -z "$bag" ]; then
   [[ $reality =~ ^(kin|foreign)$ ]] || ! is_given --seed || deviates=true
   start_node hardware_emulator -p "reality:=$(quoted "$reality")" -p "deviates:=$deviates" \
     -p "clock:=$own_clock" "${camera[@]}"
-  # That a file is another robot is for who started this to know, not for a log alone.
+  # Show warnings about a deviating robot file here, not only in the log.
   tail -n +1 -s 0.2 -f --pid="$!" "$logs/hardware_emulator.log" </dev/null 2>/dev/null |
     sed -un 's/^\[WARN\][^:]*: \(reality .*\)/-- \1/p' &
 fi
@@ -357,20 +356,20 @@ fi
 [ $combined = true ] || start_node estimator
 start_node sim
 if [ $learner = true ]; then
-  # What is learned of an emulated arm stays with the logs: the next run may be another one. Hardware
-  # is the same arm tomorrow, and the learner goes on from where it was.
+  # Keep the learned state of an emulated arm with the logs, because the next run may emulate another
+  # arm. With hardware, the learner continues from its saved state.
   kept=()
   [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/learner")")
   start_node learner "${kept[@]}" -p "joint_source:=$joint_source"
 fi
 [ -z "$record" ] || start record -o "$record" "${files[@]}" --ros-args "${under[@]}"
 if [ -n "$bag" ]; then
-  # A recording brings its own time and its own commands: no controller.
+  # A recording contains time and commands, so no controller is started.
   start replay "$bag" --clock "${files[@]}" --ros-args "${under[@]}"
 elif [ $controller = true ]; then
   [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
   moving=(-p "explore:=$explore")
-  # A pause of a busy desktop is no fault of an emulated arm.
+  # A pause of a busy desktop must not stop an emulated arm.
   [ $hardware = true ] || moving+=(-p max_age:=1.0)
   name=controller
   [ $combined = false ] || name=combined
@@ -379,13 +378,13 @@ fi
 if [ $view = true ]; then
   start view --robot "$robot" --port "$port" "${read_only[@]}" "${files[@]}" \
     --ros-args "${under[@]}"
-  # It prints its address once it can be visited.
+  # The page prints its address when it is ready.
   tail -n +1 -s 0.2 -f --pid="$!" "$logs/view.log" </dev/null 2>/dev/null |
     sed -un 's/^http:/-- the page is on http:/p' &
 fi
 
-# The status line. It counts --duration from when estimates arrive, however late that is on a slow
-# machine, and ends after it; without any estimate it gives up.
+# The status line. It counts --duration from the first estimate, and then ends bring-up. Without an
+# estimate it fails after `patience`.
 limits=()
 if [ -n "$duration" ]; then
   [[ $duration == *.* ]] || duration+=.0 # a ROS double

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fill numba's cache: take one step with both emulated bodies and with the simulator.
+"""Fill numba's cache by one step of both emulator models and of the simulator.
 
-A node that compiles while it runs can neither keep its rate nor be stopped.
+A node that compiles at run time cannot keep its rate, and cannot be stopped meanwhile.
 """
 
 from musculoskeletal_ae.emulator.reality import make_arm

@@ -1,8 +1,8 @@
 # shellcheck shell=bash
 # SPDX-License-Identifier: Apache-2.0
 #
-# Sourced by bringup.sh and test.sh. Installs what is missing into .venv, builds the package with
-# colcon, and sets up this shell for it. From the second run on this takes seconds.
+# Sourced by bringup.sh and test.sh. Installs missing packages into .venv, builds the package with
+# colcon, and sets up this shell for it. Later runs take seconds.
 #
 #     repository=…               # absolute, before sourcing
 #     environment_setup [test]   # "test": with the tools of test.sh; exits on failure
@@ -15,7 +15,7 @@ TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 
 venv=$repository/.venv
 python=$venv/bin/python
-# shellcheck disable=SC2034  # for those who source this file
+# shellcheck disable=SC2034  # used by scripts that source this file
 executables=$repository/install/musculoskeletal_ae/lib/musculoskeletal_ae
 setup_log=$repository/log/setup.log
 
@@ -38,7 +38,7 @@ step() {
   return 1
 }
 
-# On a terminal each line takes the place of the one before.
+# On a terminal, each line replaces the previous one.
 show_progress() {
   local line
   while read -r line; do
@@ -55,7 +55,7 @@ find_ros() {
     jazzy) ros=sourced ;;
     '')
       ros=wheels
-      # The wheels are an installation of ROS of their own: nothing of another one may leak in.
+      # The wheels are a separate installation of ROS; do not mix it with another one.
       unset PYTHONPATH PYTHONHOME LD_LIBRARY_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH \
         RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
       export AMENT_PREFIX_PATH=$venv
@@ -99,7 +99,7 @@ make_venv() {
     fail "ROS 2 Jazzy is on PyPI for x86_64 only, and this is $(uname -m)." \
       'Source /opt/ros/jazzy/setup.bash first.'
   fi
-  # What minimal installations of Debian and Ubuntu lack: venv's pip, and what pinocchio links to.
+  # Minimal installations of Debian and Ubuntu lack venv's pip and a library of pinocchio.
   "$base_python" -c 'import ensurepip' 2>/dev/null || missing+=("python$version-venv")
   "$base_python" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null || missing+=(libgomp1)
   if [ ${#missing[@]} -gt 0 ]; then
@@ -111,7 +111,7 @@ make_venv() {
     fail '.venv could not be made.'
 }
 
-# Fails where there is no apt-get, or where root's rights would take a password.
+# Fails without apt-get, or if sudo would require a password.
 install_with_apt() { # PACKAGE…
   local -a as_root=()
   [ "$(id -u)" = 0 ] || as_root=(sudo -n)
@@ -127,12 +127,13 @@ install_requirements() { # FILE…
   local -a arguments=()
   if [ -e "$installed" ] && ! cat "$@" | grep -qvxFf "$installed"; then return; fi
   for file in "$@"; do arguments+=(-r "$file"); done
-  # PyPI's torch brings gigabytes of CUDA; the CPU build is enough.
+  # Torch from PyPI contains gigabytes of CUDA; the CPU build is sufficient.
   if "$python" -c "import urllib.request
 urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
     arguments+=(--extra-index-url "$TORCH_CPU_INDEX")
   fi
-  # What pip leaves behind when it is killed may look complete. Without this file, .venv is made anew.
+  # A killed pip may leave an installation that looks complete. Without this file, .venv is created
+  # again.
   rm -f "$installed"
   step "installing ${*##*/} into .venv (minutes, the first time)" \
     "$python" -m pip install --no-compile "${arguments[@]}" ||
@@ -143,15 +144,15 @@ urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
 
 # --- the package ---------------------------------------------------------------------------------
 
-# The build links to the sources, so that a change of them is a change of what is installed.
+# The build links to the sources, so changes take effect without another build.
 build_package() {
   step 'building the package with colcon' "$python" -m colcon --log-base log build \
     --symlink-install --base-paths . --packages-select musculoskeletal_ae \
     --event-handlers desktop_notification- || fail 'The package could not be built.'
 }
 
-# Compiles ahead what numba would compile in nodes that start. Its cache does not notice a change in
-# a function of another file, which it has compiled into this one: after any change all is compiled.
+# Compiles all numba functions, so that nodes need not compile when they start. Numba's cache does
+# not notice changes of functions from other files, so any change recompiles everything.
 compile_package() {
   local stamp=build/.compiled
   if [ -e $stamp ] && [ -z "$(find musculoskeletal_ae -name '*.py' -newer $stamp \
@@ -166,11 +167,11 @@ compile_package() {
 # --- all of it -----------------------------------------------------------------------------------
 
 environment_setup() { # [test]
-  local - folder # "-": the options of the shell come back at the end
+  local - folder # "-" restores the options of the shell at the end
   local -a requirements=(requirements.txt)
   trap 'exit 130' INT
-  PATH=${PATH//"$venv/bin:"/} # so that .venv is not made from itself
-  unset PYTHONDONTWRITEBYTECODE # some containers set it: each process would compile all of torch
+  PATH=${PATH//"$venv/bin:"/} # so that .venv is not created from itself
+  unset PYTHONDONTWRITEBYTECODE # if set, each process would compile all of torch's Python files
   find_ros
   [ "$ros" = sourced ] || requirements+=(.ci/requirements-ros.txt)
   [ "${1-}" != test ] || requirements+=(.ci/requirements-test.txt)
@@ -181,7 +182,7 @@ environment_setup() { # [test]
   done
   mkdir -p "$repository/log" "$repository/build"
 
-  # One set-up at a time. A second one waits, and finds everything done.
+  # Only one set-up runs at a time. A second one waits, and then has nothing to do.
   (
     flock -n 9 || { say 'another set-up is running here: waiting for it' && flock 9; }
     : >"$setup_log"
@@ -194,16 +195,16 @@ environment_setup() { # [test]
   trap - INT
 
   export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH
-  # colcon's scripts read variables that are not set, and call a Python that they do not quote.
+  # colcon's scripts read unset variables, and do not quote the path of Python.
   set +u
   # shellcheck disable=SC1091
   COLCON_PYTHON_EXECUTABLE=$(readlink -f "$python") . "$repository/install/setup.bash"
 }
 
-# Where a node was killed, Fast DDS may leave shared memory through which its successor on the same
-# ports hears nothing (eProsima/Fast-DDS 4737, 5053, 5469). On one machine UDP costs no more. Where
-# ROS_AUTOMATIC_DISCOVERY_RANGE is LOCALHOST, rmw_fastrtps adds shared memory whatever the first
-# variable says, and the file keeps messages out of it.
+# Makes Fast DDS use UDP only. After the kill of a node, its shared memory may prevent a successor on
+# the same ports from receiving messages (eProsima/Fast-DDS 4737, 5053, 5469). On one machine, UDP is
+# not slower. With ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, rmw_fastrtps adds shared memory in spite
+# of the first variable; the profile file keeps messages out of it.
 use_udp() {
   export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
   [ "${ROS_AUTOMATIC_DISCOVERY_RANGE-}" != LOCALHOST ] ||

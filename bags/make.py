@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the recordings of this folder on the emulated arm, in real time.
+"""Record the bags of this folder with the emulated arm, in real time.
 
     . .ci/environment.sh … (see README.md), then: python bags/make.py NAME
 
-Runs emulator, estimator and controller at 20 Hz on a graph of its own and records what hardware and
-controller send.
+Runs emulator, estimator and controller at 20 Hz on a private graph, and records the messages of
+hardware and controller.
 """
 
 import os
@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# A graph of its own, before rclpy reads it.
+# Select a private graph before rclpy reads the variables.
 os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 101 + 1)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
@@ -35,11 +35,11 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = 'musashi_left_arm'
-# One individual in all bags, so that what is learned from one can be tried on another.
+# The same individual in all bags, so that a network learned from one can be tested on another.
 INDIVIDUAL = 1
 RATE = 20.0  # [Hz], to keep ten minutes under 3 MB
 TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
-# Of `teaching`, which is short: also what is shown, how the hand is pushed, and what is sent then.
+# `teaching` is short; it also contains the demonstration, the pushes and the commands.
 TEACHING_RATE = 50.0  # [Hz]
 TAUGHT = ',muscle_tension_command,estimated_joint_states,joint_trajectory'
 LEFT_OUT = ',anomaly_detected,isolated_muscles,target_joint_states'  # of `isolation`
@@ -48,12 +48,12 @@ POSTURE = [0.2, -0.6, 0.1, -1.2, 0.0]  # [rad]
 
 
 class Arm:
-    """The running nodes, ended by pid."""
+    """The running nodes."""
 
     def __init__(self, bag: Path, checkpoint: Path, exploration: int | None, more: str) -> None:
-        """Start emulator, estimator, controller, recorder (of more topics).
+        """Start emulator, estimator, controller, and a recorder of TOPICS and `more`.
 
-        Without a random seed of the exploration it is none.
+        `exploration` is the random seed of the exploration; None: the arm does not explore.
         """
         self._processes: list[subprocess.Popen[bytes]] = []
         self.scratch = checkpoint.parent
@@ -76,7 +76,7 @@ class Arm:
                 raise TimeoutError(f'{name} did not start within 60 s')
 
     def start(self, name: str, *arguments: str) -> None:
-        """Start a node that ends with the others."""
+        """Start a node, which `close` ends."""
         self._processes.append(self.run(name, *arguments))
 
     def run(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
@@ -88,7 +88,7 @@ class Arm:
         raise FileNotFoundError(f'{name}: not installed; run ./bringup.sh once')
 
     def spend(self, seconds: float) -> None:
-        """Let the arm move."""
+        """Handle messages while the arm moves."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             rclpy.spin_once(self.node, timeout_sec=0.1)
@@ -100,7 +100,7 @@ class Arm:
         rclpy.spin_until_future_complete(self.node, future, timeout_sec=10.0)
 
     def call(self, name: str, value: bool | None = None) -> None:
-        """Call a service, of SetBool if there is a value, else of Trigger."""
+        """Call a service: SetBool with a value, Trigger without one."""
         kind = Trigger if value is None else SetBool
         client = self.node.create_client(kind, name)
         if not client.wait_for_service(timeout_sec=60.0):
@@ -110,7 +110,7 @@ class Arm:
         print(f'{name}: {future.result()}')
 
     def close(self) -> None:
-        """End all processes, the recorder last but one so that the bag is complete."""
+        """End all processes in the reverse order of their start."""
         rclpy.shutdown()
         for process in reversed(self._processes):
             process.send_signal(signal.SIGTERM)
@@ -123,12 +123,12 @@ def exploration(arm: Arm) -> None:
 
 
 def foreign(arm: Arm) -> None:
-    """Three and a half minutes of exploration of the second body."""
+    """Three and a half minutes of exploration of emulator model `foreign`."""
     arm.spend(210.0)
 
 
 def rupture(arm: Arm) -> None:
-    """Two minutes of motion, from the first with a 3.6 kg dumbbell, then muscle #2 is cut."""
+    """Two minutes of motion, the second with a 3.6 kg dumbbell; then muscle #2 ruptures."""
     arm.spend(60.0)
     arm.set('payload', 3.6)
     arm.spend(60.0)
@@ -152,11 +152,11 @@ def faults(arm: Arm) -> None:
 
 
 def teaching(arm: Arm) -> None:
-    """A hand moves the floating arm; what it showed is recorded, and then repeated."""
+    """A hand moves the arm under gravity compensation; the motion is recorded and repeated."""
     targets = arm.node.create_publisher(JointState, 'target_joint_states', 10)
     hand = arm.node.create_publisher(WrenchStamped, PUSHED, 10)
     joints = Robot.load(ROBOT).joints
-    # So that the recorder listens before `replay` sends its one message.
+    # Wait until the recorder has subscribed, because `replay` sends one message only.
     arm.node.create_publisher(JointTrajectory, 'joint_trajectory', 10)
     arm.spend(5.0)
     targets.publish(JointState(name=joints, position=POSTURE))
@@ -181,7 +181,7 @@ def teaching(arm: Arm) -> None:
 
 
 def isolation(arm: Arm) -> None:
-    """A muscle is cut, verified and isolated; the arm moves on; it is mended and learned anew."""
+    """A muscle ruptures, is verified, isolated, and later repaired and relearned."""
     targets = arm.node.create_publisher(JointState, 'target_joint_states', 10)
     joints, muscle = Robot.load(ROBOT).joints, 'deltoid_middle'
     arm.set('on_anomaly', 'isolate', 'estimator')
@@ -203,7 +203,7 @@ def isolation(arm: Arm) -> None:
 
 # [N] of the hand, one after the other.
 PUSHES = ((15.0, 0.0, 10.0), (0.0, 0.0, 0.0), (-10.0, 8.0, 12.0), (0.0, 0.0, 0.0))
-#: what is done, the random seed of the exploration, and what else is recorded
+#: recorded motion, random seed of the exploration, and further topics
 RECORDINGS: dict[str, tuple[Callable[[Arm], None], int | None, str]] = {
     'exploration': (exploration, 101, ''),
     'rupture': (rupture, 102, ''),

@@ -371,7 +371,7 @@ class Attack:
     def topics(self) -> dict[str, str]:
         """Return the types of all subscribed topics, by name."""
         for name in NODES:
-            with suppress(NodeNameNonExistentError):  # just killed; its topics are known already
+            with suppress(NodeNameNonExistentError):  # just killed; topics known
                 pairs = self.node.get_subscriber_names_and_types_by_node(name, self.namespace)
                 self._topics |= {topic: kinds[0] for topic, kinds in pairs}
         return self._topics

@@ -43,7 +43,7 @@ LEARNING, MOVING_ON = 60.0, 25.0  # [s] before the rupture, and after the isolat
 EVERY, EVERY_LATER = 1.0, 0.4  # [s] between pictures while learning, and around the rupture
 FRAME, LAST = 110, 1500  # [ms] that a picture of the film is shown, and the last one
 SETTLE = 3.0  # [s] from the first status until the whole page is drawn
-PATIENCE = 600.0  # [s] for the start, and for what the film waits for
+PATIENCE = 600.0  # [s] to wait for the start and for each event of the film
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
@@ -88,7 +88,7 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
 
 
 def write(frames: list[Image.Image], kept: dict[str, int], out: Path) -> None:
-    """Write the film, with one palette for all pictures, and the separate pictures."""
+    """Write the film with one palette for all frames, and the separate pictures."""
     several = frames[:: max(1, len(frames) // 8)]
     collage = Image.new('RGB', (SCALED[0], SCALED[1] * len(several)))
     for i, frame in enumerate(several):

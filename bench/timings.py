@@ -37,11 +37,11 @@ from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 MANY, LONGEST = 4096, 0.05  # arms, [s] of a round
-ALL_TORCH = 'beside all of it in torch'
+ALL_TORCH = 'compared with all of it in torch'
 
 
 class Row(NamedTuple):
-    """One line of the table; the torch side is optional.
+    """One row of the table; the implementation in torch is optional.
 
     A call that processes a batch counts as several calls.
     """
