@@ -229,7 +229,8 @@ class JointTree:
             return of_joints
         ratios = self.ratios(theta)
         between = (1,) * (values.ndim - ratios.ndim)
-        return (values * ratios.reshape(*ratios.shape[:-1], *between, -1)) @ self.moved_by
+        ratios = ratios.reshape(*ratios.shape[:-1], *between, ratios.shape[-1])  # also of no rows
+        return (values * ratios) @ self.moved_by
 
     def of_both(self, matrix: Array, theta: Array) -> Array:
         """Return Aᵀ B A (D, D) for a matrix B (J−1, J−1), at θ (D,)."""

@@ -13,6 +13,7 @@ from robots import read_muscles, write_muscles, write_robot
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.stiffness import muscle_hessian
 from musculoskeletal_ae.simulation.load import Load
 
 ANGLES = np.array([-0.5, 0.1, 0.2])  # angles of bend, lift and swing
@@ -57,6 +58,13 @@ def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
         gear = kin.tree.transmission(theta)
         whole = gear.T @ (np.triu(inertia) + np.triu(inertia, 1).T) @ gear
         np.testing.assert_allclose(kin.joint_inertia(theta), np.diag(whole))
+
+
+def test_no_postures_have_no_moment_arms(robot):
+    """Learning asks for those of the postures that moved, and none may have."""
+    nothing = np.zeros((0, 3))
+    assert robot.routes.muscle_jacobian(nothing).shape == (0, 8, 3)
+    assert muscle_hessian(robot.routes.muscle_jacobian, nothing).shape == (0, 8, 3, 3)
 
 
 def test_a_motion_over_a_curved_coupling_takes_the_work_that_its_energy_gains(robot):
