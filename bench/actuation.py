@@ -43,6 +43,7 @@ MOVING, LATEST = 4.0, 10.0  # [s] before a rupture, and until its isolation
 KINDS = {
     'stiffness': {'actuation': 'stiffness'},
     'position': {'actuation': 'position'},
+    'position-none': {'actuation': 'position', 'tension_source': 'none'},
 }
 HEAD = (
     f'{"reality":<8} {"seed":>4} {"modules":<18} {"before":>7} {"after":>7} {"control":>8} '

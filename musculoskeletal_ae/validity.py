@@ -43,18 +43,27 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
 
 
 def read_muscle_states(
-    message: Any, muscles: int, isolated: Sequence[int] | Ints = (), unknown: float = 0.0
+    message: Any,
+    muscles: int,
+    isolated: Sequence[int] | Ints = (),
+    unknown: float = 0.0,
+    needs_tension: bool = True,
 ) -> Array:
     """Return length [m], tension [N] and temperature of a Float64MultiArray, (3, M).
 
     A temperature of NaN means that it is not measured. Isolated muscles may have any values:
     those not finite or beyond ±MOST_ISOLATED are replaced by `unknown`, temperatures by NaN.
+    Without `needs_tension`, tensions may have any values as well, and are returned as NaN.
     """
     values = _values(message, len(QUANTITIES), muscles)
     usable = np.isfinite(values)
+    if not needs_tension:
+        values[1], usable[1] = np.nan, True
     if len(isolated) == 0 and usable.all():
         return values
     replaced = ~(np.abs(values) < MOST_ISOLATED) & np.isin(np.arange(muscles), isolated)
+    if not needs_tension:
+        replaced[1] = False
     values[replaced] = unknown
     values[2, replaced[2]] = np.nan
     usable |= replaced

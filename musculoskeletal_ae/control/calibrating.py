@@ -73,7 +73,7 @@ class Calibrating:
         If no goal is holdable, the one with the least missing torque is used.
         """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
-        tension = inputs.sample.motor_tension * inputs.sample.usable
+        tension = inputs.sample.model_tension * inputs.sample.usable
         limits = robot.tension.bias, gentle_limit(robot)
         best, best_tension, least_missing = theta, tension, np.inf
         radian = robot.kinematics.radian

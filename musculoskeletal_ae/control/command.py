@@ -51,7 +51,7 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
 
 def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
     """Return the command of a kind that keeps the present tensions."""
-    tension = np.maximum(sample.motor_tension, robot.tension.bias)
+    tension = np.maximum(sample.model_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
     if robot.follows_position:

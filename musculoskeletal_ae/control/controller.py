@@ -33,6 +33,7 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.limiter import CommandLimiter
+from musculoskeletal_ae.control.methods import check_method
 from musculoskeletal_ae.control.planner import Plan, Planner
 from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget, length_methods
 from musculoskeletal_ae.control.settings import BY_TENSION, Settings
@@ -171,6 +172,7 @@ class Controller:
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
         self.robot, self.settings = robot, settings or Settings()
+        check_method(robot, self.settings)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
@@ -195,8 +197,9 @@ class Controller:
         """Apply new settings; another method or preset starts from the present tensions.
 
         Raises:
-            MusculoskeletalError: If the joint stiffness does not fit the robot.
+            MusculoskeletalError: If the joint stiffness or the method does not fit the robot.
         """
+        check_method(self.robot, settings)
         before, radian = self.settings, self.robot.kinematics.radian
         stiffness = settings.desired_stiffness(radian)
         self.settings = settings
@@ -407,6 +410,11 @@ class Controller:
             return f'stopped: {condition}'
         if wanted and self.settings.method == 'float':
             return 'method float: the arm is guided by hand; set another method first'
+        if wanted and not (self.robot.knows_tension or self.stream.body.offsets.known):
+            return (
+                'the length offsets are unknown, and without tensions (tension_source: none) no '
+                'exploration finds them; call estimator/zero with a stated posture'
+            )
         if wanted and not self.stream.body.used.any():
             return f'all muscles are isolated; {RESTORE}'
         if wanted != self.supervisor.explores:
@@ -535,7 +543,7 @@ class Controller:
         # Without a stop cause, all inputs are available.
         assert self.mae is not None and self.sample is not None and self.estimate is not None
         sample = self.sample
-        pull = Pull(sample.motor_tension * sample.usable, sample.bone_tension * sample.usable)
+        pull = Pull(sample.model_tension * sample.usable, sample.bone_tension * sample.usable)
         return Inputs(
             mae=self.mae,
             sample=sample,

@@ -105,7 +105,7 @@ class RestFeedback:
         correction = self.correction + gain * dt * beyond
         self.correction = np.clip(correction, -self.largest, self.largest)
         self._unsolved += dt
-        if self._unsolved >= BETWEEN:
+        if self._unsolved >= BETWEEN and self._robot.knows_tension:
             robot, bias = self._robot, self._robot.tension.bias
             lowest = np.zeros_like(bias) if robot.follows_position else bias
             largest = SLACK if robot.follows_position else RELIEF

@@ -22,6 +22,9 @@ A trajectory that is too fast for the muscle modules is slowed as a whole before
 (`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
 rest feedback (`feedback.RestFeedback`) continues from c.
 
+Where no tension is known, T is `Robot.assumed_tension` in every posture, as in the samples from
+which the network was learned (doc/explanation/method.md).
+
 Method `stiffness` minimises ‖T − T_K‖² instead, where T_K is that of `methods.stiffness_command` a
 moment ahead. It uses no feedback, which would change the chosen stiffness.
 """
@@ -290,10 +293,13 @@ class Follower:
         near: Array | float = 0.0
         if self._is_stiff:
             near = self.stiffening.step(mae, trajectory, self.time, self.effort, inputs.limit, dt)
-        self.tension, self.missing_torque = least_tension(
-            jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
-        )
-        self._motor = self.tension * loss
+        if robot.knows_tension:
+            self.tension, self.missing_torque = least_tension(
+                jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
+            )
+            self._motor = self.tension * loss
+        else:
+            self.tension = self._motor = robot.assumed_tension
         length = mae.lengths(at.theta + self._shift, self.tension)
         return length + msc_compensation(robot, self._motor) + lag * speed
 

@@ -23,7 +23,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
@@ -46,6 +47,26 @@ LEVELS = 8  # number of tensions between T_bias and limit at which the elongatio
 # Step of the finite difference of G [rad]: small relative to changes along a route, large relative
 # to errors of the MAE.
 STEP = 0.05
+
+#: methods that need no tension, by preset; `second` and the paper's `proposed` start from it
+WITHOUT_TENSION = {'default': ('geometric', 'first', 'proposed')}
+OTHERS_WITHOUT_TENSION = ('geometric', 'first')
+
+
+def check_method(robot: Robot, settings: Settings) -> None:
+    """Check that the robot's modules can do what the method needs.
+
+    Raises:
+        MusculoskeletalError: If they cannot; names the reason and the legal methods.
+    """
+    if robot.knows_tension:
+        return
+    legal = WITHOUT_TENSION.get(settings.preset, OTHERS_WITHOUT_TENSION)
+    if settings.method not in legal:
+        raise MusculoskeletalError(
+            f'method {settings.method!r} needs tensions, and tension_source of muscles.yaml is '
+            f'none; legal with preset {settings.preset!r}: {", ".join(legal)}'
+        )
 
 
 class JointStiffness(NamedTuple):

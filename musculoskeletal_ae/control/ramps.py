@@ -34,6 +34,7 @@ from musculoskeletal_ae.robot.robot import Robot
 RAMP_SHARE = 0.6
 PEAK = 1.5  # ratio of peak to mean speed of a ramp
 FIRST = 'first'  # the method that uses T_const
+SECOND = 'second'  # the method that uses the measured T
 
 
 class Ramp:
@@ -143,6 +144,9 @@ class LengthRamps:
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
         self._tension = inputs.pull.motor if goal.tension is None else goal.tension
+        if not self._robot.knows_tension:
+            goal = goal._replace(method=FIRST if goal.method == SECOND else goal.method)
+            self._tension = self._robot.assumed_tension
         self._goal, self._limit = goal, inputs.limit
         self.solution = None  # in case the next line raises an exception
         self.solution = self._solve(goal, inputs.mae, self._tension)

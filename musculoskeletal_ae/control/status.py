@@ -14,6 +14,7 @@ from musculoskeletal_ae.control.remedy import REMEDY_STEPS, identifiers, sentenc
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.control.torque import TorqueControl
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.description import NO_TENSION
 from musculoskeletal_ae.signals.body_state import KNOWN
 
 LEAST_SHARE = 10.0  # share of its speed below which a slowed trajectory's duration is reported [%]
@@ -94,6 +95,8 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
         values['unknown length offsets'] = robot.names(unknown)
         warnings.append('length offsets are unknown: the arm only explores, gently')
+    if not robot.knows_tension:
+        values['tension'] = f'tension_source: none: {NO_TENSION}'
     if tense := core.watchdog.overload.tense:
         warnings.append(f'too much tension: {", ".join(tense)}')
     return warnings + _heat_warnings(core, values)

@@ -146,6 +146,7 @@ class HeatLimit:
         # The tension sensor of an isolated muscle may be faulty; its module is commanded T_bias.
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest[1], bias)
+        tension = np.where(np.isnan(tension), sample.model_tension, tension)
         self.heat.step(tension, sample.temperature, elapsed)
 
     def lower(self, highest: float, fall: Array | float) -> None:

@@ -119,7 +119,9 @@ class Listening:
         topic = 'motors' if self._motors.is_ros2_control else 'muscle_states'
         with self._rejecting(topic):
             reading = self._motors.reading(message)
-            states = read_muscle_states(reading, self._robot.muscle_count)
+            states = read_muscle_states(
+                reading, self._robot.muscle_count, needs_tension=self._robot.knows_tension
+            )
             self._read.append((states, self._theta))
 
     def joints(self, message: object) -> None:
@@ -168,6 +170,8 @@ class Listening:
             if len(known):
                 few = np.linspace(0, len(known) - 1, min(len(known), MOST_SAMPLES)).astype(int)
                 length, tension = states[known[few], :2].swapaxes(0, 1)
+                if not self._robot.knows_tension:
+                    tension = np.tile(self._robot.assumed_tension, (len(length), 1))
                 self._judge_lengths_and_joints(verdict, theta[known[few]], length, tension)
             else:
                 lacking = np.isnan(theta).all(axis=0)
@@ -182,10 +186,11 @@ class Listening:
         if len(states) > 10:
             # A driver may publish more often than it reads the modules. Temperatures are not
             # compared, because they may stay the same.
-            same: Bools = states[1:, :2] == states[:-1, :2]
+            rows = 2 if self._robot.knows_tension else 1
+            same: Bools = states[1:, :rows] == states[:-1, :rows]
             repeated, stuck = same.all(axis=(1, 2)).mean(), same.all(axis=(0, 1))
             if repeated > MOST_REPEATED:
-                columns = states[:, :2].reshape(len(states), -1).T
+                columns = states[:, :rows].reshape(len(states), -1).T
                 if 1 < max(len(np.unique(column)) for column in columns) <= QUIET:
                     verdict.notes.append(
                         'readings hardly change: move the arm to check whether each is new'
@@ -200,6 +205,8 @@ class Listening:
         for what, texts, meant in _readings(states):
             possible = (meant >= self._low) & (meant <= self._high)
             possible[2] |= np.isnan(meant[2])
+            if not self._robot.knows_tension:
+                possible[1] = True
             # Without a command, T must be close to T_bias in the right interpretation.
             pulls = np.median(meant[1] / self._robot.tension.bias)
             warm = meant[2][~np.isnan(meant[2])]

@@ -381,7 +381,10 @@ class Arm(ABC):
             np.where(ruptured, 0.0, np.maximum(measured, 0.0)),
             noisy(housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION, rng),
         )
-        return self.faults.apply(readings)
+        readings = self.faults.apply(readings)
+        if not self.robot.knows_tension:
+            readings = readings._replace(tension=np.full_like(readings.tension, np.nan))
+        return readings
 
     @property
     def hand(self) -> pin.SE3:

@@ -189,6 +189,11 @@ class Estimator:
         if self.mae is None:
             raise MusculoskeletalError('no checkpoint; a length calibration requires one')
         check_stated_posture(self.robot, posture)
+        if not posture and not self.robot.knows_tension:
+            raise MusculoskeletalError(
+                'tension_source: none: without tensions, lengths are calibrated in a known posture '
+                'only; hold the arm still and set the parameter stated_posture'
+            )
         self._stated_posture = posture
         stated = np.array(posture) if posture else None
         self.calibration = LengthCalibration(self.robot, self.mae, stated)
@@ -283,7 +288,7 @@ class Estimator:
         before, self.sample = self.sample, sample
         elapsed = 0.0 if before is None else max(sample.time - before.time, 0.0)
         temperature = np.where(self.body.used, sample.temperature, np.nan)
-        self.heat.step(sample.motor_tension, temperature, elapsed)
+        self.heat.step(sample.model_tension, temperature, elapsed)
         if self.mae is None:
             return None
         self.stepped_at = now
@@ -311,7 +316,7 @@ class Estimator:
         finding = self.health.step(observation)
         detected = self._handle(finding, now)
         contact = None
-        if known:
+        if known and self.robot.knows_tension:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, elapsed)
         self.output = Output(
@@ -389,7 +394,7 @@ class Estimator:
     ) -> LengthOffsets | None:
         """Continue the length calibration; return the newest estimate of the offsets, or None."""
         measured = self._measured_theta(now)
-        calibration.step(sample.motor_tension, sample.length_read, dt, measured)
+        calibration.step(sample.model_tension, sample.length_read, dt, measured)
         guess = calibration.offsets
         if guess is None or (calibration.is_standing and not calibration.is_done):
             return None  # the arm has to stand until the calibration ends

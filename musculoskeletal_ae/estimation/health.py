@@ -51,7 +51,7 @@ class HealthMonitor:
         self.joints = JointDisagreement(robot)
         self._detectors: list[Detector] = [
             LengthJump(),
-            MissingValues(),
+            MissingValues(robot),
             *by_physics,
             self.residual,
             self.joints,

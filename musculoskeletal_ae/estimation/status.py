@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
+UNKNOWN_TENSION = 'unknown: tension_source is none'
 SILENCE = 1.0  # [s] without a message, after which the status is a warning
 
 
@@ -95,12 +96,14 @@ def _residuals(core: Estimator) -> dict[str, str]:
         'suspect muscle': core.robot.muscles[suspect],
     }
     if residual.is_calibrated:
-        limit = residual.limit(output.state.theta, output.sample.motor_tension)
+        limit = residual.limit(output.state.theta, output.sample.model_tension)
         values[f'{residual.symbol} limit'] = f'{limit:.3g}'
     return values
 
 
 def _contact(core: Estimator) -> dict[str, str]:
+    if not core.robot.knows_tension:
+        return {'contact': UNKNOWN_TENSION, 'tension': UNKNOWN_TENSION}
     contact = None if core.output is None else core.output.contact
     if contact is None:
         return {}

@@ -20,6 +20,7 @@ sound one had to pull. The first row that applies decides:
     T near zero, and x > STRETCHED · L_e(T_bias) ruptured
     T does not change at all                     tension_sensor_frozen
     T near zero all the same                     not_wound_in
+    T is not known                               tension_unknown
     |l − l'| > FAR                               length_sensor_offset
     T rises with T_ref                           healthy
     otherwise                                    tension_sensor_frozen
@@ -76,6 +77,7 @@ class Outcome(Enum):
     LENGTH_SENSOR_OFFSET = 'length_sensor_offset'
     TENSION_SENSOR_FROZEN = 'tension_sensor_frozen'
     NOT_WOUND_IN = 'not_wound_in'
+    TENSION_UNKNOWN = 'tension_unknown'
     VALUES_MISSING = 'values_missing'  # isolated at once, without a verification
 
 
@@ -87,6 +89,7 @@ _TEXTS = {
     Outcome.LENGTH_SENSOR_OFFSET: 'its length sensor is off',
     Outcome.TENSION_SENSOR_FROZEN: 'its tension sensor is frozen',
     Outcome.NOT_WOUND_IN: 'not verified, since nobody wound it in',
+    Outcome.TENSION_UNKNOWN: 'not verified, since its tension is not known (tension_source: none)',
     Outcome.VALUES_MISSING: 'a sensor does not report a number',
 }
 
@@ -269,6 +272,8 @@ class Verification:
             return Verdict(Outcome.TENSION_SENSOR_FROZEN)
         if is_slack:
             return Verdict(Outcome.NOT_WOUND_IN)
+        if math.isnan(tension):
+            return Verdict(Outcome.TENSION_UNKNOWN)
         if abs(excess) > FAR:
             return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'by {1e3 * excess:.0f} mm')
         rise, demanded = tension - self._before[0], demand - self._before[1]

@@ -92,6 +92,8 @@ class ClosedLoop:
     def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (for subclasses)
         """Estimate θ [rad] (D,) from the readings at `now` [s]."""
         friction, length = self.mae.friction, read.length
+        if not self.arm.robot.knows_tension:
+            return self.mae.estimate(self.arm.robot.assumed_tension, length).theta
         end = self._direction.end_tension(friction, read.tension, length)
         return self.mae.estimate(end, length).theta
 

@@ -166,7 +166,7 @@ class SampleCollector:
             sample = replace(
                 sample,
                 length=np.where(used, sample.length, 0.0),
-                motor_tension=np.where(used, sample.motor_tension, 0.0),
+                motor_tension=np.where(used, sample.model_tension, 0.0),
                 sliding=np.where(used, sample.sliding, 0.0),
             )
         return self._pairing.muscles(time, sample)
@@ -191,7 +191,7 @@ class SampleCollector:
         message = paired.message
         reading = Sample(
             theta,
-            message.motor_tension,
+            message.model_tension,
             message.length,
             message.sliding,
             self._spread,

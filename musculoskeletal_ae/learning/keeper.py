@@ -90,7 +90,7 @@ class CheckpointKeeper:
         self.validation = CheckpointValidator(robot)
         self.publication = Publication()
         self.rejected, self.last_rejected = 0, ''
-        self._torque = HealthyTorque(robot)
+        self._torque, self._knows_tension = HealthyTorque(robot), robot.knows_tension
         self._samples = samples
         self._is_validating = is_validating
         self._time = 0.0  # sum of the messages' dt [s]
@@ -103,8 +103,9 @@ class CheckpointKeeper:
     ) -> None:
         """Process a plausible message, `dt` [s] after the previous one, and measured θ (D,)."""
         self._time += dt
-        self.validation.message(message.motor_tension, message.length, self._time, theta)
-        if self.mae is not None and not is_anomaly:
+        self.validation.message(message.model_tension, message.length, self._time, theta)
+        # Without tensions there is no torque by which to detect contact.
+        if self.mae is not None and not is_anomaly and self._knows_tension:
             self._torque.step(message.motor_tension, message.length, dt)
 
     def forget_messages(self) -> None:

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
-from musculoskeletal_ae.learning.collector import SENSOR, SampleCollector
+from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_check import OffsetCheck
 from musculoskeletal_ae.learning.offset_history import HELD, OffsetHistory
@@ -83,9 +84,15 @@ class Learner:
             directory: State directory for samples and network; None to save nothing.
 
         Raises:
-            MusculoskeletalError: If the preset does not exist.
+            MusculoskeletalError: If the preset does not exist, or if there are neither joint
+                angles nor tensions.
             StateError: If the directory cannot be used.
         """
+        if joint_source == NONE and not robot.knows_tension:
+            raise MusculoskeletalError(
+                f'joint_source {NONE!r}: without joint angles the learner needs tensions, and '
+                f'tension_source of muscles.yaml is none; legal: {SENSOR}, {MARKER}'
+            )
         self.robot = robot
         self.enabled = True
         #: time of the last poll [s], and of the last one that found new usable data

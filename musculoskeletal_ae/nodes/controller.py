@@ -26,6 +26,7 @@ from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
+from musculoskeletal_ae.control.methods import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -121,6 +122,7 @@ class Controller(Shell):
         return value
 
     def _check_method(self, value: Any) -> Any:
+        check_method(self.robot, replace(self.core.settings, method=value))
         if value in BY_TENSION and self.motor_commands is not None:
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
             problem = f'{value!r}: the motors on {self.motors.command_topic} follow lengths only'

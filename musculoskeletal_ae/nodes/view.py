@@ -116,7 +116,9 @@ class View(Node):
 
         def muscles(message: Any) -> Array:
             reading = self.motors.reading(message)
-            return read_muscle_states(reading, robot.muscle_count, self._isolated(), math.nan)
+            return read_muscle_states(
+                reading, robot.muscle_count, self._isolated(), math.nan, robot.knows_tension
+            )
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, partial(read_posture, joints=joints, some=is_measured))

@@ -31,12 +31,11 @@ from musculoskeletal_ae.files import read_csv, read_table
 from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
 from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
-from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.robot import DESIRED_SHARE, Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
 
-DESIRED_SHARE = 0.3  # of T_limit, for example 60 N of 200 N
 REQUIRED_SHARE = 0.95  # of the postures that must be held, and that must be stiff
 # The required stiffness is the smaller of REQUIRED_STIFFNESS [N·m/rad] and REQUIRED_BY_LOAD [1/rad]
 # times the largest load of a joint. With the latter, a change of that load by a tenth moves no

@@ -48,6 +48,10 @@ INDEFINITE = -1e-9
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
 STIFFNESS_DEFAULT = 10000.0  # [N/m]
 SPEED_DEFAULT = 0.1  # [m/s]
+NO_TENSION = (
+    'the tension is unknown; there is no contact, tension control, torque balance, tension limit, '
+    'limit by heat, or slack or ruptured tendon by tension'
+)
 
 
 class RoutePoint(NamedTuple):
@@ -120,6 +124,7 @@ class RobotDescription:
     tension: TensionRange
     #: whether the modules follow l_target itself, and the resulting tension is not regulated
     follows_position: bool
+    knows_tension: bool  # whether the modules measure tension
     speed: Array  # with which they follow it [m/s], (M,); infinite for other modules
     #: that a stop pays out where no tension is known [m], (M,)
     release: Array
@@ -145,6 +150,8 @@ class RobotDescription:
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if self.follows_position:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
+        if not self.knows_tension:
+            lines.append(f'tension_source: none: {NO_TENSION}')
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines
@@ -215,6 +222,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         stiffness=np.array(stiffness),
         tension=TensionRange(**_columns(tension)),
         follows_position=follows_position,
+        knows_tension=content.tension_source != 'none',
         speed=np.array(speed),
         release=np.array(release),
         end_effectors=_read_end_effectors(content, model, couplings, order, fail),
@@ -459,12 +467,15 @@ def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
     }
 
 
-def with_modules(description: RobotDescription, actuation: str) -> RobotDescription:
+def with_modules(
+    description: RobotDescription, actuation: str, tension_source: str = 'sensor'
+) -> RobotDescription:
     """Return the description with another kind of muscle modules and their default values."""
     follows_position, ones = actuation == 'position', np.ones(len(description.muscles))
     return replace(
         description,
         follows_position=follows_position,
+        knows_tension=tension_source != 'none',
         stiffness=ones * (math.inf if follows_position else STIFFNESS_DEFAULT),
         speed=ones * (SPEED_DEFAULT if follows_position else math.inf),
         release=np.full_like(ones, math.nan),

@@ -151,6 +151,7 @@ class MuscleFile(Strict, frozen=True):
     muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
     series_elastic: ElasticEntry | None = None
     actuation: Literal['stiffness', 'position'] = 'stiffness'
+    tension_source: Literal['sensor', 'none'] = 'sensor'
     stiffness: Positive | UnsetType = UNSET  # K_stiff of muscle stiffness control [N/m]
     speed: Positive | UnsetType = UNSET  # of a module that follows positions [m/s]
     release: Positive | UnsetType = UNSET  # that it pays out if no tension is known [m]
@@ -176,6 +177,12 @@ class MuscleFile(Strict, frozen=True):
     def _check_actuation(self) -> None:
         """Check that no key belongs to the other kind of actuation."""
         is_position = self.actuation == 'position'
+        if self.tension_source == 'none' and not is_position:
+            raise ValueError(
+                "tension_source 'none' needs actuation: position, and actuation is 'stiffness', by "
+                'which a module regulates tension; publish the tension by which it regulates '
+                '(tension_source: sensor), or set actuation: position'
+            )
         foreign = ('stiffness',) if is_position else ('speed', 'release')
         needed = 'actuation: stiffness' if is_position else 'actuation: position'
         for key in foreign:

@@ -20,6 +20,8 @@ from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.stiffness import muscle_stiffness
 
+DESIRED_SHARE = 0.3  # tension of a well-tensed arm, as a share of T_limit
+
 
 class Robot:
     """Geometric model of D joints and M muscles (paper, §III-B)."""
@@ -34,6 +36,7 @@ class Robot:
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
         self.stiffness = description.stiffness
         self.follows_position, self.speed = description.follows_position, description.speed
+        self.knows_tension = description.knows_tension
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
@@ -122,6 +125,15 @@ class Robot:
     def fastest(self, rate_limit: float) -> Array:
         """Return the largest rate of each length command [m/s] (M,), with a given limit."""
         return np.minimum(rate_limit, self.speed)
+
+    @property
+    def assumed_tension(self) -> Array:
+        """Tension that models and plans use where it is not known [N], (M,).
+
+        It is that of a well-tensed arm, by which `check_robot` judges.
+        """
+        whole = self.description.tension
+        return np.maximum(whole.bias, DESIRED_SHARE * whole.limit)
 
     @property
     def release(self) -> Array:

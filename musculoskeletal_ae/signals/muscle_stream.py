@@ -57,8 +57,9 @@ class MuscleSample:
         time: Time of reception by the caller's clock [s].
         length: l, with the length offset removed [m].
         length_read: l as the sensor measured it [m].
-        motor_tension: Motor-side tension T [N].
-        bone_tension: Bone-side tension T_end, with tendon friction removed [N].
+        motor_tension: Motor-side tension T [N]; NaN where it is not known.
+        bone_tension: Bone-side tension T_end, with tendon friction removed [N]. Where tension is
+            not known, it is the one that models assume (`Robot.assumed_tension`).
         sliding: Direction in which each tendon slid last: 1 wound in, −1 paid out.
         temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
         usable: Which muscles are not isolated.
@@ -77,6 +78,14 @@ class MuscleSample:
     usable: Bools
     newest: Array
     jumped: tuple[int, ...] = ()
+
+    @property
+    def model_tension(self) -> Array:
+        """T [N] (M,) as measured, or as models assume it where it is not known."""
+        tension: Array = np.where(
+            np.isnan(self.motor_tension), self.bone_tension, self.motor_tension
+        )
+        return tension
 
     def shifted(self, offset: Array) -> MuscleSample:
         """Return the same sample with lengths reduced by `offset` [m], (M,)."""
@@ -283,7 +292,12 @@ class MuscleStream:
         """
         muscle_count = self._robot.muscle_count
         try:
-            states = read_muscle_states(message, muscle_count, self.body.isolated)
+            states = read_muscle_states(
+                message,
+                muscle_count,
+                self.body.isolated,
+                needs_tension=self._robot.knows_tension,
+            )
         except MessageError as error:
             raw = None
             if len(message.data) == len(QUANTITIES) * muscle_count:
@@ -301,6 +315,9 @@ class MuscleStream:
         """
         now = time if now is None else now
         offsets = self.body.offsets
+        if not self._robot.knows_tension:
+            states = states.copy()
+            states[1] = np.nan
         newest = states.copy()
         newest[0] -= offsets.offset
         problem = self._problem(states, newest, now)
@@ -314,12 +331,13 @@ class MuscleStream:
         read = states if len(self._readings) == 1 else median_of_rows(np.array(self._readings))
         length = read[0] - offsets.offset
         sliding = self._direction.step(length)
+        end = end_tension(self._friction, read[1], sliding)
         return MuscleSample(
             time=time,
             length=length,
             length_read=read[0],
             motor_tension=read[1],
-            bone_tension=end_tension(self._friction, read[1], sliding),
+            bone_tension=end if self._robot.knows_tension else self._robot.assumed_tension,
             sliding=sliding,
             temperature=self._temperatures.step(read[2], now),
             usable=self.body.used,

@@ -42,9 +42,12 @@ class FrozenSensor(Detector):
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
         sample, robot = observation.sample, self._robot
-        tension, mae = sample.motor_tension, self._mae
+        # A tension that is not known is no frozen one.
+        tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)
+        if not robot.knows_tension:
+            is_same[1] = 0.0
         self._last = readings
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same
         is_calibrated = mae is not None and mae.anomaly is not None and mae.anomaly.calibrated

@@ -11,6 +11,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind
+from musculoskeletal_ae.robot.robot import Robot
 
 SILENT = 0.15  # [s] during which all messages have NaN for the same muscle
 
@@ -18,13 +19,15 @@ SILENT = 0.15  # [s] during which all messages have NaN for the same muscle
 class MissingValues(Detector):
     """Measures how long the same muscle has reported NaN."""
 
-    def __init__(self) -> None:
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
         self._muscle: int | None = None
         self._since = self._last = -math.inf  # times of the first and the last such message [s]
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
         """Take the readings of every message; see `Detector`."""
-        is_missing = ~np.isfinite(states[:2]).all(axis=0) & usable
+        known = states[:2] if self._robot.knows_tension else states[:1]
+        is_missing = ~np.isfinite(known).all(axis=0) & usable
         muscle = int(is_missing.argmax()) if np.count_nonzero(is_missing) == 1 else None
         if muscle != self._muscle or now - self._last > SILENT:
             self._since = now

@@ -114,7 +114,7 @@ class ResidualDistance(Detector):
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
         sample, error = observation.sample, observation.estimate.residual
-        tension, muscle_count = sample.motor_tension, len(sample.motor_tension)
+        tension, muscle_count = sample.model_tension, len(sample.motor_tension)
         distance, share = math.nan, error
         if self._statistics is not None:
             centred = error - self._statistics.mean
@@ -178,7 +178,7 @@ class ResidualDistance(Detector):
             limit = self.threshold
             value, name = self.statistic(observation, distance), self.symbol
             if value > limit and not has_slack:
-                theta, tension = observation.estimate.state.theta, observation.sample.motor_tension
+                theta, tension = observation.estimate.state.theta, observation.sample.model_tension
                 wider = self.limit(theta, tension)
                 if wider > limit:
                     limit = wider

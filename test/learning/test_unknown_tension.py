@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning from lengths and joint angles alone: the torque of an unknown tension says nothing."""
+
+import numpy as np
+
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.learning.body_fit import BodyFit
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.robot.description import with_modules
+from musculoskeletal_ae.robot.robot import Robot
+
+ROBOT = Robot(
+    with_modules(Robot.load('arm26').description, actuation='position', tension_source='none')
+)
+
+
+def test_a_body_is_fitted_to_lengths_whatever_torque_the_assumed_tension_would_give():
+    true, rng = Individual(ROBOT, 3), np.random.default_rng(0)
+    tension = np.tile(ROBOT.assumed_tension, (60, 1))
+    theta = ROBOT.random_postures(60, rng)
+    # The true tension is neither the assumed one nor in balance.
+    length = true.muscle_lengths(theta, tension * rng.uniform(0.8, 1.2, tension.shape))
+    known, still = np.ones(tension.shape, dtype=bool), np.zeros(tension.shape)
+    fit = BodyFit(ROBOT, None)
+    before = np.abs(fit.body.lengths(theta, tension, still)[0] - length).mean()
+    fitted = fit.fit(Observations(theta, tension, length, still, known), theta)
+    np.testing.assert_allclose(fitted.theta, theta, atol=0.02)  # the joint sensors decide
+    held_out = ROBOT.random_postures(200, rng)
+    assumed = np.tile(ROBOT.assumed_tension, (200, 1))
+    after = np.abs(
+        fit.body.lengths(held_out, assumed, 0.0 * assumed)[0]
+        - true.muscle_lengths(held_out, assumed)
+    ).mean()
+    assert after < 0.4 * before
