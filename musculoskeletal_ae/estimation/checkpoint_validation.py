@@ -17,16 +17,16 @@ both presets, on both shipped robots and both emulator models. `python -m bench 
 values, and those of attacks.
 
 A candidate without a calibrated detector inherits the detector in use, which would otherwise be
-switched off. There is one exception: for DECLARED seconds after a user has declared the body
-healthy, a repaired muscle may be relearned, and the candidate stays without a detector.
+switched off. A muscle that was repaired within the last DECLARED seconds may be relearned, and its
+residuals then differ from those of the calibration. The inherited detector ignores this muscle and
+judges all others, until a network with a calibrated detector of its own takes over.
 
 When an anomaly is detected, networks that have been in use for less than PROOF seconds are
 discarded, and the newest network that has been in use for longer takes over again.
 """
 
-import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -43,7 +43,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 PROOF = 10.0  # [s] without an anomaly, after which a network is proven
 MOST_USED = 20  # number of networks that are kept for a rollback
-DECLARED = 600.0  # [s] after a repair, during which no detector is inherited
+DECLARED = 600.0  # [s] after its repair, during which a muscle may be relearned
 NOTICED = 2.0  # [s] before an anomaly is detected, in which messages may already be faulty
 
 
@@ -63,7 +63,7 @@ class CheckpointValidator:
         self._messages = RecentMessages(robot.joint_count)
         self._used: list[tuple[float, Mae]] = []  # networks, and the times at which they took over
         self._is_anomaly = False
-        self._declared_at = -math.inf  # [s]
+        self._repaired_at: dict[int, float] = {}  # by muscle [s]
         self.isolated: tuple[int, ...] = ()
 
     @property
@@ -120,9 +120,9 @@ class CheckpointValidator:
         if faults:
             raise GateError('; '.join(faults))
 
-    def declare_healthy(self, now: float) -> None:
-        """Note that a user declares the body healthy as it is, for example after a repair."""
-        self._declared_at = now
+    def declare_repaired(self, muscles: Iterable[int], now: float) -> None:
+        """Note that a user declares muscles (indices) healthy as they are, after a repair."""
+        self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
         """Note that a network took over."""
@@ -166,9 +166,10 @@ class CheckpointValidator:
         """Return a network that takes over, with the detector in use if it has none of its own."""
         statistics = None if self.mae is None else self.mae.anomaly
         has_own = mae.anomaly is not None and mae.anomaly.calibrated
-        was_repaired = 0.0 <= now - self._declared_at < DECLARED
-        if has_own or was_repaired or statistics is None or not statistics.calibrated:
+        if has_own or statistics is None or not statistics.calibrated:
             return mae
+        repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < DECLARED]
+        statistics = statistics.ignoring(repaired)
         return detector.with_detector_of(statistics, mae, self._messages, self.isolated)
 
     def _steps(self, mae: Mae, is_chosen: bool) -> Iterator[str | None]:

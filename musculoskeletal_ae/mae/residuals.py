@@ -21,6 +21,7 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 # Lowest standard deviation in scaled units, below any sensor's resolution (0.02 N, 0.01 mm). Keeps
 # the covariance invertible when a network restores some combination of its inputs perfectly.
 FLOOR = 1e-4
+ANYTHING = 10.0  # standard deviation of a residual that is ignored, in scaled units
 LEAST_MOTION = 60.0  # [s] of motion that calibrated touch statistics need
 
 
@@ -78,11 +79,18 @@ class AnomalyStatistics:
 
     def without(self, muscles: Sequence[int]) -> AnomalyStatistics:
         """Return the statistics with the residuals of these muscles set to 0."""
+        return self._with_spread(muscles, FLOOR)
+
+    def ignoring(self, muscles: Sequence[int]) -> AnomalyStatistics:
+        """Return the statistics in which the residuals of these muscles may have any value."""
+        return self._with_spread(muscles, ANYTHING)
+
+    def _with_spread(self, muscles: Sequence[int], spread: float) -> AnomalyStatistics:
         count = len(self.mean) // 2
-        lost = [place + m for place in (0, count) for m in muscles]
+        places = [place + m for place in (0, count) for m in muscles]
         mean, covariance = self.mean.copy(), self.covariance.copy()
-        mean[lost] = covariance[lost] = covariance[:, lost] = 0.0
-        covariance[lost, lost] = FLOOR**2
+        mean[places] = covariance[places] = covariance[:, places] = 0.0
+        covariance[places, places] = spread**2
         return replace(self, mean=mean, covariance=covariance)
 
 

@@ -151,13 +151,14 @@ class Estimator(Shell):
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
         restored = self.muscles_to_isolate or isolated  # if none is named, all
-        self.candidates.validator.declare_healthy(time.monotonic())
+        self.candidates.validator.declare_repaired(restored, time.monotonic())
         return self._isolate(set(isolated) - set(restored))
 
     def _reset(self, _: Trigger.Request) -> str:
-        cause = self.core.cause
+        cause, finding = self.core.cause, self.core.suspects.finding
         self.core.reset()
-        self.candidates.validator.declare_healthy(time.monotonic())
+        if finding is not None:
+            self.candidates.validator.declare_repaired([finding.muscle], time.monotonic())
         self._publish_offsets()
         self.published_anomaly = False
         self.candidates.on_anomaly(False)

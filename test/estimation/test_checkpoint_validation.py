@@ -255,8 +255,27 @@ def test_a_network_without_a_calibrated_detector_takes_over_with_that_in_use(tra
     assert max(ruptured) > 1.0
     own = calibrated(trained['paper'])
     assert gate.with_detector(own, end) is own
-    gate.declare_healthy(end)
-    assert gate.with_detector(mae, end) is mae
+
+
+def test_the_inherited_detector_ignores_only_the_repaired_muscle(trained):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    gate.take(calibrated(mae), 0.0)
+    end = send_healthy_messages(gate)
+    gate.declare_repaired([2], end)
+    kept = gate.with_detector(mae, end + 1.0)
+    assert kept.anomaly.calibrated
+    # Another network without a detector takes over, long after the repair.
+    gate.take(kept, end + 1.0)
+    again = gate.with_detector(mae, end + 1e4)
+    _, *ruptured = gate.detector_measures(again)
+    assert max(ruptured) > 1.0
+    changed = np.zeros((1, 2 * ROBOT.muscle_count))
+    distances = []
+    for muscle in (2, 3):
+        error = changed.copy()
+        error[0, muscle] = 1.0
+        distances.append(float(again.anomaly.distances(error + again.anomaly.mean)[0]))
+    assert distances[0] < 0.2 < 5.0 < distances[1]
 
 
 def _turned(mae, angle):
