@@ -583,7 +583,9 @@ class Controller:
         limit = self.watchdog.heat.momentary
         if not self.stream.body.offsets.known:
             limit = np.minimum(limit, gentle_limit(self.robot))
-        return self.limiter.limit(desired, self.sample, limit, dt)
+        is_winding = self.is_following and self.supervisor.is_running
+        lead = self.activities.follower.winches.lead if is_winding else 0.0
+        return self.limiter.limit(desired, self.sample, limit, dt, lead)
 
     # -- requests -------------------------------------------------------------------------------
 

@@ -6,13 +6,17 @@
 Muscle stiffness control exerts T_bias + K (l − l_target). Therefore the tension limit of a muscle
 limits its commanded length:
 
-    l_target ≥ l + l_comp(T_limit) + r,   l_comp(T) = −(T − T_bias) / K_stiff
+    l_target ≥ l + l_comp(T_limit) + r − λ max(0, −dl/dt),   l_comp(T) = −(T − T_bias) / K_stiff
     dr/dt = RELIEF (T − T_limit)/K_stiff,   0 ≤ r ≤ −l_comp(T_limit)
 
 No module is commanded to exert more than T_limit, whatever a plan, a feedback, a wrong network or
-contact demands. If the measured tension exceeds the limit nevertheless, for example because K_stiff
-or a sensor is wrong, the feedback r pays the muscle out further. A muscle whose measured tension is
-above `tension.limit` is paid out faster than the rate limit. No muscle is wound in faster.
+contact demands. While a muscle is measured to wind in, its module lags by λ dl/dt (`winches`). The
+motor then takes K_stiff λ dl/dt of the demand to turn, and the tendon does not bear this part. The
+lead ends with the motion, or as soon as the measured tension is above the limit.
+
+If the measured tension exceeds the limit nevertheless, for example because K_stiff or a sensor is
+wrong, the feedback r pays the muscle out further. A muscle whose measured tension is above
+`tension.limit` is paid out faster than the rate limit. No muscle is wound in faster.
 
 Modules that follow positions turn a command into tension by stretching the series elastic elements:
 
@@ -138,7 +142,12 @@ class CommandLimiter:
         return rate if kind == LENGTH else rate * robot.tension_per_length(robot.tension.bias)
 
     def limit(
-        self, desired: Command, sample: MuscleSample, tension_limit: Array, dt: float
+        self,
+        desired: Command,
+        sample: MuscleSample,
+        tension_limit: Array,
+        dt: float,
+        lead: Array | float = 0.0,
     ) -> Command | None:
         """Limit a command and record the result as published.
 
@@ -147,6 +156,7 @@ class CommandLimiter:
             sample: The newest muscle states.
             tension_limit: Tension limit of each muscle in addition to `tension.limit` [N], (M,).
             dt: Time since the last command [s].
+            lead: λ max(0, −dl/dt) of each muscle [m], (M,).
 
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
@@ -163,7 +173,9 @@ class CommandLimiter:
         if kind == TENSION:
             value = np.clip(value, self._robot.tension.bias, limit)
         else:
-            value = np.maximum(value, self._shortest(before, change, sample, limit, dt))
+            shortest = self._shortest(before, change, sample, limit, dt)
+            is_relaxed = sample.motor_tension * sample.usable <= limit
+            value = np.maximum(value, shortest - lead * is_relaxed)
         if not np.isfinite(value).all():
             return None
         self.command = Command(kind, value)

@@ -30,6 +30,7 @@ class Winches:
         self._products, self._squares = 0.0, LAGS
         self._since = self._last = 0.0
         self._length: Array | None = None
+        self._speed: Array = np.zeros(robot.muscle_count)  # dl/dt [m/s], (M,)
 
     def use(self, robot: Robot) -> None:
         """Use another robot description; its isolated muscles are ignored."""
@@ -39,6 +40,11 @@ class Winches:
     def lag(self) -> float:
         """The present estimate of λ [s]."""
         return min(max(self._products / self._squares, 0.0), LARGEST_LAG)
+
+    @property
+    def lead(self) -> Array:
+        """By how much the modules lag behind their commands while they wind in [m], (M,)."""
+        return self.lag * np.maximum(-self._speed, 0.0)
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
         """Take l [m] and T [N], (M,), and the length command at that time.
@@ -53,7 +59,7 @@ class Winches:
         self._length, self._since = length, 0.0
         if before is None:
             return
-        speed = (length - before) / since
+        self._speed = speed = (length - before) / since
         lacking = length - command + msc_compensation(self._robot, tension)
         is_usable = (np.abs(speed) > WINDING) & self._robot.used
         if not self._robot.follows_position:
@@ -64,3 +70,4 @@ class Winches:
     def forget(self) -> None:
         """Discard the last length after a pause; λ is kept."""
         self._length, self._since = None, 0.0
+        self._speed = np.zeros_like(self._speed)

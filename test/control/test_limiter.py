@@ -55,6 +55,20 @@ def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_h
         before = sent
 
 
+def test_the_lead_of_a_winding_muscle_demands_more_only_while_its_tension_is_below_the_limit():
+    lead, desired = 0.01, Command(LENGTH, np.full(COUNT, -1.0))
+    limit = ROBOT.tension.limit
+
+    def demanded(tension, lead):
+        limiter, now = CommandLimiter(ROBOT, Settings(rate_limit=1e3)), sample(0.0, tension)
+        sent = limiter.limit(desired, now, LIMIT, DT, lead).value
+        return BIAS + ROBOT.stiffness * -sent
+
+    np.testing.assert_allclose(demanded(BIAS, 0.0), limit)
+    np.testing.assert_allclose(demanded(BIAS, lead), limit + ROBOT.stiffness * lead)
+    assert (demanded(limit + 1.0, lead) <= limit).all()
+
+
 def test_wrong_lengths_without_a_matching_tension_pay_out_at_the_rate_limit():
     limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
     held = unchanging(ROBOT, LENGTH, now)
