@@ -82,7 +82,8 @@ def fit_body(
             prior = prior._replace(mean=prior_mean[m])
         priors.append(_reopened(body, replace(observed, theta=start), prior, m))
     means, spreads = map(list, zip(*priors, strict=True))
-    return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE))
+    is_learned = prior_mean is not None
+    return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
 
 
 def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:

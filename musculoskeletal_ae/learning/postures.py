@@ -57,6 +57,7 @@ LEAST_NOISE = 0.0008  # smallest σ of a length in the weights: error that no bo
 #: offsets of the tension sensors are common to all samples.
 TORQUE = 0.3
 LEAST_TORQUE = 0.01  # smallest usual residual torque, as the same share
+SCALINGS = 2  # iterations of the Birge ratio
 ROUNDS = 12  # largest number of Gauss–Newton iterations
 #: The iterations end when the cost decreases by less than this for each length. The step is then
 #: far shorter than the posterior spread, and the noise has settled. With ten times this value, the
@@ -91,7 +92,12 @@ class GroupFit:
     """
 
     def __init__(
-        self, model: PostureModel, mean: list[Array], spread: list[Array], least_noise: float
+        self,
+        model: PostureModel,
+        mean: list[Array],
+        spread: list[Array],
+        least_noise: float,
+        is_learned: bool = False,
     ) -> None:
         """Create the fit of one group.
 
@@ -100,7 +106,10 @@ class GroupFit:
             mean: Prior mean w̄ of each muscle.
             spread: Prior spread s of each muscle.
             least_noise: Smallest σ of a length [m].
+            is_learned: Whether the prior means were learned; otherwise they are those of the
+                geometric model.
         """
+        self._least_ratio = 1.0 if is_learned else 0.0
         self.model, self.stops = model, Stops(model)
         self.prior = GroupPrior.of(model, mean, spread)
         self._least_noise = least_noise
@@ -126,15 +135,38 @@ class GroupFit:
         """
         enough = ENOUGH * self._known.sum()
         fit = minimise(self, self.point(start), ROUNDS, enough)
-        assert fit.eliminated is not None
-        eliminated, prior = fit.eliminated, self.prior
-        if fit.level or (prior.unread > 1.0).any():
-            # Errors of the body model are common to all samples: see ALIKE.
-            self._weights = self._weights._replace(torque=self._weights.torque / prior.unread)
-            prior.repeated = prior.repeated * prior.unread
-            eliminated = Eliminated(self.equations(fit.point), 0.0, SMALL)
-        self._widen(fit.point.residuals, eliminated.root)
-        return fit.point.unknowns, eliminated.root
+        root = self._posterior(fit.point)
+        self._widen(fit.point.residuals, root)
+        return fit.point.unknowns, root
+
+    def _posterior(self, point: Point) -> Array:
+        """Return the posterior root of (w, z, e) at the solution.
+
+        The spreads of the prior are scaled by the Birge ratio √(χ²/γ). χ² is the square of the
+        deviation from the prior mean in units of the spreads, and γ the number of parameters that
+        the samples determine. An arm that differs from its model more than the prior expects, as
+        far as the samples show, is expected to do so in what they do not show, such as offsets of
+        joint sensors. An arm that agrees with a learned prior may still be wrong in the latter; the
+        ratio is then at least 1.
+        """
+        prior = self.prior
+        # Errors of the body model are common to all samples: see ALIKE.
+        self._weights = self._weights._replace(torque=self._weights.torque / prior.unread)
+        prior.repeated = prior.repeated * prior.unread
+        equations = self.equations(point)
+        root = Eliminated(equations, 0.0, SMALL).root
+        chi_square = float(prior.precision @ prior.deviation(point.unknowns.parameters) ** 2)
+        parameters = np.arange(len(prior.precision))
+        scaled = prior.precision
+        for _ in range(SCALINGS):
+            inverse = solve_triangular(root, np.eye(len(root)))[parameters]
+            undetermined = float(scaled @ np.square(inverse).sum(axis=1))
+            determined_count = max(1.0, len(parameters) - undetermined)
+            scaled = prior.precision / max(self._least_ratio, chi_square / determined_count)
+            common = equations.common.copy()
+            common[parameters, parameters] += scaled - prior.precision
+            root = Eliminated(equations._replace(common=common), 0.0, SMALL).root
+        return root
 
     def _widen(self, residuals: Residuals, root: Array) -> None:
         """Add the parameter uncertainty of relearned muscles to their length noise."""
@@ -282,6 +314,7 @@ def fit_jointly(
     mean: list[Array],
     spread: list[Array],
     least_noise: float,
+    is_learned: bool = False,
 ) -> tuple[Array, Array, Array, Array, list[tuple[Ints, Array]]]:
     """Fit the body, the joint-sensor offsets and the postures of the samples.
 
@@ -292,6 +325,8 @@ def fit_jointly(
         mean: Prior mean of each muscle's parameters.
         spread: Prior spread of each muscle's parameters.
         least_noise: Smallest σ of a length [m].
+        is_learned: Whether the prior means were learned; otherwise they are those of the geometric
+            model.
 
     Returns:
         The fields of `Fit`.
@@ -307,7 +342,8 @@ def fit_jointly(
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
         model = PostureModel(body, observed, joints, muscles, bent)
-        fit = GroupFit(model, [mean[m] for m in muscles], [spread[m] for m in muscles], least_noise)
+        means, spreads = ([prior[m] for m in muscles] for prior in (mean, spread))
+        fit = GroupFit(model, means, spreads, least_noise, is_learned)
         own_parameters = [body.parameters[m] for m in muscles]
         begin = Unknowns(theta, zero[joints], own_parameters, body.springs)
         solution, group_root = fit.run(begin)
