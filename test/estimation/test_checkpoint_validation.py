@@ -74,6 +74,37 @@ def test_a_bad_network_is_refused_without_any_message_and_the_error_names_figure
     assert any(f'limit {limit:g}' in str(refusal.value) for limit in LIMITS.values())
 
 
+class RestoringAll:
+    """A network that restores every state, with its own lengths."""
+
+    def __init__(self, softness, offset=0.0):
+        self.softness, self.offset = softness, offset
+
+    def lengths(self, theta, tension):
+        relative = ROBOT.routes.relative_lengths(theta)
+        elongation = relative - ROBOT.muscle_lengths(theta, tension)
+        return relative - self.softness * elongation + self.offset
+
+    def encode(self, _mask, theta, tension, length):
+        return theta, tension, length
+
+    def decode(self, state):
+        return state
+
+    def muscle_jacobian(self, theta, _tension):
+        return ROBOT.routes.muscle_jacobian(theta)
+
+
+@pytest.mark.parametrize('softness', [0.3, 1.0, 4.0])
+def test_muscles_of_another_softness_pass_and_lengths_with_an_offset_do_not(softness):
+    def length_error(mae):
+        return dict(filter(None, CheckpointValidator(ROBOT).postures.errors(mae)))['l by ①']
+
+    assert length_error(RestoringAll(softness)).max() < 0.1
+    for offset in (-0.08, 0.08):
+        assert length_error(RestoringAll(softness, offset)).min() > LIMITS['l by ①']
+
+
 def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
     arms = {name: behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items()}
     for name, robot in arms.items():
