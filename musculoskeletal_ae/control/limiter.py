@@ -174,8 +174,10 @@ class CommandLimiter:
             value = np.clip(value, self._robot.tension.bias, limit)
         else:
             shortest = self._shortest(before, change, sample, limit, dt)
-            is_relaxed = sample.motor_tension * sample.usable <= limit
-            value = np.maximum(value, shortest - lead * is_relaxed)
+            # A module that follows positions winds in by its lead even if the arm is blocked.
+            if not self._robot.follows_position:
+                shortest -= lead * (sample.motor_tension * sample.usable <= limit)
+            value = np.maximum(value, shortest)
         if not np.isfinite(value).all():
             return None
         self.command = Command(kind, value)
