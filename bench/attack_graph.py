@@ -297,7 +297,7 @@ class Attack:
         end = time.monotonic() + PATIENCE
         while not condition():
             if time.monotonic() > end:
-                self.found(promise, f'waited {PATIENCE:g} s in vain for {what}')
+                self.found(promise, f'timeout after {PATIENCE:g} s: {what}')
                 return False
             self.spin(0.1)
         return True

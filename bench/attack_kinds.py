@@ -93,7 +93,9 @@ class Scene:
             if level != 'error' and self._goes_on(moment):
                 return
             self.follow_advice()
-        attack.found('the advice helps', f'{self.what}: not in {PATIENCE:g} s; last: {trouble}')
+        attack.found(
+            'the advice helps', f'{self.what}: no recovery in {PATIENCE:g} s; status: {trouble}'
+        )
         attack.end_strangers()
         for name in NODES:
             self.resume(name)

@@ -130,7 +130,7 @@ def interpreter(version: str) -> Path | None:
 def _needed(version: str) -> Path:
     python = interpreter(version)
     if python is None:
-        raise MusculoskeletalError(f'there is no python{version}, on PATH or of pyenv')
+        raise MusculoskeletalError(f'python{version} is neither on PATH nor in pyenv')
     return python
 
 
@@ -209,7 +209,7 @@ def _debian_13(site: Site) -> None:
     """Create a minimal Debian 13 (Python 3.13, no compiler, no libgomp, no venv), and enter it."""
     root = site.folder / 'debian'
     if os.getuid() != 0 or shutil.which('debootstrap') is None:
-        raise MusculoskeletalError('a Debian 13 is made by root, with debootstrap')
+        raise MusculoskeletalError('creating a Debian 13 requires root and debootstrap')
     site.run(
         'Debian 13',
         f'debootstrap --variant=minbase --include={DEBIAN_PACKAGES} trixie {root}',
@@ -283,7 +283,7 @@ def check_node(name: str, folder: Path, checkpoint: Path) -> str:
     packages = pinned(ROOT / 'requirements.txt', version, NODE_REQUIREMENTS)
     packages += [] if is_sourced else pinned(ROS_REQUIREMENTS, version)
     site.run(
-        f'Python {version} with {len(packages)} packages and what they need',
+        f'Python {version} with {len(packages)} packages and their dependencies',
         *site.setup,
         f'"${{PYTHON:-python3}}" -m venv {"--system-site-packages" if is_sourced else ""} {venv}',
         f'{venv}/bin/python -m pip install --no-compile {" ".join(packages)}',

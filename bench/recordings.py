@@ -203,7 +203,7 @@ def main(argv: list[str]) -> int:
     """Learn all repositories that there are clones of; return 1 if there is none."""
     parser = Parser('recordings', "Learns public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
-    parser.add_argument('--fetch', action='store_true', help='clone what is missing from GitHub')
+    parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')
     parser.add_argument('--only', default='', help='part of the name of a repository')
     parser.add_argument('--out', type=Path, default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)

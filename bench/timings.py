@@ -63,7 +63,10 @@ class Timed(NamedTuple):
 
 
 def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
-    """Return the multiply-adds of the encoder, if there is a mask, and of the decoder or of l."""
+    """Return the number of multiply-adds of a pass through encoder and decoder.
+
+    Without a mask, the encoder is not used. With `lengths`, the decoder computes only l.
+    """
     depth, total = len(mae.encoder) // len(mae.groups), sum(w.size for w, _ in mae.decoder)
     for g, group in enumerate(mae.groups):
         muscles = len(group.muscles)
@@ -270,7 +273,7 @@ def emulation_rows(robot: Robot) -> list[Row]:
     steps = 10
     return [
         Row(
-            f'emulated millisecond, body {reality}',
+            f'emulated millisecond, model {reality}',
             partial(make_arm(robot, 0, reality).step, steps * STEP),
             several=steps,
         )

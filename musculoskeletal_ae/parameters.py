@@ -31,7 +31,7 @@ class Parameter:
     """A value that a user may choose."""
 
     default: Any  # also determines the type; a tuple for a list of numbers or names
-    meaning: str  # one phrase
+    meaning: str  # description as one phrase
     unit: str = ''  # such as 'rad/s'
     within: tuple[float, float] | None = None  # lowest and highest legal value of a number
     legal: tuple[str, ...] = ()  # legal words; empty for any

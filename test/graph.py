@@ -189,7 +189,7 @@ class Graph:
                 raise AssertionError(f'{dead[0].name} ended with {status}: {output[-2000:]}')
             if time.monotonic() > end:
                 raise AssertionError(
-                    f'waited {deadline:g} s in vain for {what}; {self._last_diagnostics()}'
+                    f'timeout after {deadline:g} s: {what}; {self._last_diagnostics()}'
                 )
             self.executor.spin_once(LOOK)
         return value

@@ -530,7 +530,7 @@ class Controller:
             self._approach(self.settings.target_duration or self.settings.first_duration)
         command = activities.step(control, inputs)
         if control is activities.gravity_compensation:
-            # The next method holds the posture in which the arm was left.
+            # The next method holds the present posture.
             inside = np.clip(inputs.theta, self.robot.lower, self.robot.upper)
             self.target_state = Target(np.zeros_like(inside), inside)
         if control is activities.exploring:

@@ -177,7 +177,7 @@ class Listening:
                 lacking = np.isnan(theta).all(axis=0)
                 which = ', '.join(np.array(self._robot.joints)[lacking]) or 'all joints at once'
                 verdict.notes.append(
-                    f'sign, zero and order of l are not judged without θ of {which}: publish '
+                    f'sign, zero and order of l are not checked without θ of {which}: publish '
                     'joint_states, or hold the arm still and pass --posture'
                 )
         return verdict

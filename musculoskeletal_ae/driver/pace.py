@@ -69,7 +69,7 @@ class Pace:
         if self._explain(gap, came, now):
             verdict.notes.append(
                 f'this computer is busy: no message was received for {gap:.2f} s, and check_driver '
-                'was blocked as well. The rate is not judged; end other programs and try again'
+                'was blocked as well. The rate was not checked; end other programs and try again'
             )
         elif gap > LONGEST_GAP:
             verdict.failed('gap', gap=gap)

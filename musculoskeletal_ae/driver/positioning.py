@@ -142,7 +142,7 @@ class Positioning(MotionTest):
         else:
             verdict.passed('unit', m)
         if np.isnan(pulled):
-            verdict.notes.append(f'{self.trying}: its tension is unknown, the sign is not judged')
+            verdict.notes.append(f'{self.trying}: its tension is unknown, sign not checked')
         elif pulled < -RESPONSE[0]:
             detail = f'T fell by {-pulled:.0f} N as l fell by {1e3 * moved[m]:.1f} mm'
             verdict.failed('position sign', m, detail=detail)

@@ -46,7 +46,7 @@ class Verdict:
         self.robot = robot
         self._state = np.full((robot.muscle_count, len(CHECKS)), OPEN, dtype=object)
         self.faults: list[Fault] = []
-        self.notes: list[str] = []  # remarks, and what could not be judged
+        self.notes: list[str] = []  # remarks, and checks that were not possible
 
     def passed(self, check: str, *muscles: int) -> None:
         """Record that muscles (none: all) passed a check, unless they have failed it."""

@@ -206,7 +206,7 @@ class Winding(MotionTest):
         yield from self._wait(HOLD)
         return self._mean()
 
-    # -- what is judged -------------------------------------------------------------------------
+    # -- checks -----------------------------------------------------------------------------------
 
     def _try(self, m: int) -> Wait:
         robot, verdict, home = self._robot, self.verdict, self._mean()
@@ -248,7 +248,7 @@ class Winding(MotionTest):
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
         if asked < 0.25 * (self._highest - self._bias)[m]:
-            note = f'{self._robot.muscles[m]}: the arm gave way, the law is not judged'
+            note = f'{self._robot.muscles[m]}: the arm moved, so the control law was not checked'
             self.verdict.notes.append(note)
             return
         if abs(last.third[m] - home.third[m]) > 0.7 * asked and abs(got) < 0.3 * asked:

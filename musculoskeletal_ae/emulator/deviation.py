@@ -79,7 +79,7 @@ class Attachments:
     def move(self, muscles: Bools) -> None:
         """Draw the positions of the sites of some muscles (M,).
 
-        A site that would lie inside an object that a tendon wraps round keeps its original
+        A site that would lie inside an object that a tendon wraps around keeps its original
         position.
         """
         own = [self._sites[m] for m in np.flatnonzero(muscles)]

@@ -88,7 +88,7 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
     """Return the model of a robot directory with the differences of an individual.
 
     Route points are redrawn until no tendon slips, by centimetres, over the end of a described
-    object that it wraps round. No one would route a tendon there.
+    object that it wraps around. No one would route a tendon there.
     """
     again = np.zeros(robot.muscle_count, dtype=np.int64)
     model = mjcf.from_directory(robot, draw, again).compile()

@@ -106,7 +106,7 @@ class Individual:
     ) -> None:
         """Redraw points' deviations (P, 3) until tendons jump only where those of the model do.
 
-        A tendon jumps by centimetres if it slips over the end of an object that it wraps round. No
+        A tendon jumps by centimetres if it slips over the end of an object that it wraps around. No
         one would route a tendon there. `again` holds the deviations to try.
         """
         nominal = robot.routes
@@ -141,7 +141,7 @@ class Individual:
 def _objects(
     robot: Robot, point: Array, quantile: float, seed: int, thickness: Array
 ) -> WrapObjects:
-    """Return the object that each segment wraps round: a described one, or a bone's head.
+    """Return the object that each segment wraps around: a described one, or a bone's head.
 
     A described object has a slightly different radius than in the description. A bone's head is
     centred at the joint nearest to the tendon. The tendon touches it in a share `quantile` of the

@@ -252,7 +252,7 @@ def _obstacle(
 
 
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
-    """Add a sphere or a cylinder for tendons to wrap round, without collisions."""
+    """Add a sphere or a cylinder for tendons to wrap around, without collisions."""
     kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -307,8 +307,8 @@ def from_file(robot: Robot, file: Path) -> Any:
         names = [thing.name for thing in present]
         if missing := [name for name in wanted if name not in names]:
             available = ', '.join(filter(None, names))
-            problem = f'{kind} {missing[0]!r} of {robot.description.directory} is not in it'
-            remedy = f'it has: {available}; create the robot with import_robot'
+            problem = f'{kind} {missing[0]!r} of {robot.description.directory} is missing'
+            remedy = f'the file has: {available}; create the robot with import_robot'
             raise _file_error(file, f'{problem}; {remedy}')
     joint_types = {joint.name: joint.type for joint in spec.joints}
     for name, slides in zip(followers, robot.kinematics.tree.prismatic[1:], strict=True):

@@ -120,7 +120,7 @@ Memory = namedtuple('Memory', 'elongation loop slow rest bend longer over readin
 #: Paths of the tendons, as arrays of MuJoCo.
 #:     tendon          MuJoCo tendon of each muscle, (M,)
 #:     point           points of all paths [m], (P, 3)
-#:     kind            −1 for a site, otherwise the geom that the tendon wraps round, (P,)
+#:     kind            −1 for a site, otherwise the geom that the tendon wraps around, (P,)
 #:     start, count    first point and number of points of each tendon
 #:     site            sites of the muscles, in order
 #:     body            body of each site, (S,)

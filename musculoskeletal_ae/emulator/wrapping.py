@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Muscle routes that wrap round bones, compiled by numba: the true lengths of the emulated arm.
+"""Muscle routes that wrap around bones, compiled by numba: the true lengths of the emulated arm.
 
-A segment between two route points may wrap round a sphere (a bone's head) that the geometric model
+A segment between two route points may wrap around a sphere (a bone's head) that the geometric model
 of `robot/routes.py` does not contain. Segments that the robot description wraps also wrap here,
 round an object of a slightly different size. `robot/wrapping.py` computes the path of the tendon on
 either.
@@ -47,7 +47,7 @@ class WrappedRoutes(NamedTuple):
     second: Ints  # end point of each segment, (S,)
     muscle: Ints  # muscle of each segment, (S,)
     weight: Array  # factor of each segment's length and tension, (S,)
-    objects: WrapObjects  # object that each segment wraps round; radius 0 if none
+    objects: WrapObjects  # object that each segment wraps around; radius 0 if none
 
 
 class Placed(NamedTuple):

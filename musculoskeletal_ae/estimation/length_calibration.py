@@ -68,12 +68,12 @@ class LengthCalibration:
 
     @property
     def time(self) -> float:
-        """How long the arm has moved gently, or stood [s]."""
+        """Duration of gentle motion, or of standing, so far [s]."""
         return self._collector.time
 
     @property
     def enough(self) -> float:
-        """How long the arm has to move gently, or to stand [s]."""
+        """Required duration of gentle motion, or of standing [s]."""
         if self.is_standing:
             return STANDING
         return ENOUGH_WITH_ANGLES if self._has_angles else ENOUGH

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may choose about detection: one table for the core and the parameters of the node."""
+"""Settings of anomaly detection: one table for the core and the parameters of the node."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
 
 @dataclass(frozen=True)
 class Detection:
-    """What is an anomaly; what winds in slack wire, so that no tension is no cut muscle yet."""
+    """Settings of the detectors, of the winding in of slack, and of the reaction to an anomaly."""
 
     anomaly_threshold: float = settable(
         0.0,

@@ -43,14 +43,14 @@ ACQUITTALS, WITHIN = 2, 60.0  # number of healthy suspects, and the time in whic
 OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
 
 
-FIND_OFFSETS = 'call estimator/zero, which finds the length offsets anew'
+CALIBRATE = 'call estimator/zero, which calibrates the lengths again'
 #: remedies for findings about length offsets and joint sensors, for users
 REMEDIES = {
-    Kind.LENGTH_JUMP: FIND_OFFSETS,
-    Kind.LENGTHS_JUMPED: FIND_OFFSETS,
-    Kind.LENGTHS_DISAGREE: FIND_OFFSETS,
+    Kind.LENGTH_JUMP: CALIBRATE,
+    Kind.LENGTHS_JUMPED: CALIBRATE,
+    Kind.LENGTHS_DISAGREE: CALIBRATE,
     Kind.JOINT_SENSORS_DISAGREE: (
-        'check the joint sensor and call estimator/reset; if it is right, call estimator/zero'
+        'check the joint sensor and call estimator/reset; if it is correct, call estimator/zero'
     ),
 }
 

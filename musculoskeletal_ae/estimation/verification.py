@@ -88,8 +88,8 @@ _TEXTS = {
     Outcome.LENGTH_SENSOR_FROZEN: 'its length sensor is frozen',
     Outcome.LENGTH_SENSOR_OFFSET: 'its length sensor is off',
     Outcome.TENSION_SENSOR_FROZEN: 'its tension sensor is frozen',
-    Outcome.NOT_WOUND_IN: 'not verified, since nobody wound it in',
-    Outcome.TENSION_UNKNOWN: 'not verified, since its tension is not known (tension_source: none)',
+    Outcome.NOT_WOUND_IN: 'not verified, because it was not wound in',
+    Outcome.TENSION_UNKNOWN: 'not verified, because its tension is unknown (tension_source: none)',
     Outcome.VALUES_MISSING: 'a sensor does not report a number',
 }
 

@@ -166,7 +166,7 @@ def grasp_and_cut(_: Study, rows: Rows) -> Plot:
     return figure, (
         'Estimation error, anomaly A, and the distance d on which the detector decides, for '
         f'the same recording before and after learning. The arm grasps {PAYLOAD:g} kg (dashed); '
-        f'then {ruptured} ruptures (yellow) and is mended.'
+        f'then {ruptured} ruptures (yellow) and is repaired.'
     )
 
 

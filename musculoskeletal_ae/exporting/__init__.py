@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A learned body as a model of another format."""
+"""Export of a learned body in other formats."""

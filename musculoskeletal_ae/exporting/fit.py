@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parametric body that is nearest to a learned network.
+"""Fit a parametric body to a learned network.
 
     min over δ, κ, o   Σ_n (l_net(θ_n, T_n) − l(θ_n, T_n; δ, κ, o))² / σ²
                        + Σ (δ/s_δ)² + Σ (κ/s_κ)² + (o/s_o)²
 
-l is the calibrated body of `learning/body.py` without its residual model: attachment points that
-are off by δ, elastic constants off by the factor e^κ, a length offset o. Each muscle is fitted
-alone, by Gauss–Newton with a damping that falls. What is left is what such a body cannot hold.
+l is the length of the calibrated body of `learning/body.py` without its residual model. Its
+parameters are displacements δ of the route points, factors e^κ of the elastic constants, and a
+length offset o. Each muscle is fitted separately, by the Gauss–Newton method with decreasing
+damping. The residual is the part of the network that such a body cannot represent.
 """
 
 from dataclasses import dataclass
@@ -18,22 +19,31 @@ from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-STATES = 1500  # random states that are fitted
+STATES = 1500  # number of random states in the fit
 NOISE = 3e-4  # σ of the network's lengths [m]
-ATTACHMENT, ELASTIC, OFFSET = 0.02, 0.5, 0.05  # s_δ [m], s_κ, of o [m]
-DAMPING = (10.0, 1.0, 0.1, 0.01, 0.0, 0.0, 0.0, 0.0)  # of each round, times the diagonal
+ATTACHMENT, ELASTIC, OFFSET = 0.02, 0.5, 0.05  # s_δ [m], s_κ, s_o [m]
+DAMPING = (
+    10.0,
+    1.0,
+    0.1,
+    0.01,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+)  # damping of each round, relative to the diagonal
 
 
 @dataclass(frozen=True)
 class FittedBody:
-    """What was fitted."""
+    """The fitted body and its residual."""
 
     body: CalibratedBody
-    residual: Array  # root mean square of what is left of each muscle's length [m], (M,)
+    residual: Array  # root mean square residual of each muscle's length [m], (M,)
 
     @property
     def shift(self) -> Array:
-        """How far each route point is off, in the frame of its joint [m], (P, 3)."""
+        """Displacement of each route point in the frame of its joint [m], (P, 3)."""
         shift = np.zeros((len(self.body.robot.routes.point), 3))
         for layout, parameters in zip(self.body.layouts, self.body.parameters, strict=True):
             shift[layout.points] = parameters[layout.attachment].reshape(-1, 3)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A learned body as an MJCF model, and how far it is from the network that it was made from.
+"""Export a learned body as an MJCF model, and compare the model with the network.
 
-Links, joints, limits and masses are those of the robot directory; attachment points are as
-learned, by `fit`. An actuator of each tendon is the muscle's series elastic element in series with
-its motor, whose length is the control:
+Links, joints, limits and masses are those of the robot directory. Route points are learned; `fit`
+computes them. Each tendon has an actuator that represents the series elastic element in series with
+a motor, whose length is the control:
 
     pull = k (L − u),   0 ≤ pull ≤ T_max,   k = dT/dx at T_mid = (T_bias + T_limit) / 2
 
-L is the tendon's length, u = l + offset for the motor's length l of this package. Tendon friction
-is a constant force of MuJoCo's, μ T_mid, and not the share of the tension that it really is.
+L is the length of the tendon in MuJoCo, and u = l + offset, where l is the length in this package.
+Tendon friction is approximated by a constant force μ T_mid, although it is a share of the tension.
 """
 
 from collections.abc import Callable
@@ -31,34 +31,34 @@ from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 1000  # in which the model and the network are compared
-DAMPING = 0.05  # [N·m·s/rad] of a joint, or times joint_gear; chosen, so that it can be simulated
+POSTURES = 1000  # postures in which the model and the network are compared
+DAMPING = 0.05  # [N·m·s/rad] of a joint, or times joint_gear; chosen for a stable simulation
 THIN = 0.008  # [m] radius of the capsules that draw bones
 TIMESTEP = 0.002  # [s]
 LEGEND = """\
-length      root mean square difference of lengths, their mean apart
-moment arm  the same of dl/dq, over all joints, beside its size
+length      standard deviation of the difference of lengths
+moment arm  root mean square difference of dl/dq over all joints, and the size of dl/dq
 spring      largest error of the linear spring between T_bias and T_limit
 offset      control = l + offset, where l is the length in muscle_states
 Torques of weight and springs are those of the robot directory, unless the springs were learned.
-The model does not hold: what is left of lengths and moment arms (above), the bend of the springs,
-friction as a share of the tension, creep, sensor errors, heat.
+The model does not represent the differences of lengths and moment arms above, the nonlinearity of
+the elastic elements, friction proportional to tension, creep, sensor errors and heat.
 """
 
 
 class Report(NamedTuple):
-    """How far an exported model is from the network, over the workspace."""
+    """Differences between an exported model and the network, over the workspace."""
 
-    lengths: Array  # root mean square error of each muscle at T_mid, its mean apart [m], (M,)
+    lengths: Array  # standard deviation of each muscle's length error at T_mid [m], (M,)
     arms: Array  # root mean square error of each muscle's moment arms [m], (M,)
     arm_size: Array  # root mean square of the network's moment arms [m], (M,)
     torque: Array  # largest difference of the torque that holds the weight [N·m], (D,)
     stretch: Array  # largest error of the linear spring within [T_bias, T_limit] [m], (M,)
-    warnings: tuple[str, ...]  # of MuJoCo when it loads the model
-    mjx: str  # what MJX makes of it
+    warnings: tuple[str, ...]  # warnings of MuJoCo about the model
+    mjx: str  # whether MJX can load the model
 
     def text(self, robot: Robot, offsets: Array) -> str:
-        """Return the report for people."""
+        """Return the report as a text."""
         counts = f'{robot.joint_count} joints, {robot.muscle_count} muscles, {POSTURES} postures'
         units = f'{"":<28}{"[mm]":>10}{"[mm]":>12}{"[mm]":>8}{"[mm]":>9}{"[m]":>11}'
         head = f'{"muscle":<28}{"length":>10}{"moment arm":>12}{"of":>8}{"spring":>9}{"offset":>11}'
@@ -71,23 +71,23 @@ class Report(NamedTuple):
             f'{name} {value:.2g} {unit.torque}'
             for name, value, unit in zip(robot.joints, self.torque, robot.units)
         )
-        warned = '; '.join(self.warnings) or 'of nothing'
+        warned = '; '.join(self.warnings) or 'none'
         lines += ['', f'torque of weight and springs, largest difference: {torques}']
-        lines += [f'MuJoCo warns: {warned}', f'MJX {self.mjx}', '', LEGEND]
+        lines += [f'warnings of MuJoCo: {warned}', f'MJX {self.mjx}', '', LEGEND]
         return '\n'.join(lines)
 
 
 def loads_in_mjx(model: Any) -> str:
-    """Say whether MJX takes a model."""
+    """Return a text on whether MJX can load a model."""
     try:
         from mujoco import mjx
     except ImportError:
-        return 'was not asked: mujoco-mjx is not installed'
+        return 'was not tested: mujoco-mjx is not installed'
     try:
         mjx.put_model(model)
-    except Exception as error:  # noqa: BLE001 - mjx names what it lacks by errors of many kinds
-        return f'does not take it: {" ".join(str(error).split())}'
-    return 'takes it'
+    except Exception as error:  # noqa: BLE001 - mjx raises errors of many kinds
+        return f'cannot load the model: {" ".join(str(error).split())}'
+    return 'can load the model'
 
 
 def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
@@ -108,7 +108,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
         spec.compile()
         text = spec.to_xml()
     except (ValueError, mujoco.FatalError) as error:
-        message = f'MuJoCo does not take the exported model: {" ".join(str(error).split())}'
+        message = f'MuJoCo rejects the exported model: {" ".join(str(error).split())}'
         raise MusculoskeletalError(f'{out}: {message}') from error
     out.mkdir(parents=True, exist_ok=True)
     file = out / 'model.xml'
@@ -129,9 +129,9 @@ class Springs(NamedTuple):
     """Linear springs of M muscles, each (M,)."""
 
     tension: Array  # T_mid [N]
-    elongation: Array  # there [m]
+    elongation: Array  # elongation at T_mid [m]
     stiffness: Array  # [N/m]
-    error: Array  # the largest between T_bias and T_limit [m]
+    error: Array  # largest error of the elongation between T_bias and T_limit [m]
 
 
 def _springs(fitted: FittedBody) -> Springs:
@@ -151,7 +151,7 @@ def _springs(fitted: FittedBody) -> Springs:
 
 
 def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
-    """Return the routes with points moved in the frames of their joints by (P, 3) [m]."""
+    """Return the routes with points displaced in the frames of their joints by (P, 3) [m]."""
     left = iter(shift)
 
     def item(part: Any) -> Any:
@@ -164,7 +164,7 @@ def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
 
 
 def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
-    """Return the model of a robot whose route points are as learned."""
+    """Return the MuJoCo model of a robot with learned route points."""
     exact, once = Draw(0, NONE), np.zeros(robot.muscle_count, dtype=np.int64)
     spec, bodies = mjcf.skeleton(robot, exact)
     mjcf.add_routes(robot, exact, once, spec, bodies)
@@ -193,7 +193,7 @@ def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
         spec.tendon(name).frictionloss = float(friction[m])
         k = float(springs.stiffness[m])
         gain, bias = np.zeros(10), np.zeros(10)
-        gain[0], bias[1] = k, -k  # force = k (u − L), which shortens where it is negative
+        gain[0], bias[1] = k, -k  # force = k (u − L); a negative force shortens the tendon
         reach = float(most[m]) / k
         span = [float(lengths[:, m].min()) - reach, float(lengths[:, m].max()) + reach]
         spec.add_actuator(
@@ -236,7 +236,7 @@ def _compare(
         mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
         arms[n] = kin.tree.of_theta(dense[tendons][:, tree], row)
         torques[n] = kin.tree.of_theta((data.qfrc_bias - data.qfrc_passive)[tree], row)
-    # What the spring adds at T_mid is a constant.
+    # The elongation of the spring at T_mid is constant.
     off = theirs - springs.elongation - lengths
     return Report(
         lengths=off.std(axis=0),

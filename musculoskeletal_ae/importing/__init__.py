@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot descriptions out of other people's formats: what `import_robot` does."""
+"""Import of robot descriptions in other formats (`import_robot`)."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CARDSflow robots: `cardsflow.xml` beside `model.urdf` or `model.sdf`; a URDF alone.
+"""Import of CARDSflow robots (`cardsflow.xml` with `model.urdf` or `model.sdf`), and of URDFs.
 
-CARDSflow measures via points from a link's centre of mass, in the axes of the link; those of the
-link 'world' stand still. SPHERICAL and CYLINDRICAL via points (axis z) are wraps, a MESH is taken
-as the point it names. Limits of joints may stand in `joint_limits.yaml` beside the model: for each
-joint a list of angles that it took, of which the least and the greatest count. A URDF alone gives a
-skeleton of muscles.yaml, one muscle to be replaced.
+CARDSflow states via points relative to a link's centre of mass, in the axes of the link; those of
+the link 'world' are fixed. SPHERICAL and CYLINDRICAL via points (axis z) become wraps, and a MESH
+becomes its point. `joint_limits.yaml` in the same directory may list angles of each joint; the
+smallest and the largest are its limits. A URDF alone gives a skeleton of muscles.yaml, with one
+muscle per joint that has to be replaced.
 """
 
 import os
@@ -33,14 +33,14 @@ from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_mimics, read_urdf
 
-Limits = dict[str, tuple[float, float]]  # lowest and highest of each joint [rad] or [m]
+Limits = dict[str, tuple[float, float]]  # lower and upper limit of each joint [rad] or [m]
 
 ROUND = 'SPHERICAL', 'CYLINDRICAL'  # via points that are wraps
-FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # what later versions of SDF add
+FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # attributes of later versions of SDF
 
 
 def read_cardsflow(file: Path, root: ET.Element) -> Source:
-    """Read a cardsflow.xml and the model beside it."""
+    """Read a cardsflow.xml and the model in its directory."""
     limits_file = file.parent / 'joint_limits.yaml'
     limits = _read_limits(limits_file)
     for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
@@ -49,7 +49,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
             source, centres = read(beside, tree, (limits, limits_file.name))
             break
     else:
-        raise refuse(file, 'there is no model.urdf and no model.sdf beside it')
+        raise refuse(file, 'its directory contains neither model.urdf nor model.sdf')
     if limits:
         known = [name for name in limits if source.model.existJointName(name)]
         source.note(
@@ -85,7 +85,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                     radius = float(numbers(via.get('radius'), 1, f'{where} radius')[0])
                     axis = np.eye(3)[2] if kind == 'CYLINDRICAL' else None
                     route.append(Wrap(body, at, radius, axis, None))
-                    source.note('chosen', f'muscle {name}: it wraps the shorter way round')
+                    source.note('chosen', f'muscle {name}: it wraps the short way around')
                     continue
                 if kind != 'FIXPOINT':
                     source.note('approximated', f'muscle {name}: a {kind} via point is a point')
@@ -100,7 +100,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
 
 
 def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
-    """Return the limits of joints of a joint_limits.yaml, none if it is not there."""
+    """Return the joint limits of a joint_limits.yaml; empty if there is no such file."""
     if not os.path.lexists(file):
         return {}
     document, limits = read_yaml(file, refuse), dict[str, tuple[float, float]]()
@@ -119,7 +119,7 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
 
 
 def _measure(source: Source) -> None:
-    """Let a source have the lengths that CARDSflow gives its straight routes."""
+    """Provide CARDSflow's lengths of straight routes for the comparison."""
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
     if not straight or not joints:
@@ -135,7 +135,7 @@ def _measure(source: Source) -> None:
 
 
 def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
-    """Read a URDF and invent a muscle, to be replaced, over each joint."""
+    """Read a URDF, and add a placeholder muscle over each joint."""
     source, _ = _read_urdf(file, root)
     carried = {source.place(link)[0]: link for link in reversed(source.links)}
     names = distinct(safe_name(f'muscle_of_{joint}', '') for joint in source.model.names[1:])
@@ -147,7 +147,7 @@ def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
 
 
 def _endless(*ends: str | None) -> bool:
-    """Return whether limits are such as exporters write where there are none, as 1e16."""
+    """Return whether limits are placeholders for no limits, such as 1e16."""
     try:
         return any(abs(float(end or 0.0)) > 1e6 for end in ends)
     except ValueError:
@@ -157,7 +157,7 @@ def _endless(*ends: str | None) -> bool:
 def _read_urdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return links and joints of a URDF, by pinocchio, and each link's centre of mass."""
+    """Return the links and joints of a URDF, read by pinocchio, and each link's centre of mass."""
     for joint in root.findall('joint'):
         limits, kind = joint.findall('limit'), joint.get('type')
         ends = [limit.get(end) for limit in limits for end in ('lower', 'upper')]
@@ -202,15 +202,17 @@ def _read_sdf(
     if root.tag != 'sdf' or model is None:
         raise refuse(file, 'expected an sdf with a model')
     if len([*root.iter('model')]) > 1 or model.find('include') is not None:
-        raise refuse(file, 'expected one model, and nothing that it includes: write it as one')
+        raise refuse(file, 'expected a single model without <include>; merge them into one')
     version = [int(part) for part in root.get('version', '1.6').split('.')]
-    frame_of_axis = '1' if version < [1, 5] else '0'  # the model's before 1.5, then the joint's
+    frame_of_axis = (
+        '1' if version < [1, 5] else '0'
+    )  # the frame of the model before 1.5, then that of the joint
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
     source.given_limits, source.limits_file = limits_and_file
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
-            problem = f'{element.tag} with {element.attrib}: only what SDF 1.6 knows is read'
-            raise refuse(file, f'{problem}, poses in radians and in their usual frames')
+            problem = f'{element.tag} with {element.attrib}: only SDF 1.6 is supported'
+            raise refuse(file, f'{problem}, with poses in radians and in their default frames')
 
     def value(element: ET.Element | None, tag: str, count: int = 1, default: str = '0') -> Array:
         if element is None:
@@ -237,7 +239,7 @@ def _read_sdf(
         lost = sorted({*above, *above.values(), *links} - {'world'} - set(order)) or order
         raise refuse(file, f'expected a tree of links with one root; outside it: {", ".join(lost)}')
     source.above = above
-    #: by link: number of the joint that carries it, and where that joint stands in the model
+    #: for each link, index of the joint that carries it, and the joint's pose in the model
     stands: dict[str, tuple[int, pin.SE3]] = {}
     for name in order:
         carrier, at = stands.get(above.get(name, ''), (0, pin.SE3.Identity()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a file of another format to a robot directory: what `import_robot` does and says."""
+"""Convert a file of another format to a robot directory, and report the result (`import_robot`)."""
 
 import os
 import re
@@ -30,10 +30,10 @@ from musculoskeletal_ae.robot.jumps import jump_choices
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-LARGEST = 20_000_000  # [bytes] of a model
-WARM_UP, PLAYED = 0.1, 1.0  # [s] of a model
-REAL_TIME = 0.5  # [s] of a core for a second, beside the other nodes on two cores
-SLOW = 3  # exit status
+LARGEST = 20_000_000  # largest file [bytes]
+WARM_UP, PLAYED = 0.1, 1.0  # [s] of model time
+REAL_TIME = 0.5  # CPU time per second of model time that is fast enough beside the other nodes [s]
+SLOW = 3  # exit status for a model that is slower than real time
 OPENSIM = (
     'OpenSim models are not read; convert it to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
@@ -47,26 +47,30 @@ READERS = {
 
 
 class Imported(NamedTuple):
-    """A robot that was imported."""
+    """An imported robot."""
 
     robot: Robot
-    notes: tuple[str, ...]  # what had to be chosen, dropped, held fixed, renamed or approximated
-    comparison: Comparison | None  # with the source's own engine; None: it has no lengths
+    notes: tuple[
+        str, ...
+    ]  # properties that were chosen, dropped, held fixed, renamed or approximated
+    comparison: Comparison | None  # with the source's own engine; None if it computes no lengths
 
 
 def read_source(file: Path) -> Source:
-    """Read a file of any of the formats, recognised by its root element.
+    """Read a file of any supported format, which the root element identifies.
 
-    A SourceError or RobotDescriptionError names the file, what is wrong and what is legal.
+    Raises:
+        SourceError: If the file is not valid; names the file, the problem and the legal values.
+        RobotDescriptionError: If its URDF is not valid.
     """
     text = read_text(file, refuse, LARGEST)
-    # Before parsing: OpenSim writes tags that are not XML, as HuntCrossleyForce::ContactParameters.
+    # Check this before parsing, because some tags of OpenSim are not valid XML.
     if '<OpenSimDocument' in text:
         raise refuse(file, OPENSIM)
     try:
         root = parse_xml(file, text)
     except RobotDescriptionError as error:
-        # MuJoCo reads some of what is no XML, as attributes without a space between.
+        # MuJoCo accepts some invalid XML, such as attributes without a space in between.
         loose = isinstance(error.__cause__, ET.ParseError)
         if not (loose and re.match(r'(\s|<\?.*?\?>|<!--.*?-->)*<mujoco[\s/>]', text, re.DOTALL)):
             raise
@@ -88,21 +92,28 @@ def read_source(file: Path) -> Source:
 
 
 def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
-    """Import a file as a robot directory; `chain`: the options of `cut`.
+    """Import a file as a robot directory.
 
-    A RobotDescriptionError says if what was written is no valid robot, as of wrong inertias.
+    Args:
+        file: The file.
+        out: A new or empty directory.
+        chain: Options of `cut`.
+
+    Raises:
+        SourceError: If the file cannot be imported.
+        RobotDescriptionError: If the result is not a valid robot, for example because of inertias.
     """
     source = read_source(file)
     cut(source, **chain)
     if not source.routes:
-        raise refuse(file, '; '.join(['no muscle is left', *source.lost()[-3:]]))
+        raise refuse(file, '; '.join(['no muscle remains', *source.lost()[-3:]]))
     if (there := os.path.lexists(out)) and (not out.is_dir() or any(out.iterdir())):
         raise refuse(out, 'expected a new or empty directory')
     try:
         write(source, out)
         robot = Robot.load(out)
-    except BaseException:  # Ctrl-C too leaves nothing that looks like a robot
-        for file in out.glob('*'):  # of which none was there
+    except BaseException:  # also on Ctrl-C, leave no partial robot
+        for file in out.glob('*'):  # the directory was empty before
             file.unlink()
         if not there and out.exists():
             out.rmdir()
@@ -111,7 +122,7 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
 
 
 def run(args: Namespace) -> int:
-    """Import, and print what a person should know; return the exit status."""
+    """Import a file, print the report, and return the exit status."""
     chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
     robot, notes, comparison = import_robot(args.file, args.out, **chain)
     for note, count in Counter(notes).items():
@@ -133,9 +144,10 @@ def run(args: Namespace) -> int:
 
 
 def play(robot: Robot, file: Path) -> int:
-    """Play the file for a second, say how fast that is, and return 0, or SLOW if it is too slow.
+    """Simulate the file for a second, and print how long this takes; return 0, or SLOW.
 
-    A MusculoskeletalError says why it cannot be played.
+    Raises:
+        MusculoskeletalError: If the file cannot be simulated.
     """
     from musculoskeletal_ae.emulator.reality import make_arm
 
@@ -156,10 +168,10 @@ def play(robot: Robot, file: Path) -> int:
 
 
 def length_verdict(comparison: Comparison | None) -> str:
-    """Say how far lengths are from the source's own."""
+    """Return a text on the differences of lengths from the source's own."""
     errors = comparison.lengths if comparison else None
     if not errors:
-        return 'lengths: not compared, the source has none of its own here'
+        return 'lengths: not compared, because the source computes none'
     worst = sorted(errors.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
     verdict = f'largest length error over {POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
@@ -168,7 +180,7 @@ def length_verdict(comparison: Comparison | None) -> str:
 
 
 def arm_verdict(comparison: Comparison) -> str:
-    """Say how far moment arms are from the source's own, and whether signs agree."""
+    """Return a text on the differences of moment arms from the source's own, and of their signs."""
     worst = sorted(comparison.arms.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
     verdict = f'largest moment arm error over {ARM_POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'
@@ -179,7 +191,7 @@ def arm_verdict(comparison: Comparison) -> str:
 
 
 def check_verdict(check: RobotCheck) -> str:
-    """Say in a line what `check_robot` finds."""
+    """Return a line with the verdict of `check_robot`."""
     shares = f'held {100 * check.held.mean():.0f} %, stiff {100 * check.stiff.mean():.0f} %'
     kinds = Counter(fault.kind for fault in check.faults)
     faults = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())

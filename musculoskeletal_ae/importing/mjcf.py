@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MuJoCo models (MJCF), through the `mujoco` package: what loads there loads here.
+"""Import of MuJoCo models (MJCF), which the package `mujoco` loads.
 
 Spatial tendons become routes: sites, wrapping spheres and cylinders with their side sites, and
-branches over pulleys. Hinges and slides become joints, a body with several of them a chain of
-massless links; a ball joint three hinges. `equality/joint` becomes a coupling. Springs and dampers
-of joints, and springs of fixed tendons, become `joint_elasticity`.
+branches over pulleys. Hinges and slides become joints; a body with several joints becomes a chain
+of massless links, and a ball joint becomes three hinges. `equality/joint` becomes a coupling.
+Springs and dampers of joints, and springs of fixed tendons, become `joint_elasticity`.
 
-Where a site of a tendon lies on the rim of what the tendon wraps round, MuJoCo lets rounding decide
-whether it does. It is tied to the rim here (`robot/wrapping.py`), and the geom that MuJoCo computes
-with is thinner by a share 2·RIM, so that it decides the same.
+If a site lies on the rim of an object that its tendon wraps around, rounding decides in MuJoCo
+whether the tendon wraps. Here the site is attached to the rim (`robot/wrapping.py`). For MuJoCo,
+the radius of the object is reduced by a share 2·RIM, which leads to the same decision.
 """
 
 from collections import defaultdict
@@ -38,23 +38,29 @@ from musculoskeletal_ae.robot.wrapping import RIM
 
 check_mujoco()
 
-#: where a model says how many it has of each kind that has names here
+#: attribute of a model with the number of elements, for each kind of named element
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
-RANGE_POSTURES = 200  # in which the range of a tendon's length is measured
-LEAST_REACH = 1e-3  # [m] of a body's geometry
-STRONGEST = 1e6  # [N]; MuJoCo makes a muscle without a lever at the start stronger
+RANGE_POSTURES = 200  # postures in which the range of a tendon's length is measured
+LEAST_REACH = 1e-3  # [m] smallest distance of a far end from the origin of its body
+STRONGEST = 1e6  # [N]; MuJoCo assigns more to muscles without an initial moment arm
 
 
 def read_mjcf(file: Path, root: ET.Element) -> Source:
-    """Read an MJCF file; a SourceError says if MuJoCo does not load it."""
+    """Read an MJCF file.
+
+    Raises:
+        SourceError: If MuJoCo cannot load it.
+    """
     for item in root.iter('include'):
         included = file.parent / (name := item.get('file', ''))
         if included.exists() and not included.is_file():
-            raise refuse(file, f'what it includes, {name!r}, is no regular file')
+            raise refuse(file, f'the included file {name!r} is not a regular file')
     warnings: list[str] = []
-    mujoco.set_mju_user_warning(warnings.append)  # by default it writes a file where it was started
+    mujoco.set_mju_user_warning(
+        warnings.append
+    )  # by default MuJoCo writes a file into the working directory
     try:
         model = open_mjcf(file).compile()
     except (ValueError, mujoco.FatalError) as error:
@@ -68,14 +74,14 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
 
 
 def open_mjcf(file: Path) -> Any:
-    """Return an MJCF file's MjSpec, whose bodies all stay: MuJoCo may fuse a hand with its arm."""
+    """Return the MjSpec of an MJCF file, set to keep bodies that MuJoCo might fuse."""
     spec = mujoco.MjSpec.from_file(str(file))
     spec.compiler.fusestatic = False
     return spec
 
 
 def resting_joints(model: Any) -> list[float]:
-    """Return where `import_robot` holds each hinge and slide of a model, if it leaves it out."""
+    """Return the position at which `import_robot` holds each joint if it leaves it out."""
     reader = _Reader(model, '')
     source = reader.source
     source.couplings = resolved(source.couplings)
@@ -84,9 +90,10 @@ def resting_joints(model: Any) -> list[float]:
 
 
 def tie_rims(model: Any) -> list[tuple[int, int]]:
-    """Make geoms thinner by a share 2·RIM on whose rim a site of a tendon lies that wraps them.
+    """Reduce the radius of geoms by a share 2·RIM if a site of a wrapping tendon lies on the rim.
 
-    Returns each such tendon with its geom.
+    Returns:
+        Each such tendon with its geom (indices).
     """
     data, types, tied = mujoco.MjData(model), mujoco.mjtWrap, []
     mujoco.mj_kinematics(model, data)
@@ -114,8 +121,8 @@ def tie_rims(model: Any) -> list[tuple[int, int]]:
 def far_end(model: Any, data: Any, body: int) -> Array | None:
     """Return the point of a body's geometry that is farthest from its joint, in its frame [m].
 
-    Of what tendons wrap round, only if the body has nothing else; None if there is no geometry, or
-    none that reaches out.
+    Geoms that tendons wrap around count only if the body has no others. The result is None without
+    geometry, or if it lies at the origin.
     """
     turn, origin = data.xmat[body].reshape(3, 3), data.xpos[body].copy()
     anchor = origin
@@ -138,7 +145,7 @@ def far_end(model: Any, data: Any, body: int) -> Array | None:
 
 
 def _ends(model: Any, data: Any, geom: int) -> Array:
-    """Return points at the ends of a geom, in the world [m] (N, 3)."""
+    """Return points at the ends of a geom, in the world frame [m], (N, 3)."""
     kinds, size, place = mujoco.mjtGeom, model.geom_size[geom], data.geom_xpos[geom]
     turn, kind = data.geom_xmat[geom].reshape(3, 3), model.geom_type[geom]
     if kind == kinds.mjGEOM_MESH:
@@ -152,7 +159,7 @@ def _ends(model: Any, data: Any, geom: int) -> Array:
         local = size[0] * np.concatenate([np.eye(3), -np.eye(3)])
     elif kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_ELLIPSOID):
         local = np.concatenate([np.diag(size), -np.diag(size)])
-    else:  # planes and fields have no end
+    else:  # planes and height fields have no end
         return np.zeros((0, 3))
     return local @ turn.T + place
 
@@ -166,7 +173,7 @@ class _Reader:
         mujoco.mj_kinematics(model, self.start)
         self.names = {kind: self._names(kind) for kind in COUNTS}
         self.balls: dict[int, list[str]] = {}
-        #: joint that follows another (−1: none), by which polynomial
+        #: joint that is coupled, its master (−1: none), and the polynomial
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
         self.radius = model.geom_size[:, 0].copy()  # as in the file
@@ -180,7 +187,7 @@ class _Reader:
         self.source.lengths = self._lengths
 
     def _names(self, kind: str) -> list[str]:
-        """Return the name of each thing of a kind, or its kind and number."""
+        """Return the names of all elements of a kind; unnamed ones are numbered."""
         get, count = getattr(self.model, kind), getattr(self.model, COUNTS[kind])
         original = [get(i).name for i in range(count)]
         names = names_of_all(kind, original)
@@ -189,7 +196,7 @@ class _Reader:
         return names
 
     def _springs(self) -> None:
-        """Take springs and dampers of joints, and springs of tendons that only add up joints."""
+        """Read springs and dampers of joints, and springs of fixed tendons."""
         m, source, kinds = self.model, self.source, mujoco.mjtJoint
         for j, name in enumerate(self.names['joint']):
             stiffness, damping = m.jnt_stiffness[j], float(m.dof_damping[m.jnt_dofadr[j]])
@@ -213,7 +220,7 @@ class _Reader:
             source.springs.append(Spring(shares, float(m.tendon_stiffness[t]), float(low), name))
 
     def _is_fixed(self) -> Bools:
-        """Return which tendons add up joints instead of having a route, (tendons,)."""
+        """Return which tendons are fixed, that is, have no route, (tendons,)."""
         fixed: Bools = self.model.wrap_type[self.model.tendon_adr] == mujoco.mjtWrap.mjWRAP_JOINT
         return fixed
 
@@ -237,7 +244,7 @@ class _Reader:
             self.source.note('dropped', f'contacts: {touching} geoms may touch each other')
 
     def _bodies(self) -> None:
-        """Add links and joints; at the start a joint stands as its body does, in its anchor."""
+        """Add links and joints; a joint starts at its anchor with the rotation of its body."""
         m, data, at_start = self.model, self.start, {0: (0, pin.SE3.Identity())}
         for i in range(m.nbody):
             turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
@@ -258,7 +265,7 @@ class _Reader:
                 self.source.above[link[0]] = self.names['body'][m.body_parentid[i]]
 
     def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
-        """Add a joint that stands at a pose in the carrier at the start; return its number."""
+        """Add a joint with an initial pose in the frame of its carrier; return its index."""
         m, source, types, name = self.model, self.source, mujoco.mjtJoint, self.names['joint'][j]
         low, high = m.jnt_range[j] if m.jnt_limited[j] else (-np.inf, np.inf)
         kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
@@ -318,14 +325,14 @@ class _Reader:
                 self._route(name, range(first, first + m.tendon_num[t]))
                 known = [force for force in driven.get(t, []) if force < np.inf]
                 source.strength[name] = sum(known)
-                if m.tendon_actfrclimited[t]:  # a force that shortens is negative
+                if m.tendon_actfrclimited[t]:  # a negative force shortens the tendon
                     most = max(0.0, -float(m.tendon_actfrcrange[t][0]))
                     source.strength[name] = min(sum(known) or np.inf, most)
         if self.tendons and not driven:
-            source.note('chosen', 'every tendon is a muscle: no actuator pulls any')
+            source.note('chosen', 'no actuator pulls a tendon, so every tendon is a muscle')
 
     def _strength(self, a: int) -> float:
-        """Return what an actuator of a tendon can pull [N]; inf: the file does not limit it."""
+        """Return the largest tension of an actuator [N]; inf without a limit in the file."""
         m, ends = self.model, np.array([-np.inf, np.inf])
         gain, gear = m.actuator_gainprm[a], m.actuator_gear[a][0]
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
@@ -346,11 +353,11 @@ class _Reader:
             )
         if m.actuator_forcelimited[a]:
             ends = np.clip(ends, *m.actuator_forcerange[a])
-        # A force that shortens is negative in MuJoCo.
+        # In MuJoCo, a negative force shortens the tendon.
         pull = float(max(-gear * ends)) if gear else 0.0
         if pull <= 0.0:
             problem = (
-                f'actuator {self.names["actuator"][a]}: it can only push, and a wire only pulls'
+                f'actuator {self.names["actuator"][a]}: it can only push, but a tendon only pulls'
             )
             self.source.note('dropped', problem)
         return max(pull, 0.0) if pull <= STRONGEST else np.inf
@@ -386,23 +393,21 @@ class _Reader:
         if axis is not None and side is not None and side_link is None:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
-                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo has it
+                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # like in MuJoCo
         link = self.names['body'][body]
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)
 
     def _tie_rims(self) -> None:
-        """Make geoms thinner whose rim carries a site of a tendon that wraps round them."""
+        """Make objects thinner whose rim carries a site of a tendon that wraps around them."""
         for tendon, geom in tie_rims(self.model):
             body = self.names['body'][self.model.geom_bodyid[geom]]
-            tied = (
-                f'muscle {self.names["tendon"][tendon]}: a site on the rim of what it wraps round'
-            )
+            tied = f'muscle {self.names["tendon"][tendon]}: a site on the rim of an object'
             self.source.note(
-                'chosen', f'{tied} on {body} is tied to it; MuJoCo lets rounding decide'
+                'chosen', f'{tied} on {body} is attached to it; MuJoCo lets rounding decide'
             )
 
     def _points(self) -> None:
-        """Name the far ends of bodies' geometry and the sites, those on tendons last."""
+        """Name the far ends of geometry and the sites; those on tendons come last."""
         m, source, points = self.model, self.source, dict[str, tuple[str, Array]]()
         for i in range(1, m.nbody):
             if (far := far_end(m, self.start, i)) is not None:
@@ -415,7 +420,7 @@ class _Reader:
         source.points = points
 
     def _tendon_range(self, tendon: int) -> Array:
-        """Return the least and the greatest length of a tendon in random postures [m]."""
+        """Return the smallest and the largest length of a tendon in random postures [m]."""
         m, data, rng = self.model, mujoco.MjData(self.model), np.random.default_rng(0)
         lengths = []
         for _ in range(RANGE_POSTURES):
@@ -425,7 +430,7 @@ class _Reader:
         return np.array([min(lengths), max(lengths)])
 
     def _with_tendons(self, data: Any) -> Any:
-        """Return data with the lengths of its posture."""
+        """Update the tendon lengths of MuJoCo's data, and return the data."""
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
         mujoco.mj_tendon(self.model, data)
@@ -447,7 +452,7 @@ class _Reader:
                     'XYZ', angles
                 )
                 data.qpos[at] = np.roll(turn.as_quat(), 1)
-            for _ in self.polynomials:  # as often as one may follow another
+            for _ in self.polynomials:  # couplings may be chained
                 for slave, (master, terms) in self.polynomials.items():
                     at = m.jnt_qposadr[[slave, master]]
                     moved = (data.qpos - start)[at[1]] if master >= 0 else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body read from another format: cut, written as a robot directory, compared with its source."""
+"""A body read from another format: reduce it, write it as a robot directory, and compare it."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -21,81 +21,86 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES, ARM_POSTURES = 1000, 200  # in which lengths are compared, and moment arms
-TURN = 1e-5  # [rad], [m] by which joints are moved to measure a moment arm
-SHORT_ARM = 1e-3  # [m]; the sign of a shorter moment arm does not count
-LISTED = 12  # names in a line
-STRENGTH = 'tension.limit is what the source says a muscle can pull, bias a tenth, max 1.5 times'
+POSTURES, ARM_POSTURES = 1000, 200  # postures in which lengths and moment arms are compared
+TURN = 1e-5  # [rad], [m] step of the differences for moment arms
+SHORT_ARM = 1e-3  # [m]; signs of shorter moment arms are not compared
+LISTED = 12  # largest number of names in a message
+STRENGTH = 'tension.limit is the largest tension in the source, bias 0.1 and max 1.5 times that'
 EARTH = 9.81  # [m/s²]
-UNLIMITED = {False: np.pi, True: 0.5}  # ± [rad], [m] of joints that slide, where there are none
+UNLIMITED = {
+    False: np.pi,
+    True: 0.5,
+}  # ± limits of revolute [rad] and prismatic joints [m] without limits
 
-#: absolute lengths [m] (N,) of muscles, for values (N,) of joints that are not at rest
+#: computes absolute lengths [m] (N,) of muscles from positions (N,) of joints; others are at rest
 Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
 class SourceError(MusculoskeletalError):
-    """A file that cannot be imported, and why."""
+    """A file that cannot be imported."""
 
 
 def refuse(file: Path, problem: str) -> SourceError:
-    """Return the error that says what is wrong with a file."""
+    """Return the error for a problem of a file."""
     return SourceError(f'{file}: {problem}')
 
 
 class Spring(NamedTuple):
     """A spring along a weighted sum of joints, x = Σ share · q, with the torque −k (x − x_0)."""
 
-    shares: dict[str, float]  # of joints
+    shares: dict[str, float]  # by joint
     stiffness: float  # k [N·m/rad]
     rest: float  # x_0 [rad]
-    name: str  # what the source calls it
+    name: str  # name in the source
 
 
 @dataclass
 class Source:
-    """Everything that was read, as a model of pinocchio in which links are frames."""
+    """The content of a file, as a pinocchio model in which links are frames."""
 
     name: str
     model: pin.Model = field(default_factory=pin.Model)
-    links: list[str] = field(default_factory=list)  # the root first
-    rest: dict[str, float] = field(default_factory=dict)  # values of joints that do not rest at 0
-    fixed: list[str] = field(default_factory=list)  # joints that the source holds
+    links: list[str] = field(default_factory=list)  # the root comes first
+    rest: dict[str, float] = field(
+        default_factory=dict
+    )  # positions of joints whose rest position is not 0
+    fixed: list[str] = field(default_factory=list)  # joints that are fixed in the source
     couplings: dict[str, Coupling] = field(default_factory=dict)
     routes: dict[str, Route] = field(default_factory=dict)
-    strength: dict[str, float] = field(default_factory=dict)  # highest tension [N], where known
+    strength: dict[str, float] = field(default_factory=dict)  # largest tension [N], if known
     springs: list[Spring] = field(default_factory=list)
-    damping: dict[str, float] = field(default_factory=dict)  # of joints [N·m·s/rad]
+    damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
     end_effector: str = ''
-    #: named points that may be the end effector: link and place in its frame [m]
+    #: named points that may be the end effector: link, and position in its frame [m]
     points: dict[str, tuple[str, Array]] = field(default_factory=dict)
-    #: limits of joints that stand beside the model, and the file that holds them
+    #: joint limits of a separate file, and that file
     given_limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     limits_file: str = ''
-    above: dict[str, str] = field(default_factory=dict)  # link that each link hangs on, where known
+    above: dict[str, str] = field(default_factory=dict)  # parent of each link, if known
 
     def note(self, kind: str, text: str) -> None:
-        """Remember, in a line, what was 'chosen', 'dropped', 'held fixed', 'renamed' and so on."""
+        """Add a line to the report; `kind` is 'chosen', 'dropped', 'held fixed' or 'renamed'."""
         self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:
-        """Return the notes that say why something did not become a muscle, or is none any more."""
+        """Return the notes about dropped muscles and tendons."""
         return [note for note in self.notes if re.match(r'dropped: .*(muscle|tendon)', note)]
 
     def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
-        """Return a safe name that is not taken, and say so where it is not the original one."""
+        """Return a legal, unused name, and add a note if it differs from the original."""
         (name,) = distinct([safe_name(original, fallback)], taken)
         self.renamed(kind, original, name)
         return name
 
     def renamed(self, kind: str, original: str | None, name: str) -> None:
-        """Say so where a name is not the original one."""
+        """Add a note if a name differs from the original."""
         if original and name != original:
             self.note('renamed', f'{kind} {original} is {name} here')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
-        """Return limits of a joint: given, of the model, or chosen ones where there are none."""
+        """Return the limits of a joint: of the separate file, of the model, or chosen."""
         if joint in self.given_limits:
             return self.given_limits[joint]
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
@@ -146,12 +151,12 @@ class Source:
         return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
 
     def settle(self) -> None:
-        """Let coupled joints rest where those that they follow put them."""
+        """Set the rest positions of coupled joints from those of their masters."""
         for slave, c in self.couplings.items():
             self.rest[slave] = float(c.value(self.rest.get(c.master, 0.0)))
 
     def point_link(self, name: str) -> str:
-        """Return a link by its name or by that of a point, for which a link is added."""
+        """Return a link by its name; for the name of a point, add a link."""
         if name in self.links or name not in self.points:
             return name
         link, xyz = self.points[name]
@@ -162,7 +167,7 @@ class Source:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names in a line, the first ones of many."""
+    """Return names as a text, at most LISTED of them."""
     more = f' and {len(names) - LISTED} more' if len(names) > LISTED else ''
     return ', '.join(names[:LISTED]) + more
 
@@ -188,7 +193,11 @@ def tip(source: Source) -> str:
 
 
 def numbers(text: str | None, count: int, where: str) -> Array:
-    """Return numbers of an XML text; a ValueError says where they are not."""
+    """Return the numbers in an XML text.
+
+    Raises:
+        ValueError: If they are not valid; names the place.
+    """
     try:
         values = np.array([float(word) for word in (text or '').split()])
     except ValueError:
@@ -199,7 +208,11 @@ def numbers(text: str | None, count: int, where: str) -> Array:
 
 
 def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.Inertia:
-    """Return a link's inertia; a ValueError names the link whose is none."""
+    """Return the inertia of a link.
+
+    Raises:
+        ValueError: If it is not physical; names the link.
+    """
     try:
         return pin.Inertia(mass, centre, tensor)
     except RuntimeError as error:
@@ -209,12 +222,12 @@ def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.In
 
 
 def safe_name(text: str | None, fallback: str) -> str:
-    """Return a name that URDF and YAML take, made of what the source calls it."""
+    """Return a legal name for URDF and YAML, derived from the name in the source."""
     return re.sub(r'[^\w.+-]+', '_', text or '').strip('_')[:100] or fallback
 
 
 def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return names with underscores behind those that are given or taken before."""
+    """Return unique names, made by appending underscores to repeated or taken ones."""
     result, used = [], {*taken}
     for name in names:
         while name in used:
@@ -225,19 +238,23 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 
 def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
-    """Return safe and distinct names of all things of a kind; those that have none are numbered."""
+    """Return legal and unique names of all elements of a kind; unnamed ones are numbered."""
     safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
-    return distinct(safe, ['universe'])  # which is pinocchio's own
+    return distinct(safe, ['universe'])  # a name of pinocchio
 
 
 def unique(
     kind: str, items: Iterable[tuple[str, Any]], legal: str = 'unique names: rename one'
 ) -> dict[str, Any]:
-    """Return what others refer to by name; a ValueError says which name comes twice."""
+    """Return elements by name.
+
+    Raises:
+        ValueError: If a name occurs twice.
+    """
     named: dict[str, Any] = {}
     for name, item in items:
         if name in named:
-            raise ValueError(f'{kind} {name!r} comes twice; expected {legal}')
+            raise ValueError(f'{kind} {name!r} is listed twice; expected {legal}')
         named[name] = item
     return named
 
@@ -250,10 +267,10 @@ def cut(
     base: str = '',
     end: str = '',
 ) -> None:
-    """Cut the source to a chain in place.
+    """Reduce the source in place to a chain.
 
-    Joints that are not asked for are held fixed and said so; links that neither hang on the base
-    nor are one piece with it go, with the muscles that are fastened to them or move no joint.
+    Joints that are not requested are held fixed, with a note. Links that do not descend from the
+    base are removed, with their muscles. Muscles that move no joint are removed as well.
     """
     model, links = source.model, source.links
     if base and base not in links:
@@ -278,7 +295,7 @@ def cut(
         raise SourceError(f'--joints {missing[0]}: {problem}; joints: {", ".join(free)}')
     if end:
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
-        # A joint whose coupled one is in the chain moves the chain as well.
+        # Masters of coupled joints in the chain move the chain as well.
         wanted &= above | {c.master for slave, c in couplings.items() if slave in above}
     source.settle()
     source.couplings = {s: c for s, c in couplings.items() if s in movable and c.master in wanted}
@@ -299,7 +316,7 @@ def cut(
     for name, route in list(source.routes.items()):
         lost = [item.link for item in route if item.link not in source.links]
         if lost:
-            source.note('dropped', f'muscle {name}: fastened to {lost[0]}, which was cut off')
+            source.note('dropped', f'muscle {name}: attached to {lost[0]}, which is left out')
         elif len({source.place(p.link)[0] for p in route if isinstance(p, RoutePoint)}) < 2:
             source.note('dropped', f'muscle {name}: it moves no joint')
         elif name not in without and (not muscles or name in muscles):
@@ -315,11 +332,11 @@ def cut(
         source.end_effector = end
     if not wanted:
         held = [note for note in source.notes if note.startswith('held fixed')]
-        raise SourceError('; '.join(['no joint is left that moves', *held[:3]]))
+        raise SourceError('; '.join(['no movable joint remains', *held[:3]]))
 
 
 def _choose_end(source: Source) -> None:
-    """Let the far end of the geometry of the last link be the end effector; name the others."""
+    """Choose the far end of the last link's geometry as the end effector; note the alternatives."""
     link = tip(source)
     leaves = [name for name in source.links if name not in source.above.values()]
     others = [name for each in leaves for name in (tip_name(each), each)]
@@ -385,7 +402,7 @@ def urdf(source: Source) -> str:
 
 
 def write(source: Source, out: Path) -> None:
-    """Write robot.urdf and muscles.yaml into a directory, which is made if it is not there."""
+    """Write robot.urdf and muscles.yaml into a directory, which is created if necessary."""
     muscles: list[dict[str, Any]] = []
     for name, route in source.routes.items():
         muscles.append({'name': name, 'route': [written(item) for item in route]})
@@ -409,7 +426,7 @@ def write(source: Source, out: Path) -> None:
 def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]:
     """Return the entries of muscles.yaml for springs and dampers.
 
-    A spring of a joint that follows another by a line is one of that other joint.
+    A spring of a linearly coupled joint becomes a spring of its master.
     """
     stiffness, preload = np.zeros((len(joints), len(joints))), np.zeros(len(joints))
     for spring in source.springs:
@@ -458,7 +475,7 @@ def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
 
 
 class Comparison(NamedTuple):
-    """How far the muscles of an imported robot are from those of the source's own engine."""
+    """Differences between an imported robot and the source's own engine, by muscle."""
 
     lengths: dict[str, float]  # largest error [m]
     arms: dict[str, float]  # largest error of a moment arm [m], or of a length per length
@@ -466,10 +483,10 @@ class Comparison(NamedTuple):
 
 
 def compare(source: Source, robot: Robot) -> Comparison | None:
-    """Compare lengths over POSTURES and moment arms over ARM_POSTURES; None without own lengths.
+    """Compare lengths in POSTURES and moment arms in ARM_POSTURES postures.
 
-    The source's moment arms are differences of its lengths, so that nothing of this package
-    stands between.
+    The source's moment arms are numerical derivatives of its lengths, independent of this package.
+    The result is None if the source computes no lengths.
     """
     if source.lengths is None:
         return None

@@ -61,7 +61,7 @@ class BringupStatus(Shell):
     def report(self) -> Report:
         """Return the situation of the whole arm."""
         self.situation.tick()
-        return Report(self.situation.level(), self.situation.trouble() or 'all nodes are well', {})
+        return Report(self.situation.level(), self.situation.trouble() or 'all nodes are OK', {})
 
     def _print(self) -> None:
         now = time.monotonic()

@@ -107,7 +107,7 @@ class CheckDriver:
         elif (publishers := node.count_publishers(self.topic)) > 1:
             verdict.failed('several', n=publishers, topic=self.topic)
         if not node.count_publishers(JOINTS):
-            verdict.notes.append('nobody publishes joint_states, which the learner needs')
+            verdict.notes.append('joint_states, which the learner needs, has no publisher')
         return verdict
 
     def alone(self, own: int = 0) -> bool:

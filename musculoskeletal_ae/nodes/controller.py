@@ -222,7 +222,7 @@ class Controller(Shell):
 
     def _stop(self, _: Trigger.Request) -> str:
         self.core.stop(StopCause.OPERATOR)
-        return 'stopped; call controller/reset to go on'
+        return 'stopped; call controller/reset to continue'
 
     def _reset(self, _: Trigger.Request) -> str:
         present = self.core.reset(time.monotonic())

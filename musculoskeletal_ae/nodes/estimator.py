@@ -165,7 +165,7 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self._publish_isolated()
         self._report()
-        return f'cleared: {cause}' if cause else 'nothing was detected'
+        return f'cleared: {cause}' if cause else 'no anomaly was detected'
 
     def _check_health(self, _: Trigger.Request) -> str:
         """Confirm that no anomaly is detected; other nodes clear their latch only then."""

@@ -105,7 +105,7 @@ class Record(Node):
             if each.topic_name not in self.writer.topics
         ]
         return [
-            f'{name}, which {"sent nothing" if self.count_publishers(name) else "nobody publishes"}'
+            f'{name}, which {"sent nothing" if self.count_publishers(name) else "has no publisher"}'
             for name in silent
         ]
 
@@ -211,7 +211,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         count, left_out = recover(bag, target, options.compression)
         print(f'{count} messages recovered to {target}')
         if left_out:
-            problem = f'left out, since they are not in CDR: {", ".join(left_out)}'
+            problem = f'not recorded, because they are not in CDR: {", ".join(left_out)}'
             print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
         with STOP.reacting(Reaction.REMEMBER):  # queued messages are still written

@@ -60,7 +60,7 @@ def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
     add = parser.add_argument
-    topic_help = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} if nobody publishes it)'
+    topic_help = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} if it has no publisher)'
     add('--topic', help=topic_help)
     add('--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]')
     return parser.parse_args(arguments)

@@ -260,7 +260,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
     """Publish a trajectory to the connected nodes, and wait until one has used it.
 
     Raises:
-        MusculoskeletalError: If nobody listens, or the trajectory did not arrive or was refused.
+        MusculoskeletalError: If there is no subscriber, or the trajectory was lost or refused.
     """
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
     answers = _Answers(node, publisher.topic_name)
@@ -271,7 +271,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
         raise MusculoskeletalError(
             f'no connection to {listeners} within {wait:g} s: try again, or with a longer --wait'
             if listeners
-            else f'nobody listens to {topic}: start the controller first'
+            else f'{topic} has no subscriber: start the controller first'
         )
     spinner.spin_until(lambda: answers.reports, FIRST_REPORT_TIME)
     has_reported = bool(answers.reports)
@@ -351,7 +351,7 @@ def parse(arguments: list[str]) -> Namespace:
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='a bag directory, or one mcap or sqlite3 file')
-    check = 'play nothing; check and report the contents (exit status 1: faults)'
+    check = 'check the contents without playing them (exit status 1: faults)'
     add('--check', action='store_true', help=check)
     add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
     topics = (

@@ -601,7 +601,7 @@ class Shell(Node):
     def _log_waiting(self, missing: list[str]) -> None:
         """Log the needed topics without messages, and the reason, whenever they change."""
         reasons = [
-            f'{self.full_name(topic)}, which nobody publishes'
+            f'{self.full_name(topic)}, which has no publisher'
             if self.count_publishers(self.full_name(topic)) == 0
             else f'{self.full_name(topic)}, on which no usable message has arrived'
             for topic in missing

@@ -85,7 +85,7 @@ class View(Node):
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
         self.page = page.Page(robot, *address, options.read_only, request)
         for note in self.page.notes:
-            self.get_logger().warning(f'mesh left out: {printable(note)}')
+            self.get_logger().warning(f'mesh omitted: {printable(note)}')
         self.situation = Situation(self.get_namespace())
         self.reception = Reception(lambda text: self.get_logger().warning(text))
         hardware = robot.description.directory.name
@@ -170,7 +170,7 @@ class View(Node):
             is_viewed = self.page.looked_at.wait(timeout=STOP_CHECK_PERIOD)
             if (now := time.monotonic()) >= self.reported_at + diagnostics.PERIOD:
                 self.reported_at = now
-                state = 'viewed' if is_viewed else 'nobody views the page'
+                state = 'viewed' if is_viewed else 'the page has no visitors'
                 self.diagnostics.tell(Report('ok', state, {}))
             while not self.requests.empty():  # including the last visitor's requests
                 what, *value = self.requests.get()

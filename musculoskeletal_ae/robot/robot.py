@@ -99,8 +99,8 @@ class Robot:
     def tension_per_length(self, tension: Array) -> Array:
         """Return the change of tension per change of a length command [N/m], (M,).
 
-        It is K_stiff of MSC. Modules that follow positions stretch the series elastic elements; it
-        is then their stiffness at T [N] (M,).
+        It is K_stiff of MSC. For modules that follow positions, it is the stiffness of the series
+        elastic elements at T [N], (M,).
         """
         if not self.follows_position:
             return self.stiffness

@@ -117,7 +117,7 @@ def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp
     graph.spin(1.0)
     output, ns = recorder.end(signal.SIGINT), graph.namespace
     assert '0 messages recorded' in output
-    silent = f'{ns}/anomaly, which nobody publishes; {ns}/muscle_states, which sent nothing'
+    silent = f'{ns}/anomaly, which has no publisher; {ns}/muscle_states, which sent nothing'
     assert f'nothing was recorded of {silent}' in output
     assert recorder.process.returncode == 1
     assert Bag.open(tmp_path / 'bag').message_count == 0

@@ -350,7 +350,7 @@ def test_additional_joints_and_joints_in_several_messages_are_no_fault():
             listening.muscles(array(rows), driver.now)
     verdict = listening.verdict(driver.now)
     assert not verdict.faults, str(verdict)
-    assert 'missing joint' in str(verdict) and 'not judged without' not in str(verdict)
+    assert 'missing joint' in str(verdict) and 'not checked without' not in str(verdict)
 
 
 def test_unknown_joint_names_are_found():

@@ -31,7 +31,7 @@ def test_what_is_exported_loads_and_is_as_near_to_the_network_as_the_report_says
     options = ['--robot', str(robot.description.directory), '--out', str(out)]
     assert main([str(folder / 'mae.safetensors'), *options]) == 0
     printed = capsys.readouterr().out
-    assert 'MuJoCo warns: of nothing' in printed
+    assert 'warnings of MuJoCo: none' in printed
     model = mujoco.MjModel.from_xml_path(str(out / 'model.xml'))
     assert [model.tendon(i).name for i in range(model.ntendon)] == [*robot.muscles]
     limits = [model.joint(name).range for name in robot.joints]

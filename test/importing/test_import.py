@@ -85,7 +85,7 @@ def test_a_point_on_the_rim_of_what_it_wraps_round_is_tied_to_it(mjcf, tmp_path)
     assert 'pulley' in text
     mjcf.write_text(text)
     result = import_robot(mjcf, tmp_path / 'out')
-    tied = 'muscle bend: a site on the rim of what it wraps round on lower is tied to it'
+    tied = 'muscle bend: a site on the rim of an object on lower is attached to it'
     assert f'chosen: {tied}; MuJoCo lets rounding decide' in result.notes
     assert max(result.comparison.lengths.values()) < 1e-6
     m, robot = result.robot.muscles.index('bend'), result.robot
@@ -185,7 +185,7 @@ def test_what_is_included_must_be_a_regular_file(mjcf, tmp_path):
     mjcf.write_text(
         mjcf.read_text().replace('<worldbody>', '<include file="more.xml"/><worldbody>')
     )
-    with pytest.raises(SourceError, match=r"'more.xml', is no regular file"):
+    with pytest.raises(SourceError, match=r"'more.xml' is not a regular file"):
         import_robot(mjcf, tmp_path / 'out')
 
 
@@ -245,7 +245,7 @@ COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="cu
         ),
         ('<site name="o1"', '<site user="nan" name="o1"', 'MuJoCo warns: XML contains a'),
         ('force="150"', 'force="0"', 'tension of 1 muscles: the default'),
-        ('force="50"', 'force="0.004"', 'tension.limit is what the source says'),
+        ('force="50"', 'force="0.004"', 'tension.limit is the largest tension in the source'),
     ],
 )
 def test_what_differs_from_the_source_is_reported(mjcf, tmp_path, monkeypatch, old, new, expected):
@@ -403,10 +403,10 @@ def test_an_import_that_is_interrupted_leaves_nothing(mjcf, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ('old', 'new', 'expected'),
     [
-        ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only what SDF 1.6 knows is read'),
-        ('type="revolute"', 'type="ball"', 'moves; held fixed: joint shoulder: it is ball'),
-        ('<joint', '<link name="arm"/><joint', "link 'arm' comes twice; expected unique names"),
-        ('</model>', '<model name="palm"/></model>', 'expected one model'),
+        ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only SDF 1.6 is supported'),
+        ('type="revolute"', 'type="ball"', 'remains; held fixed: joint shoulder: it is ball'),
+        ('<joint', '<link name="arm"/><joint', "link 'arm' is listed twice; expected unique names"),
+        ('</model>', '<model name="palm"/></model>', 'expected a single model'),
     ],
 )
 def test_an_sdf_that_would_be_read_wrongly_is_refused(cardsflow, tmp_path, old, new, expected):
@@ -445,7 +445,7 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert (robot.root_link, robot.description.end_effector) == ('upper_upright', 'lower')
     assert robot.joints == ('elbow',)
     assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
-    assert 'dropped: muscle front: fastened to base, which was cut off' in output
+    assert 'dropped: muscle front: attached to base, which is left out' in output
     assert 'largest length error over 1000 postures: 0.000 mm' in output
     assert 'check_robot: not sound' in output  # no muscle holds it open against its weight
 

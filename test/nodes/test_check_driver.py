@@ -125,5 +125,5 @@ def test_ctrl_c_ends_check_driver_without_a_traceback(graph):
 def test_nodes_say_what_they_wait_for(graph):
     estimator = graph.start('estimator', robot='arm26')
     waiting = estimator.wait_for_output('waiting for')
-    assert f'{graph.namespace}/muscle_states, which nobody publishes' in waiting
-    assert f'{graph.namespace}/mae_checkpoint, which nobody publishes' in waiting
+    assert f'{graph.namespace}/muscle_states, which has no publisher' in waiting
+    assert f'{graph.namespace}/mae_checkpoint, which has no publisher' in waiting

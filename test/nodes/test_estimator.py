@@ -158,7 +158,7 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
     response = estimator.call(Trigger, 'estimator/reset')
     assert response.success and response.message.startswith('cleared: ')
     estimator.wait(lambda: not detected[-1].data, 'the reset')
-    assert estimator.call(Trigger, 'estimator/reset').message == 'nothing was detected'
+    assert estimator.call(Trigger, 'estimator/reset').message == 'no anomaly was detected'
 
 
 @pytest.mark.parametrize('kind', ['length', 'tension'])

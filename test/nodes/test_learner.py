@@ -120,7 +120,7 @@ class HostedLearner:
         """Advance the time until a condition holds."""
         deadline = time.monotonic() + DEADLINE
         while not condition():
-            assert time.monotonic() < deadline, f'waited in vain for {what}'
+            assert time.monotonic() < deadline, f'timeout: {what}'
             self.step()
             if not self.node.core.trainer.ready:  # leave the processor to the training
                 time.sleep(DT)

@@ -81,7 +81,7 @@ class Browser:
     def _wait(condition: Any, what: str = 'the browser') -> Any:
         end = time.monotonic() + DEADLINE
         while not (value := condition()):
-            assert time.monotonic() < end, f'waited {DEADLINE:g} s in vain for {what}'
+            assert time.monotonic() < end, f'timeout after {DEADLINE:g} s: {what}'
             time.sleep(0.05)
         return value
 

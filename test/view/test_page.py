@@ -258,7 +258,9 @@ def test_sliders_reach_the_limits_of_a_prismatic_joint(tmp_path, limits):
 def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph, view, arm26):
     port, asked = view(), []
     graph.listen(DiagnosticArray, '/diagnostics')
-    graph.wait(lambda: graph.report('view').message == 'nobody views the page', 'its diagnostics')
+    graph.wait(
+        lambda: graph.report('view').message == 'the page has no visitors', 'its diagnostics'
+    )
 
     def answer(request, response):  # like a node without these parameters
         asked.append(request)
