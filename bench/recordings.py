@@ -5,8 +5,8 @@
 
 DIR has one clone for each repository of `recordings_read.repositories`, named OWNER+NAME or NAME
 (a working tree or a git directory). A repository without a clone is cloned into DIR if --fetch is
-given, and left out otherwise. Nothing of the data is kept. The results are recordings.json and
-recordings.md, of which doc/results.md has the tables.
+given, and left out otherwise. Nothing of the data is kept. The results are result.json, of which
+`python doc/make.py` makes the tables of doc/results.md, and these tables on the screen.
 
 Every model is made from the training rests alone, and judged on all rows of runs (neck), files
 (arm) or poses (stand) that it was not made from. All constants are in `recordings_learn`; none was
@@ -41,6 +41,7 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 HALF = slice(0, None, 2)  # every other rest trains
+ALL_ROWS = ', of all rows'
 
 
 class Split(NamedTuple):
@@ -118,7 +119,7 @@ def models(recording: Recording, split: Split, directory: Path) -> Iterator[tupl
         if split.full is not None:
             for degree in (1, 2, 3):
                 fit = polynomial(split.full, degree, with_effort)
-                yield f'polynomial of degree {degree}, {what}, of all rows', fit
+                yield f'polynomial of degree {degree}, {what}{ALL_ROWS}', fit
     link, at_zero = recording.link, np.zeros(3)
     if link.name == 'continuum_stand':
         link, at_zero = fitted(link, split.training)
@@ -160,24 +161,49 @@ def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str,
     return results, shown
 
 
+#: what stands for all polynomials that were fitted to all rows of the training runs
+OF_ALL_ROWS = 'best polynomial of all training rows (chosen by its test error)'
+
+
 def table(results: list[Result]) -> str:
-    """Return the errors of one recording as a Markdown table, best model of each split in bold."""
-    splits, labels = (
-        [*dict.fromkeys(part)] for part in zip(*[(r.split, r.model) for r in results])
-    )
-    errors = {(r.split, r.model): r.error_rad for r in results}
-    samples = {r.split: r.samples for r in results}
-    heads = [f'{split} ({samples[split]} samples)' for split in splits]
-    lines = [f'| error [rad] | {" | ".join(heads)} |', '|---' * (len(splits) + 1) + '|']
-    best = {s: min(e for (split, _), e in errors.items() if split == s) for s in splits}
+    """Return the errors of one recording as a Markdown table.
+
+    Of the polynomials of all rows, only the best one of each split stands there. The best model
+    from the rest samples is in bold.
+    """
+    errors, samples = dict[tuple[str, str], float](), dict[str, int]()
+    for result in results:
+        label = OF_ALL_ROWS if result.model.endswith(ALL_ROWS) else result.model
+        before = errors.get((result.split, label), np.inf)
+        errors[result.split, label] = min(before, result.error_rad)
+        samples[result.split] = result.samples
+    labels = [*dict.fromkeys(label for _, label in errors if label != OF_ALL_ROWS)]
+    best = {s: min(e for (k, m), e in errors.items() if k == s and m in labels) for s in samples}
+    heads = [f'{split} ({count} rests)' for split, count in samples.items()]
+    lines = [f'| mean error [rad] | {" | ".join(heads)} |', '|---' * (len(heads) + 1) + '|']
+    if any(label == OF_ALL_ROWS for _, label in errors):
+        labels.append(OF_ALL_ROWS)
     for label in labels:
         cells = []
-        for split in splits:
-            value = errors.get((split, label))
-            text = '–' if value is None else f'{value:.3f}' if value < 10.0 else 'diverges'
+        for split in samples:
+            value = errors.get((split, label), np.nan)
+            text = '–' if np.isnan(value) else f'{value:.3f}' if value < 1.0 else '> 1'
             cells.append(f'**{text}**' if value == best[split] else text)
         lines.append(f'| {label} | {" | ".join(cells)} |')
     return '\n'.join(lines)
+
+
+def tables(document: dict[str, Any]) -> str:
+    """Return the tables of a recordings.json as Markdown."""
+    results = [Result(**row) for row in document['errors']]
+    parts = []
+    for repository in repositories():
+        own = [result for result in results if result.recording == repository.recording]
+        if own:
+            link = f'[{repository.name}](https://github.com/{repository.name})'
+            head = f'**{link}** ({repository.licence}): {repository.robot}.'
+            parts.append(f'{head}\n\n{table(own)}')
+    return '\n\n'.join(parts)
 
 
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
@@ -207,7 +233,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument('--only', default='', help='part of the name of a repository')
     parser.add_argument('--out', type=Path, default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)
-    rows, shown, parts = [], dict[str, Any](), []
+    rows, shown = list[dict[str, Any]](), dict[str, Any]()
     for repository in repositories():
         clone = clone_of(repository, args.clones, args.fetch)
         if args.only not in repository.name or clone is None:
@@ -216,15 +242,11 @@ def main(argv: list[str]) -> int:
         results, also = learn(repository, Files(clone))
         rows += [result._asdict() for result in results]
         shown[repository.name] = also
-        notes = [f'{key}: {value}' for key, value in also.items()]
-        head = f'**{repository.name}** ({repository.licence}): {repository.robot}.'
-        parts.append('\n\n'.join([head, table(results), *notes]))
-    if not parts:
+    if not rows:
         raise MusculoskeletalError(f'{args.clones}: no clone of any repository; use --fetch')
     args.out.mkdir(parents=True, exist_ok=True)
     document = {'errors': rows, 'also': shown}
     text = json.dumps(document, indent=1, ensure_ascii=False)
-    (args.out / 'recordings.json').write_text(text + '\n', encoding='utf-8')
-    (args.out / 'recordings.md').write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
-    print(f'{args.out}: recordings.json, recordings.md')
+    (args.out / 'result.json').write_text(text + '\n', encoding='utf-8')
+    print(tables(document))
     return 0

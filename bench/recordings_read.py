@@ -109,6 +109,7 @@ class Repository:
     """A public repository with recordings."""
 
     name: str  # owner/name on GitHub
+    recording: str  # name of the link, under which its results stand
     licence: str
     robot: str  # one line about the robot and its sensors
     read: Callable[[Files], Recording]
@@ -268,14 +269,14 @@ def fitted(link: SoftLink, training: Run) -> tuple[SoftLink, Array]:
 def repositories() -> Iterator[Repository]:
     """Yield the repositories, in the order of the table."""
     yield Repository(
-        'HUMASoft/Data-and-Results', 'LGPL-3.0',
+        'HUMASoft/Data-and-Results', 'soft_neck', 'LGPL-3.0',
         'soft neck, 3 tendons, motor encoders, IMU; 0, 500 and 1000 g', soft_neck,
     )  # fmt: skip
     yield Repository(
-        'HUMASoft/Soft-Arm', 'no licence file',
+        'HUMASoft/Soft-Arm', 'soft_arm', 'no licence file',
         'soft arm, 3 tendons, motor encoders and currents (157:1 gears), IMU; 0 to 500 g', soft_arm,
     )  # fmt: skip
     yield Repository(
-        'ARM-Lab/Learning-Based-Position-Control-for-Continuum-Robots', 'MIT',
+        'ARM-Lab/Learning-Based-Position-Control-for-Continuum-Robots', 'continuum_stand', 'MIT',
         'continuum robot, 3 tendons, commanded shortenings, tracked tip; no load', continuum_stand,
     )  # fmt: skip

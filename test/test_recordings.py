@@ -93,8 +93,7 @@ def test_the_slope_of_the_effort_is_the_stiffness_against_the_bend():
 
 
 def test_the_table_marks_the_best_model_of_each_split():
-    rows = [
-        Result('r', s, 9, m, e) for s, m, e in (('a', 'x', 0.1), ('a', 'y', 0.2), ('b', 'y', 0.3))
-    ]
-    lines = table(rows).split('\n')
-    assert lines[2:] == ['| x | **0.100** | – |', '| y | 0.200 | **0.300** |']
+    errors = ('a', 'x', 0.1), ('a', 'y', 0.2), ('b', 'y', 0.3), ('b', 'z, of all rows', 0.2)
+    lines = table([Result('r', split, 9, model, off) for split, model, off in errors]).split('\n')
+    assert lines[2:4] == ['| x | **0.100** | – |', '| y | 0.200 | **0.300** |']
+    assert lines[4].endswith('| – | 0.200 |')
