@@ -5,8 +5,8 @@
 
 DIR has one clone for each repository of `recordings_read.repositories`, named OWNER+NAME or NAME
 (a working tree or a git directory). A repository without a clone is cloned into DIR if --fetch is
-given, and left out otherwise. Nothing of the data is kept. The results are result.json, of which
-`python doc/make.py` makes the tables of doc/results.md, and these tables on the screen.
+given, and left out otherwise. Nothing of the data is kept. The results are result.json and
+tables.md, which `python doc/make.py` writes into doc/results.md.
 
 Every model is made from the training rests alone, and judged on all rows of runs (neck), files
 (arm) or poses (stand) that it was not made from. All constants are in `recordings_learn`; none was
@@ -36,12 +36,12 @@ from bench.recordings_learn import (
     polynomial,
 )
 from bench.recordings_read import Files, Recording, Repository, Run, fitted, repositories
+from bench.recordings_table import ALL_ROWS, Result, tables
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 HALF = slice(0, None, 2)  # every other rest trains
-ALL_ROWS = ', of all rows'
 
 
 class Split(NamedTuple):
@@ -54,21 +54,20 @@ class Split(NamedTuple):
     full: Run | None = None  # all rows of the training runs, for polynomials of all rows
 
 
-class Result(NamedTuple):
-    """The error of one model on one split."""
-
-    recording: str
-    split: str
-    samples: int
-    model: str
-    error_rad: float
+def _rows(run: Run, rows: Any) -> Run:
+    parts = {'length': run.length[rows], 'effort': run.effort[rows], 'theta': run.theta[rows]}
+    return replace(run, rests=run.rests[:0], **parts)
 
 
 def neck_splits(recording: Recording) -> Iterator[Split]:
     """Split the soft neck: one payload, and two payloads for the third."""
     none, half, whole = recording.runs
     own = none.at_rest(HALF)
-    for test in recording.runs:
+    # Rows of the poses in between, from the end of one rest to that of the next.
+    pose = np.searchsorted(none.rests[:, 1], np.arange(len(none.length)), side='right')
+    others = (pose % 2 == 1) & (pose < len(none.rests))
+    yield Split('0 g → other poses, 0 g', own, _rows(none, others), [], _rows(none, ~others))
+    for test in (half, whole):
         yield Split(f'0 g → {test.name}', own, test, [], none)
     for first, second, test in ((none, whole, half), (none, half, whole), (half, whole, none)):
         rests = [first.at_rest(HALF), second.at_rest(HALF)]
@@ -92,13 +91,9 @@ def stand_splits(recording: Recording) -> Iterator[Split]:
     """Split the test stand: 20 or 100 of its poses, and all others."""
     run = recording.runs[0]
     order = np.random.default_rng(0).permutation(len(run.length))
-
-    def of(rows: Any) -> Run:
-        return replace(run, length=run.length[rows], effort=run.effort[rows], theta=run.theta[rows])
-
     for count in (20, 100):
         name = f'{count} poses → all others'
-        yield Split(name, of(order[:count]), of(order[count:]), [])
+        yield Split(name, _rows(run, order[:count]), _rows(run, order[count:]), [])
 
 
 SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {
@@ -108,8 +103,10 @@ SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {
 }
 
 
-def models(recording: Recording, split: Split, directory: Path) -> Iterator[tuple[str, Model]]:
-    """Yield every model of a split with its name."""
+def models(
+    recording: Recording, split: Split, directory: Path, learned: dict[tuple[str, bool], Model]
+) -> Iterator[tuple[str, Model]]:
+    """Yield every model of a split with its name; `learned` keeps those of equal training rows."""
     efforts = (False, True) if split.training.effort.size else (False,)
     for with_effort in efforts:
         what = 'lengths and efforts' if with_effort else 'lengths'
@@ -127,22 +124,25 @@ def models(recording: Recording, split: Split, directory: Path) -> Iterator[tupl
     def shifted(run: Run) -> Run:
         return replace(run, length=run.length - at_zero)
 
-    robot = Robot.load(link.write(directory))
     for with_effort in efforts:
-        learned = package(robot, shifted(split.training), with_effort)
+        key = split.name.partition(' → ')[0], with_effort
+        if key not in learned:
+            learned[key] = package(link, directory, shifted(split.training), with_effort)
         what = 'lengths and efforts' if with_effort else 'lengths'
-        yield f'this package, {what}', lambda run, learned=learned: learned(shifted(run))
+        yield f'this package, {what}', lambda run, model=learned[key]: model(shifted(run))
     if split.rests:
+        robot = Robot.load(link.write(directory))
         yield 'statics with learned springs, payload known', Statics(robot, split.rests).posture
 
 
 def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str, Any]]:
     """Return the errors of all models on a repository, and what else its runs show."""
     recording = repository.read(files)
-    name, results = recording.link.name, []
+    name, results = recording.link.name, list[Result]()
+    learned = dict[tuple[str, bool], Model]()
     with tempfile.TemporaryDirectory() as folder:
         for split in SPLITS[name](recording):
-            for label, model in models(recording, split, Path(folder) / 'robot'):
+            for label, model in models(recording, split, Path(folder) / 'robot', learned):
                 off = error(model, split.test)
                 results.append(Result(name, split.name, len(split.training.length), label, off))
                 print(f'{name}: {split.name}: {label}: {off:.4f} rad', flush=True)
@@ -159,51 +159,6 @@ def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str,
                 share = payload_share(recording.runs, with_effort, with_theta)
                 shown[f'payload R² by {", ".join(inputs)}'] = share
     return results, shown
-
-
-#: what stands for all polynomials that were fitted to all rows of the training runs
-OF_ALL_ROWS = 'best polynomial of all training rows (chosen by its test error)'
-
-
-def table(results: list[Result]) -> str:
-    """Return the errors of one recording as a Markdown table.
-
-    Of the polynomials of all rows, only the best one of each split stands there. The best model
-    from the rest samples is in bold.
-    """
-    errors, samples = dict[tuple[str, str], float](), dict[str, int]()
-    for result in results:
-        label = OF_ALL_ROWS if result.model.endswith(ALL_ROWS) else result.model
-        before = errors.get((result.split, label), np.inf)
-        errors[result.split, label] = min(before, result.error_rad)
-        samples[result.split] = result.samples
-    labels = [*dict.fromkeys(label for _, label in errors if label != OF_ALL_ROWS)]
-    best = {s: min(e for (k, m), e in errors.items() if k == s and m in labels) for s in samples}
-    heads = [f'{split} ({count} rests)' for split, count in samples.items()]
-    lines = [f'| mean error [rad] | {" | ".join(heads)} |', '|---' * (len(heads) + 1) + '|']
-    if any(label == OF_ALL_ROWS for _, label in errors):
-        labels.append(OF_ALL_ROWS)
-    for label in labels:
-        cells = []
-        for split in samples:
-            value = errors.get((split, label), np.nan)
-            text = '–' if np.isnan(value) else f'{value:.3f}' if value < 1.0 else '> 1'
-            cells.append(f'**{text}**' if value == best[split] else text)
-        lines.append(f'| {label} | {" | ".join(cells)} |')
-    return '\n'.join(lines)
-
-
-def tables(document: dict[str, Any]) -> str:
-    """Return the tables of a recordings.json as Markdown."""
-    results = [Result(**row) for row in document['errors']]
-    parts = []
-    for repository in repositories():
-        own = [result for result in results if result.recording == repository.recording]
-        if own:
-            link = f'[{repository.name}](https://github.com/{repository.name})'
-            head = f'**{link}** ({repository.licence}): {repository.robot}.'
-            parts.append(f'{head}\n\n{table(own)}')
-    return '\n\n'.join(parts)
 
 
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
@@ -248,5 +203,6 @@ def main(argv: list[str]) -> int:
     document = {'errors': rows, 'also': shown}
     text = json.dumps(document, indent=1, ensure_ascii=False)
     (args.out / 'result.json').write_text(text + '\n', encoding='utf-8')
+    (args.out / 'tables.md').write_text(tables(document) + '\n', encoding='utf-8')
     print(tables(document))
     return 0

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations_with_replacement
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from bench.recordings_read import Run
+from bench.recordings_read import Run, SoftLink
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import Observations
@@ -67,9 +68,9 @@ def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
 
 
 def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
-    """Return what stands for the tensions [N]: T_bias alone, or with the effort on top."""
+    """Return what stands for the tensions [N]: those assumed, or T_bias with the effort on top."""
     if not with_effort:
-        return lambda run: np.tile(robot.tension.bias, (len(run.length), 1))
+        return lambda run: np.tile(robot.assumed_tension, (len(run.length), 1))
     strong = np.quantile(np.abs(training.effort), 0.95)
 
     def scaled(run: Run) -> Array:
@@ -79,8 +80,14 @@ def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], 
     return scaled
 
 
-def package(robot: Robot, training: Run, with_effort: bool = False, seed: int = 0) -> Model:
-    """Return what this package learns: a network, trained on the calibrated body of the rests."""
+def package(
+    link: SoftLink, directory: Path, training: Run, with_effort: bool = False, seed: int = 0
+) -> Model:
+    """Return what this package learns: a network, trained on the calibrated body of the rests.
+
+    Without efforts, the tension is unknown. With them, they are taken for tensions.
+    """
+    robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
     tension = tensions(robot, training, with_effort)
     pulls = tension(training)
     known, still = np.ones(pulls.shape, dtype=bool), np.zeros_like(pulls)

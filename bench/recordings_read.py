@@ -74,8 +74,8 @@ class SoftLink:
     mass: float  # of its tip [kg]
     limit: float  # largest bend [rad]
 
-    def write(self, directory: Path) -> Path:
-        """Write the robot directory, and return it."""
+    def write(self, directory: Path, tension_source: str = 'none') -> Path:
+        """Write the robot directory, and return it; its winches follow positions."""
         directory.mkdir(parents=True, exist_ok=True)
         low, high, half = -self.limit, self.limit, 0.5 * self.height
         urdf = URDF.format(name=self.name, half=half, mass=self.mass, low=low, high=high)
@@ -87,6 +87,7 @@ class SoftLink:
             muscles.append({'name': f'tendon_{i}', 'route': list(ends)})
         document = {
             'joints': ['bend_x', 'bend_y'], 'muscles': muscles, 'end_effector': 'head',
+            'actuation': 'position', 'tension_source': tension_source,
             # Tendons of steel, without an elastic element.
             'series_elastic': {'force': 1000.0, 'rate': 1000.0, 'wire_stretch': 1e-6},
             'tension': {'bias': 5.0, 'limit': 60.0, 'max': 100.0},

@@ -7,7 +7,7 @@
 - `reference/parameters.md`: the parameters of all nodes
 - `reference/command_line.md`: `--help` of all scripts and executables
 - `reference/stops.md`: modes and stop causes
-- the tables of results in `README.md`
+- the tables of results in `README.md` and `doc/results.md`
 - `images/elastic_unit.png`: the series elastic element; `images/muscles.png`: an arm
 - the charts of the results in `results/`
 """
@@ -35,6 +35,7 @@ from musculoskeletal_ae.robot.robot import Robot
 FOLDER = Path(__file__).resolve().parent
 PACKAGE = FOLDER.parent / 'musculoskeletal_ae'
 README = FOLDER.parent / 'README.md'
+DOCUMENTS = README, FOLDER / 'results.md'
 #: what a program in Python builds on, module by module
 MODULES = {
     'robot/robot.py': ['Robot'],
@@ -267,9 +268,23 @@ def capabilities_table() -> str:
     return '\n'.join(lines)
 
 
-def readme(text: str) -> str:
-    """Return README with its tables written from the committed results."""
-    for name, make in {'estimates': estimates_table, 'capabilities': capabilities_table}.items():
+def recordings_tables() -> str:
+    """Return the tables of the recordings of other people's robots."""
+    return (FOLDER / 'results' / 'recordings' / 'tables.md').read_text('utf-8').strip()
+
+
+TABLES = {
+    'estimates': estimates_table,
+    'capabilities': capabilities_table,
+    'recordings': recordings_tables,
+}
+
+
+def with_tables(text: str) -> str:
+    """Return a document with those of the TABLES that it marks, from the committed results."""
+    for name, make in TABLES.items():
+        if f'<!-- {name} -->' not in text:
+            continue
         begin, end = f'<!-- {name} -->', f'<!-- /{name} -->'
         head, _, rest = text.partition(begin)
         text = f'{head}{begin}\n\n{make()}\n\n{end}{rest.partition(end)[2]}'
@@ -352,7 +367,8 @@ def draw_results() -> None:
 if __name__ == '__main__':
     for page, make in PAGES.items():
         (FOLDER / 'reference' / page).write_text(make(), encoding='utf-8')
-    README.write_text(readme(README.read_text('utf-8')), encoding='utf-8')
+    for document in DOCUMENTS:
+        document.write_text(with_tables(document.read_text('utf-8')), encoding='utf-8')
     draw_series_elastic(FOLDER / 'images' / 'elastic_unit.png')
     draw_muscles(FOLDER / 'images' / 'muscles.png')
     draw_results()

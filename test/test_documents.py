@@ -44,9 +44,10 @@ def test_the_page_of_the_command_line_has_every_executable_and_option():
     assert usage.rstrip() in page, REMEDY
 
 
-def test_the_tables_of_the_readme_are_those_of_the_committed_results():
-    text = (ROOT / 'README.md').read_text('utf-8')
-    assert text == make.readme(text), REMEDY
+@pytest.mark.parametrize('document', make.DOCUMENTS, ids=lambda document: document.name)
+def test_the_tables_of_a_document_are_those_of_the_committed_results(document):
+    text = document.read_text('utf-8')
+    assert text == make.with_tables(text), REMEDY
 
 
 def test_links_between_documents_lead_somewhere():

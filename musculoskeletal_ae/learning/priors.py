@@ -15,8 +15,8 @@ from musculoskeletal_ae.learning.stops import sensor_zeros
 
 # For prismatic joints, [rad] below are times RACK [m].
 #: Errors of the body model are common to all samples. Therefore all samples together count as at
-#: most this number of independent ones, both for joint-sensor offsets and for the posterior
-#: uncertainty from the torque and the stops of joints without a sensor.
+#: most this number of independent ones, for joint-sensor offsets, for springs of the joints, and
+#: for the posterior uncertainty from the torque and the stops of joints without a sensor.
 ALIKE = 10.0
 SENSOR = 0.002  # σ_y of a joint sensor [rad]
 SMALL = 1e-6  # smallest σ_y [rad]
@@ -106,7 +106,7 @@ class GroupPrior:
             ),
             repeated=repeated,
             unread=np.maximum(1.0, (~by_sensor).sum(axis=0) / ALIKE),
-            spring_precision=model.spring_spread.ravel() ** -2.0,
+            spring_precision=max(1.0, len(readings) / ALIKE) / model.spring_spread.ravel() ** 2,
         )
 
     def deviation(self, parameters: list[Array]) -> Array:
