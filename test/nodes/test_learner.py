@@ -416,7 +416,7 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
     # One report that may have been due, and one that the loss causes.
     assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
     learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
-    graph.wait(lambda: levels()[-1] != DiagnosticStatus.ERROR, 'its end')
+    learner.learn(lambda: levels()[-1] != DiagnosticStatus.ERROR, 'the end of the error')
     count = learner.samples
     graph.end(learner.node)
     assert len(host(state_directory=state).node.core.samples) == count

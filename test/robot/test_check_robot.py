@@ -355,12 +355,12 @@ def test_arms_of_human_size_are_judged_by_the_round_figures(name):
 
 
 def test_a_description_error_is_one_line_and_status_1(tmp_path, capsys):
-    directory = change(copy_robot('arm26', tmp_path), lambda d: d.update(speed=1.0))
+    directory = change(copy_robot('arm26', tmp_path), lambda d: d.update(colour=1.0))
     status, printed, error = verdict(capsys, directory)
     assert status == 1
     assert printed == ''
     assert error.startswith('error: ') and error.count('\n') == 1
-    assert 'muscles.yaml' in error and "'speed'" in error
+    assert 'muscles.yaml' in error and "'colour'" in error
 
 
 @pytest.mark.parametrize(
