@@ -158,7 +158,7 @@ exclude --mujoco --robot --hardware --bag --reality
 [ -n "$mujoco" ] || [ ${#chain[@]} = 0 ] || refuse "${chain[0]} goes with --mujoco"
 [ -z "$mujoco" ] || [ -f "$mujoco" ] || refuse "--mujoco '$mujoco' is no file"
 for option in --port --read-only; do
-  ! is_given "$option" || [ $view = true ] || refuse "$option is about the page: it goes with --view"
+  ! is_given "$option" || [ $view = true ] || refuse "$option requires --view"
 done
 
 robot_directory=$repository/config/$robot

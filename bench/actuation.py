@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares kinds of muscle modules: stiffness control or positions, and what is known of tension.
+"""Compares kinds of muscle modules: stiffness control or positions, and sources of tension.
 
     python -m bench actuation [--robot musashi_left_arm] [--seeds 0,1,2,3,4] [--quick]
 
 Each emulated individual explores and learns with every kind of module, from the same initial
-network. Then, with what it has learned:
+network. With the learned network, the bench measures:
 
-- estimate: mean ‖θ_est − θ‖ while it explores for another while, before and after learning,
-- control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random postures that the model can hold,
-- rupture: each of some muscles ruptures while the arm explores. The share that is isolated as
-  broken within 10 s, the share where that muscle is the one, and the mean time to the finding,
+- estimate: mean ‖θ_est − θ‖ in further exploration, before and after learning,
+- control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random holdable postures,
+- rupture: several muscles rupture in turn while the arm explores. The share of ruptures
+  after which a muscle is isolated within 10 s, the share with the right muscle, and the mean time
+  to the finding,
 - max/limit: the highest true tension as a multiple of `tension.limit`, except after a rupture,
 - wrong: isolated muscles and stops of the healthy arm.
 
@@ -54,14 +55,14 @@ HEAD = (
 
 
 class Result(NamedTuple):
-    """What one individual showed with one kind of module."""
+    """Results of one individual with one kind of module."""
 
     before: float
     after: float
     control: float
-    isolated: float  # share of the ruptures
+    isolated: float  # share of the ruptures after which a muscle was isolated
     named: float
-    found: float  # [s]
+    found: float  # mean time to the finding [s]
     highest: float  # as a multiple of the limit
     wrong: float
     samples: float
@@ -79,7 +80,7 @@ class Watched:
         self._arm, self.highest = arm, 0.0
 
     def note(self) -> None:
-        """Take the present tensions."""
+        """Record the present tensions."""
         share = self._arm.tension / self._arm.robot.tension.limit
         self.highest = max(self.highest, float(share.max()))
 
@@ -133,7 +134,7 @@ def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tu
 
 
 def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, float]:
-    """Rupture muscles in turn; return the shares isolated and named, and the time found [s]."""
+    """Rupture muscles in turn; return the shares isolated and named, and the mean time [s]."""
     isolated, named, times = 0, 0, []
     for m in np.random.default_rng([seed, 0x2B]).permutation(arm.robot.muscle_count)[:count]:
         arm.reset()

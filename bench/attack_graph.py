@@ -149,7 +149,7 @@ class Attack:
         self.situation = Situation(self.namespace)
         self.status: list[tuple[float, str, str]] = []  # time [s], level and text
         self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
-        #: intervals [s] in which others than the controller may command, or sensors are wrong
+        #: intervals [s] in which other nodes may send commands, or sensor data are wrong
         self.foreign: list[tuple[float, float]] = []
         self.lying: list[tuple[float, float]] = []
         self.strangers: list[Process] = []  # duplicate nodes that the attack started

@@ -42,7 +42,7 @@ BEFORE_CORE = {
     'control solve: proposed, paper': 530.0, 'simulation step': 150.0,
     f'the same, each of {timings.MANY} in one batch': 6.7,
 }  # fmt: skip
-TORCH_BEFORE = 118.0  # [µs] of the first row there: ours were 6.2 times as fast
+TORCH_BEFORE = 118.0  # time of the first row in torch on that machine [µs]
 #: rate [Hz]: latency at 50 %, 99 %, largest [ms]; all nodes [% of a core]; with learner to 200 Hz
 BEFORE_WIRE = {100.0: ('3.4 / 9.4 / 19', 138), 200.0: ('2.4 / 8.6 / 17', 172),
                500.0: ('0.6 / 6.1 / 12', 166)}  # fmt: skip

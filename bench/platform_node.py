@@ -67,11 +67,11 @@ def check(file: Path) -> str:
         rclpy.try_shutdown()
     difference = float(np.max(np.abs(np.array(received[0].position) - expected)))
     if not difference < LARGEST_DIFFERENCE:
-        raise RuntimeError(f'the node estimates {difference:g} rad beside the core')
+        raise RuntimeError(f'the estimates of node and core differ by {difference:g} rad')
     if process.returncode != 0:
         raise RuntimeError(f'on SIGTERM the estimator ended with status {process.returncode}')
     version = '.'.join(map(str, sys.version_info[:3]))
-    return f'Python {version}, NumPy {np.__version__}: node and core estimate the same'
+    return f'Python {version}, NumPy {np.__version__}: node and core have the same estimate'
 
 
 if __name__ == '__main__':

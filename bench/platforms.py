@@ -27,7 +27,7 @@ from musculoskeletal_ae.options import Parser
 
 ROOT = Path(__file__).resolve().parents[1]
 ROS_REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt'
-#: what the core and the estimator import, without which --node does
+#: all packages that `--node` installs: the imports of the core and the estimator
 NODE_REQUIREMENTS = ('numpy', 'pin', 'safetensors', 'msgspec', 'PyYAML')
 #: package versions of Ubuntu 24.04
 UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1', 'lark==1.1.9')

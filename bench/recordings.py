@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learns public recordings of other people's tendon-driven robots, beside polynomial fits.
+"""Learns public recordings of other tendon-driven robots, and compares with polynomial fits.
 
     python -m bench recordings --clones DIR [--out DIR] [--only NAME]
 
@@ -8,8 +8,8 @@ DIR has one clone for each repository of `recordings_read.repositories`, named O
 given, and left out otherwise. Nothing of the data is kept. The results are result.json and
 tables.md, which `python doc/make.py` writes into doc/results.md.
 
-Every model is made from the training rests alone, and judged on all rows of runs (neck), files
-(arm) or poses (stand) that it was not made from. All constants are in `recordings_learn`; none was
+Every model is trained on the training rests only, and tested on all rows of other runs (neck),
+files (arm) or poses (stand). All constants are in `recordings_learn`; none was
 chosen by an error on test rows.
 """
 
@@ -41,11 +41,11 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-HALF = slice(0, None, 2)  # every other rest trains
+HALF = slice(0, None, 2)  # every other rest is for training
 
 
 class Split(NamedTuple):
-    """What is trained on, and what is tested on."""
+    """Training and test data."""
 
     name: str
     training: Run  # rest samples
@@ -60,7 +60,7 @@ def _rows(run: Run, rows: Any) -> Run:
 
 
 def neck_splits(recording: Recording) -> Iterator[Split]:
-    """Split the soft neck: one payload, and two payloads for the third."""
+    """Split the soft neck: training with one payload, or with two and test with the third."""
     none, half, whole = recording.runs
     own = none.at_rest(HALF)
     # Rows of the poses in between, from the end of one rest to that of the next.
@@ -76,7 +76,7 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
 
 
 def arm_splits(recording: Recording) -> Iterator[Split]:
-    """Split the soft arm: other files of one payload, and other payloads."""
+    """Split the soft arm: test with other files of the same payload, or with other payloads."""
     files = {load: [run for run in recording.runs if run.load == load] for load in (0.0, 0.5)}
     others = [run for run in recording.runs if run.load not in files]
     bare, held_out = files[0.0][0::2], files[0.0][1::2]
@@ -88,7 +88,7 @@ def arm_splits(recording: Recording) -> Iterator[Split]:
 
 
 def stand_splits(recording: Recording) -> Iterator[Split]:
-    """Split the test stand: 20 or 100 of its poses, and all others."""
+    """Split the test stand: training with 20 or 100 of its poses, and test with all others."""
     run = recording.runs[0]
     order = np.random.default_rng(0).permutation(len(run.length))
     for count in (20, 100):
@@ -136,7 +136,7 @@ def models(
 
 
 def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str, Any]]:
-    """Return the errors of all models on a repository, and what else its runs show."""
+    """Return the errors of all models on a repository, and further results of its runs."""
     recording = repository.read(files)
     name, results = recording.link.name, list[Result]()
     learned = dict[tuple[str, bool], Model]()
@@ -181,7 +181,7 @@ def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
 
 
 def main(argv: list[str]) -> int:
-    """Learn all repositories that there are clones of; return 1 if there is none."""
+    """Learn all repositories that have clones; return 1 if there is none."""
     parser = Parser('recordings', "Learns public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that recordings are learned with: this package, and what it is compared with.
+"""Models of recordings: that of this package, and those for comparison.
 
-Every model is made from rest samples and maps lengths (and efforts) to θ.
+Every model is trained on rest samples and maps lengths (and efforts) to θ.
 """
 
 from __future__ import annotations

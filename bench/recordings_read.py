@@ -49,7 +49,7 @@ class Run:
     name: str
     load: float  # payload [kg]
     length: Array  # l, paid-out tendon since the start [m], (N, M)
-    effort: Array  # what the motors exert, in units of the recording, (N, M); (N, 0): unknown
+    effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0): unknown
     theta: Array  # θ, which an independent sensor measured [rad], (N, D)
     rests: Array  # first row of each rest, and the row after its last one, (R, 2)
 
@@ -251,9 +251,9 @@ def continuum_stand(files: Files) -> Recording:
 
 
 def fitted(link: SoftLink, training: Run) -> tuple[SoftLink, Array]:
-    """Return a link whose tendons stand where training rows put them, and their lengths at θ = 0.
+    """Estimate the positions of a link's tendons and their lengths at θ = 0 from training rows.
 
-    Rows in which a tendon is not shortened say nothing about it.
+    Rows in which a tendon is not shortened contain no information about it.
     """
     arms, at_zero = [], []
     for length in training.length.T:

@@ -21,7 +21,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
 STEP = 0.003  # first step inwards, by which latency is measured [m]
-SPEED = 0.01  # [m/s] at which the target goes on inwards
+SPEED = 0.01  # [m/s] at which the target continues inwards
 FURTHEST = 0.015  # farthest that the target moves inwards [m]
 OUTWARDS = 0.005  # [m]
 FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
@@ -61,7 +61,7 @@ class Positioning(MotionTest):
         #: last time at which each muscle neither pulled too hard nor was far from its target [s]
         self._tame_at: Array = np.zeros(self._robot.muscle_count)
 
-    # -- what is commanded ----------------------------------------------------------------------
+    # -- commands -------------------------------------------------------------------------------
 
     def _sequence(self) -> Wait:
         try:
@@ -105,7 +105,7 @@ class Positioning(MotionTest):
         mean: Array = np.mean([states for _, states in self._recent], axis=0)
         return mean
 
-    # -- what is judged -------------------------------------------------------------------------
+    # -- checks ---------------------------------------------------------------------------------
 
     def _try(self, m: int) -> Wait:
         verdict, home, start = self.verdict, self._mean(), float(self._target[m])

@@ -109,7 +109,7 @@ class Winding(MotionTest):
         self._tame_at: Array = np.zeros(robot.muscle_count)
         self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
 
-    # -- what is commanded ----------------------------------------------------------------------
+    # -- commands -------------------------------------------------------------------------------
 
     def _sequence(self) -> Wait:
         try:

@@ -191,7 +191,7 @@ class Arm(ABC):
     warnings: tuple[str, ...] = ()  # warnings to report when the arm is started
     _angles: Array  # of all joints
     _rates: Array  # velocities of all joints
-    _order: Ints  # indices of the joints of θ in both
+    _order: Ints  # indices of the joints of θ in `_angles` and `_rates`
 
     def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
         """Build the modules; `length_bias` [m] (M,) are the offsets of their length sensors."""

@@ -3,8 +3,8 @@
 
 A segment between two route points may wrap around a sphere (a bone's head) that the geometric model
 of `robot/routes.py` does not contain. Segments that the robot description wraps also wrap here,
-round an object of a slightly different size. `robot/wrapping.py` computes the path of the tendon on
-either.
+around an object of a slightly different size. `robot/wrapping.py` computes the path of the tendon
+on either kind of object.
 """
 
 from __future__ import annotations

@@ -210,7 +210,7 @@ class Estimator(Shell):
         joints = [joint for joint, is_known in zip(self.robot.joints, known) if is_known]
         self.by_camera.publish(joint_message(joints, theta[known], message.header.stamp))
 
-    # -- what is published ----------------------------------------------------------------------
+    # -- publishing -----------------------------------------------------------------------------
 
     def _publish(self, output: Output, stamp: Any, now: float) -> None:
         state, sample = output.state, output.sample

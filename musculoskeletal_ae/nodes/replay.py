@@ -382,7 +382,7 @@ def parse(arguments: list[str]) -> Namespace:
             'by their own clocks the arm would seem faster or slower than it was'
         )
     if options.robot and not options.check:
-        parser.error('--robot is for --check')
+        parser.error('--robot requires --check')
     if options.check:
         changed = {
             name for name, value in vars(options).items() if value != parser.get_default(name)

@@ -12,9 +12,8 @@ and, where joints are forced to θ_fix,
     (θ_sim, T_sim) ← f_decode(z) after the descent (`latent_descent`)
 
 l_sim is the commanded length l_target (in the Japanese text: the muscle length sent to the robot).
-Only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF, with that of the
-joints' springs. A muscle without a command gives way:
-its l_sim is its present length.
+Only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF, plus the torque of the joints' springs.
+For a muscle without a command, l_sim is its present length, so that it does not resist.
 
 The paper does not state that θ_sim and T_sim are kept within the limits of joints and modules; we
 do so. This bounds the iteration for any network, and without it tensions fall below T_bias. On one

@@ -125,8 +125,8 @@ class RobotDescription:
     #: whether the modules follow l_target itself, and the resulting tension is not regulated
     follows_position: bool
     knows_tension: bool  # whether the modules measure tension
-    speed: Array  # with which they follow it [m/s], (M,); infinite for other modules
-    #: that a stop pays out where no tension is known [m], (M,)
+    speed: Array  # speed of modules that follow positions [m/s], (M,); infinite for others
+    #: length that a stop pays out if tensions are unknown [m], (M,)
     release: Array
     end_effectors: tuple[str, ...]  # links; `end_effector` is the first
     couplings: dict[str, Coupling]  # of joints that follow others

@@ -4,9 +4,9 @@
     load(θ) = g(θ) + K θ − b − Jᵀ F
 
 (paper, §III-F: the necessary torque from the geometric model), compiled by numba; K and b are those
-of `JointElasticity`. Pinocchio computes the same torque of the weight,
-and a test compares the two. However, it has no gradient with a wrench, and called from Python it
-takes as long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with axis a_k
+of `JointElasticity`. Pinocchio computes the same torque of the weight, and a test compares the two.
+However, it has no gradient with a wrench, and a call from Python takes as long as the rest of a
+step. With forces f_i at points c_i, a joint k at o_k with axis a_k
 needs only sums over the bodies that it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i

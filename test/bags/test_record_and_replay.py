@@ -264,7 +264,7 @@ def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
         (replay_tool.parse, ['bag', '--start', '-1'], 'expected a number of at least 0'),
         (replay_tool.parse, ['bag', '--duration', 'inf'], 'expected a number above 0'),
         (replay_tool.parse, ['bag', '--topics', ','], "',': expected a name"),
-        (replay_tool.parse, ['bag', '--robot', 'arm26'], '--robot is for --check'),
+        (replay_tool.parse, ['bag', '--robot', 'arm26'], '--robot requires --check'),
         (
             replay_tool.parse,
             ['bag', '--as-trajectory', '--topics', 'joint_states,imu'],

@@ -235,7 +235,7 @@ def test_a_reality_that_is_another_robot_is_reported_on_the_terminal(environment
     [
         (['--robot', 'no_such_robot'], 'musashi_left_arm'),
         (['--duration', 'soon'], 'soon'),
-        (['--read-only'], 'goes with --view'),
+        (['--read-only'], 'requires --view'),
         (['--explore', '--no-controller'], 'exclude each other'),
         (['-p', 'arm:rate:=50.0'], 'hardware_emulator'),
         (['--fly'], '--help'),

@@ -42,7 +42,7 @@ class FrozenSensor(Detector):
     def step(self, observation: Observation) -> Finding | None:
         """Take a message."""
         sample, robot = observation.sample, self._robot
-        # A tension that is not known is no frozen one.
+        # An unknown tension does not count as frozen.
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)

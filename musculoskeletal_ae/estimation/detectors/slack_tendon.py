@@ -111,7 +111,7 @@ class SlackTendon(Detector):
         if self._slack_time.max() < DEAD_TIME - 1e-9:
             return None
         muscle = int(self._slack_time.argmax())
-        return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched and does not pull')
+        return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched, but has no tension')
 
     def _is_stretched(self, sample: MuscleSample, slack: tuple[int, ...]) -> Bools:
         """Return which slack muscles are so short that they had to pull, (M,)."""
