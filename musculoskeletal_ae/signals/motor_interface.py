@@ -127,10 +127,11 @@ class MotorInterface:
             raise MessageError('repeated stamp', f'{stamp.sec}.{stamp.nanosec:09d} s')
         position = np.array(message.position, dtype=float)[self._places]
         rows = np.full((3, len(position)), np.nan)
-        rows[0] = self._length_per_position * (position - self._zero)
-        if len(message.effort):
-            effort = np.array(message.effort, dtype=float)[self._places]
-            rows[1] = self._tension_per_effort * (effort - self._effort_zero)
+        with np.errstate(over='ignore'):  # values that large are rejected as not finite
+            rows[0] = self._length_per_position * (position - self._zero)
+            if len(message.effort):
+                effort = np.array(message.effort, dtype=float)[self._places]
+                rows[1] = self._tension_per_effort * (effort - self._effort_zero)
         return MuscleReading(rows.ravel())
 
     def command(self, length: Array) -> Array:

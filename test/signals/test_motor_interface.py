@@ -2,6 +2,7 @@
 """Conversion of the messages of a ros2_control robot, with the rules of its two controllers."""
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -127,6 +128,16 @@ def test_a_position_that_is_not_a_number_is_rejected_by_the_one_stream_of_all_me
     reading = interface.reading(joint_state(robot.muscles, 2, position=position, effort=effort))
     sample = MuscleStream(robot).take(reading, 0.0)
     np.testing.assert_allclose(sample.motor_tension, robot.tension.bias)
+
+
+anything = st.lists(st.floats(width=64), max_size=5)
+
+
+@given(st.lists(st.sampled_from([*MOTORS, 'elbow']), max_size=5), anything, anything, anything)
+def test_whatever_arrives_is_a_reading_or_a_message_error(names, position, velocity, effort):
+    arrays = {'position': position, 'velocity': velocity, 'effort': effort}
+    with suppress(MessageError):
+        assert states(joint_state(names, **arrays)).shape == (3, 3)
 
 
 def test_a_command_is_in_the_order_of_the_controller():
