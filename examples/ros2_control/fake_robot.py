@@ -15,6 +15,7 @@ import time
 
 import numpy as np
 import rclpy
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -29,10 +30,10 @@ SPOOL_RADIUS = 0.012  # [m]
 
 
 class Hardware:
-    """The hardware component: motors with encoders and torque sensors, and two joint sensors."""
+    """The hardware component: motors with encoders and torque sensors, and joint sensors."""
 
-    def __init__(self) -> None:
-        self.robot = Robot.load('arm26')
+    def __init__(self, robot: str) -> None:
+        self.robot = Robot.load(robot)
         self.arm, self.read_at = EmulatedArm(self.robot, seed=1), time.monotonic()
         index = np.arange(self.robot.muscle_count)
         self.motors = [f'{muscle}_motor' for muscle in self.robot.muscles]
@@ -53,7 +54,7 @@ class Hardware:
         return states
 
     def write(self, angles: dict[str, float]) -> None:
-        """Let each drive follow a spool angle with its stiffness (the MSC law)."""
+        """Let each drive follow a spool angle: by the MSC law, or with `actuation: position`."""
         angle = np.array([angles[motor] for motor in self.motors])
         self.arm.command_length(self.direction * SPOOL_RADIUS * (angle - self.zero))
 
@@ -63,7 +64,7 @@ class FakeRobot(Node):
 
     def __init__(self) -> None:
         super().__init__('fake_robot')
-        self.hardware = Hardware()
+        self.hardware = Hardware(self.declare_parameter('robot', 'arm26').value)
         self.joints = sorted(self.hardware.motors)  # parameter `joints` of tendon_controller
         self.commands: list[float] | None = None
         self.states = self.create_publisher(JointState, 'joint_states', 10)
@@ -100,7 +101,7 @@ if __name__ == '__main__':
     rclpy.init()
     try:
         rclpy.spin(FakeRobot())
-    except MusculoskeletalError as error:
+    except (MusculoskeletalError, ParameterException) as error:  # unknown robot, or not a name
         sys.exit(f'error: {error}')
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
