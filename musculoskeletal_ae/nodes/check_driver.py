@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message
+from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message, motor_command
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import (
     ROS_HELP,
@@ -54,8 +54,6 @@ class CheckDriver:
         self.node = Node('check_driver')
         self.robot, self.options = robot, options
         self.motors = _motors(robot, options)
-        #: without motor commands, those of the driver's contract
-        self.is_converted = bool(self.motors.command_topic)
         command = self.motors.command_topic or 'muscle_length_command'
         resolve = self.node.resolve_topic_name
         self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
@@ -143,9 +141,10 @@ class CheckDriver:
                 return
             last, target = now, winding.step(states, now)
             if target is not None:
-                if self.is_converted:
-                    target = self.motors.command(target)
-                publisher.publish(array_message(target, 'muscle'))
+                if self.motors.command_topic:
+                    publisher.publish(motor_command(self.motors, target))
+                else:
+                    publisher.publish(array_message(target, 'muscle'))
             if winding.trying != trying:
                 trying = winding.trying
                 _say(f'moving: {trying}')

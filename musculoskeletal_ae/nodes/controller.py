@@ -30,7 +30,14 @@ from musculoskeletal_ae.control.methods import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, array_message, serve
+from musculoskeletal_ae.nodes.messages import (
+    LATCHED,
+    RELIABLE,
+    SENSOR,
+    array_message,
+    motor_command,
+    serve,
+)
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
@@ -241,7 +248,7 @@ class Controller(Shell):
             value, offset = command.value, self.body.offsets.offset
             value = value + offset if command.kind == LENGTH else value
             if self.motor_commands is not None and command.kind == LENGTH:
-                self.motor_commands.publish(array_message(self.motors.command(value), 'motor'))
+                self.motor_commands.publish(motor_command(self.motors, value))
             message = serialize_message(array_message(value, 'muscle'))
             self.publishers_of[command.kind].publish(message)
             self.core.sent_at = time.monotonic()

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds ROS messages from arrays (`validity` reads them), QoS profiles and service answers."""
 
+from __future__ import annotations
+
 import math
 from array import array
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
 from rcl_interfaces.msg import SetParametersResult
@@ -17,7 +19,9 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.signals.motor_interface import MotorInterface
+
+if TYPE_CHECKING:  # a slow import, which --help of the tools does not need
+    from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 # The three qualities of service (doc/reference/topics_and_services.md).
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -47,6 +51,11 @@ def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointStat
     message = JointState(name=joints, position=array('d', theta.tobytes()))
     message.header.stamp = stamp
     return message
+
+
+def motor_command(motors: MotorInterface, length: Array) -> Float64MultiArray:
+    """Return the command to the motors of muscles with l_target [m] (M,), without a layout."""
+    return Float64MultiArray(data=array('d', motors.command(length).tobytes()))
 
 
 def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: Time) -> JointState:

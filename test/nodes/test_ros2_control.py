@@ -116,6 +116,14 @@ def test_the_emulator_plays_the_same_robot(graph, arm26):
     graph.wait(pulls, 'motors that pull')
 
 
+def test_our_nodes_command_the_emulator_by_its_motors(graph, trained_file):
+    emulator = host(graph, HardwareEmulator)
+    host(graph, Estimator, checkpoint=trained_file)
+    host(graph, Controller, checkpoint=trained_file, max_age=5.0, explore=True)
+    graph.wait(lambda: not emulator.arm.safe, 'a command to the motors')
+    assert not emulator.rejected
+
+
 def test_the_simulator_takes_the_place_of_the_robot_with_the_same_messages(
     graph, trained_file, arm26
 ):
