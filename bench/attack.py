@@ -6,8 +6,8 @@
 The whole system runs on an emulated arm, once for each seed. Each run has three parts:
 
 1. Known attacks (`attack_kinds`), in several variants, while the arm holds and while it explores.
-   The seeds share them. After each attack, the bench follows the advice of the status line
-   literally until the arm moves on.
+   The seeds share them. After each attack, the bench takes the steps that /diagnostics advises
+   until the arm moves on.
 2. Random events: targets, services, faults, suspended and killed nodes, false states of the body.
 3. Messages of a hostile node. It publishes on every topic that a node subscribes to (modified
    genuine messages, and random ones), and calls every service with illegal content.
@@ -245,7 +245,7 @@ def evaluate(attack: 'Attack') -> list[Row]:
         Row('tension above 1.1 × limit lasts 0.5 s at most', len(true), tense),
         Row('a stopped arm is not wound in', len(stops), wound),
         Row('no status OK while wrong for 2 s', tried['status'], take('status OK while wrong', [])),
-        Row('the advice of the status line helps', tried['attacks'], take('the advice helps', [])),
+        Row('the advised steps recover the arm', tried['attacks'], take('the advice helps', [])),
         Row('samples survive', tried['kills'], take('samples survive', [])),
         Row('memory stays', len(attack.processes), fat),
         Row(
@@ -313,7 +313,7 @@ def main(argv: list[str]) -> int:
             rows.append(Row('a killed learner loses nothing', count, lost))
     tried, broken, outcomes = attack_files.attack(size.files, seeds[0])
     print(', '.join(f'{count} {what}' for what, count in sorted(outcomes.items())))
-    rows.append(Row('a file is used or refused, soon', tried, broken))
+    rows.append(Row('each file is used or refused in time', tried, broken))
     print_rows(rows)
     print(f'{time.monotonic() - begun:.0f} s')
     return int(any(row.broken for row in rows))

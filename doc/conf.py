@@ -40,14 +40,14 @@ suppress_warnings = [
 
 
 def write_reference(_: Sphinx) -> None:
-    """Write one page for each room of the package, those that nobody builds on excepted."""
+    """Write one page for each folder of the package, except those without a public API."""
     left_out = [str(PACKAGE / room) for room in ('nodes', 'tools', 'view', 'importing')]
     out = str(FOLDER / 'modules')
     apidoc.main(['-f', '-q', '-T', '-M', '-d', '1', '-o', out, str(PACKAGE), *left_out])
 
 
 def as_written(*event: Any) -> None:
-    """Keep bars, stars and `code` what they are, and indented blocks as equations."""
+    """Preserve bars, stars and `code`, and show indented blocks as equations."""
     lines: list[str] = event[-1]
     text = re.sub(r'(?<!`)`([^`]+)`(?!`)', r'``\1``\ ', '\n'.join(lines))
     equation = False

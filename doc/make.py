@@ -197,7 +197,7 @@ def command_line() -> str:
     return '\n'.join(lines).rstrip() + '\n'
 
 
-#: of README: key of `experiment robustness`, label, and what the paper measured on Musashi
+#: rows of README's table: key of `experiment robustness`, label, and the paper's value on Musashi
 ESTIMATES = {
     'before_rad': ('before learning', '0.414'),
     'least_squares_rad': ('least squares on the geometric model (no learning)', '–'),
@@ -300,7 +300,7 @@ PAGES = {
 
 
 def draw_series_elastic(file: Path) -> None:
-    """Draw what force, rate and wire_stretch each do to L_e(T)."""
+    """Draw the effects of force, rate and wire_stretch on L_e(T)."""
     from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
     tension = np.linspace(0.0, 300.0, 200)
@@ -323,7 +323,7 @@ def draw_series_elastic(file: Path) -> None:
 
 
 def draw_muscles(file: Path) -> None:
-    """Draw an arm with its muscles, each in a colour of its own and with its name."""
+    """Draw an arm with its muscles, each in a different colour and with its name."""
     robot = Robot.load('musashi_left_arm')
     theta = robot.lower + 0.35 * (robot.upper - robot.lower)
     theta[0] = 0.4 * robot.upper[0]

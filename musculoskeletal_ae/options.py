@@ -132,9 +132,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_reality(self) -> None:
         """Add `--reality`, the emulator model."""
-        text = (
-            'emulator model: kin shares our mechanics; foreign is MuJoCo with mechanics of its own'
-        )
+        text = 'emulator model: kin shares the mechanics of this package; foreign uses MuJoCo'
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bench of public recordings: how it reads clones, and that its models find what is there."""
+"""`bench recordings`: reading of clones, and recovery of known parameters by its models."""
 
 import subprocess
 from pathlib import Path
@@ -24,7 +24,7 @@ def link(tmp_path_factory) -> Robot:
 
 
 def rests(link, values, load, count, seed):
-    """Return rest samples of a link by the statics, from lengths alone."""
+    """Return rest samples of a link, computed from lengths by the statics."""
     rng = np.random.default_rng(seed)
     bend = rng.uniform(-0.35, 0.35, (count, 2))
     length = link.routes.absolute_lengths(bend) - link.routes.length_at_zero
@@ -36,7 +36,7 @@ def rests(link, values, load, count, seed):
 
 
 def test_statics_predict_a_payload_that_was_not_trained(link):
-    """A spring of 1.2 N·m/rad and soft tendons: from 0 and 0.5 kg to 1 kg."""
+    """A spring of 1.2 N·m/rad and soft tendons; training with 0 and 0.5 kg, test with 1 kg."""
     true = np.array([np.log(1.2), np.log(1500.0), 0.03, 0.001, 1.1])
     none, half, whole = (rests(link, true, load, 12, seed=7) for load in (0.0, 0.5, 1.0))
     assert np.linalg.norm(none.theta - whole.theta, axis=1).mean() > 0.02

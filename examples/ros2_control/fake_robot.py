@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ros2_control robot made of messages: it behaves as two controllers of ros2_controllers do.
+"""A fake ros2_control robot: exchanges the messages of two controllers of ros2_controllers.
 
     python fake_robot.py
 
-The node stands for a controller_manager with the file controllers.yaml beside this one. The
-hardware is an emulated arm whose winches are joints named MUSCLE_motor. Half of the spools wind
-the other way round, and every encoder has a zero of its own. nodes.yaml corrects both.
+The node replaces a controller_manager with the file controllers.yaml of this directory. The
+hardware is an emulated arm whose motors are joints named MUSCLE_motor. Half of the spools wind in
+the opposite direction, and every encoder has another zero. nodes.yaml corrects both.
 doc/howto/ros2_control.md describes the connection.
 """
 

@@ -481,7 +481,7 @@ class Controller:
         if stale_estimate:  # a restarted estimator no longer has a suspect
             self.supervisor.on_suspect(False)
         if self.limiter.command is not None or not self.supervisor.is_running:
-            # Before the first command there is nothing to stop.
+            # Before the first command there is no motion to stop.
             self.supervisor.on_conditions(present, step.elapsed, self.stopping.is_releasing)
         fall = self.limiter.largest_change(TENSION, step.dt)
         self.watchdog.heat.lower(self.settings.temperature_limit, fall)

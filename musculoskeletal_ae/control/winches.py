@@ -43,7 +43,7 @@ class Winches:
 
     @property
     def lead(self) -> Array:
-        """By how much the modules lag behind their commands while they wind in [m], (M,)."""
+        """Lag of the modules behind their commands while they wind in [m], (M,)."""
         return self.lag * np.maximum(-self._speed, 0.0)
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:

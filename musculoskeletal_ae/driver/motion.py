@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the motion tests of both kinds of muscle modules have in common."""
+"""Common parts of the motion tests of both kinds of muscle modules."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -27,7 +27,7 @@ class MotionTest(ABC):
         """Prepare to test muscles; no muscles: all. The verdict receives the results."""
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._muscles = robot, muscles or range(robot.muscle_count)
-        self.trying = ''  # current step, for people
+        self.trying = ''  # current step, for messages
         self.done = False
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()

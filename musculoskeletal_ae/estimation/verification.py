@@ -7,20 +7,20 @@ muscle stiffness control demands, and with the length l' estimated from the othe
 
     T_ref = T_bias + K (l − l_target)
 
-Modules that follow positions regulate no tension. Their T_ref is what the series elastic element
-has to pull with when the suspect is stretched further than before it was wound in:
+Modules that follow positions do not regulate tension. Their T_ref is the tension of the series
+elastic element if the suspect is stretched further than before the verification:
 
     L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T)
 
-There a tendon may be slack at first. It is wound in until it pulls, or until it is so short that a
-sound one had to pull. The first row that applies decides:
+Their tendons may be slack at first. The suspect is wound in until it has tension, or until it is so
+short that a healthy one would have tension. The first row that applies decides:
 
     l does not change at all                     length_sensor_frozen
     l does not follow l_target                   jammed
     T near zero, and x > STRETCHED · L_e(T_bias) ruptured
     T does not change at all                     tension_sensor_frozen
-    T near zero all the same                     not_wound_in
-    T is not known                               tension_unknown
+    T near zero otherwise                        not_wound_in
+    T is unknown                                 tension_unknown
     |l − l'| > FAR                               length_sensor_offset
     T rises with T_ref                           healthy
     otherwise                                    tension_sensor_frozen
@@ -106,7 +106,7 @@ class Verdict(NamedTuple):
 
 
 class _Reading(NamedTuple):
-    """Readings of the suspect, its command, and what the other muscles say."""
+    """Readings of the suspect, its command, and the length expected from the other muscles."""
 
     tension: float  # T [N]
     length: float  # l [m]
@@ -133,7 +133,7 @@ class ModuleLaw:
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return x [m]; only modules that follow positions need it."""
+        """Return the stretch x [m]; used by modules that follow positions only."""
         return row.likely - row.length
 
     def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
@@ -152,7 +152,7 @@ class PositionLaw(ModuleLaw):
         self.stretched = STRETCHED * elongation(bias)  # [m]
 
     def stretch(self, row: _Reading) -> float:
-        """Return x [m]."""
+        """Return the stretch x [m]."""
         return row.likely - row.length + self._elongation(row.tension)
 
     def demand(self, row: _Reading, is_reference: bool) -> float:

@@ -4,7 +4,7 @@
     K = S K̄ S,  S = diag(e^{α/2}),      b = e^α b̄ + β
 
 α are logarithmic errors of the stiffnesses, and β errors of the torques at θ = 0 [N·m]. With this
-form, K keeps no negative eigenvalue whatever α is. Only joints with a spring of their own in
+form, K keeps no negative eigenvalue whatever α is. Only joints with their own spring in
 muscles.yaml have these two parameters. They follow from the torque balance of rest samples
 (`posture_model`), and therefore only from samples with tensions.
 """
@@ -23,7 +23,7 @@ LARGEST = 2.0  # bound on |α|
 
 
 def none_learned(joint_count: int) -> Array:
-    """Return α and β of joints about whose springs nothing was learned, (2, D)."""
+    """Return α and β without learning: zeros, (2, D)."""
     return np.zeros((2, joint_count))
 
 

@@ -67,7 +67,7 @@ class Sim(Arm):
             self.arm.use(mae)
 
     def _isolate(self) -> None:
-        # As the robot, its modules pull isolated muscles as real modules do.
+        # With as_robot, modules exert tension on isolated muscles like real ones.
         if self.arm is not None and not self.as_robot:
             self.arm.isolate(self.body.isolated)
 

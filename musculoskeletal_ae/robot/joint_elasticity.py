@@ -3,7 +3,7 @@
 
     τ_passive = −K (θ − θ_0) − diag(d) θ̇ = b − K θ − diag(d) θ̇,    b = K θ_0
 
-K is symmetric. An entry off its diagonal couples two joints, as a ligament or a soft link does that
+K is symmetric. An off-diagonal entry couples two joints, like a ligament or a soft link that
 both of them bend. K has no negative eigenvalue, because passive parts only store energy. The
 muscles therefore have to exert g(θ) + K θ − b to hold a posture (`Kinematics.holding_torque`).
 """
@@ -28,7 +28,7 @@ class JointElasticity:
 
     @classmethod
     def none(cls, joint_count: int) -> JointElasticity:
-        """Return that of joints without springs and dampers."""
+        """Return the elasticity of joints without springs and dampers."""
         nothing = np.zeros(joint_count)
         return cls(np.zeros((joint_count, joint_count)), nothing, nothing)
 
@@ -39,7 +39,7 @@ class JointElasticity:
 
     @property
     def is_sprung(self) -> Bools:
-        """Which joints have a spring of their own, (D,)."""
+        """Whether each joint has its own spring, (D,)."""
         return np.diag(self.stiffness) > 0.0
 
     @property
@@ -54,7 +54,7 @@ class JointElasticity:
         return torque
 
     def deviating(self, factor: Array, shift: Array) -> JointElasticity:
-        """Return springs `factor` times as stiff (D,), which rest `shift` [rad] (D,) elsewhere."""
+        """Return springs with stiffness times `factor` (D,) and rest plus `shift` [rad] (D,)."""
         scale = np.sqrt(factor)
         stiffness = scale[:, None] * self.stiffness * scale
         return JointElasticity(stiffness, stiffness @ (self.rest + shift), self.damping)

@@ -138,10 +138,10 @@ class MotorInterface:
         """Return the motor command for l_target [m] (M,): positions in the controller's order."""
         return self._position(length)[self._order]
 
-    # -- the other direction, for an arm that is emulated -----------------------------------------
+    # -- the reverse conversion, for emulated arms -----------------------------------------------
 
     def take_command(self, follow: Callable[[Array], object]) -> Callable[[Any], None]:
-        """Return what passes l_target [m] (M,) from a Float64MultiArray of motor commands on."""
+        """Return a callback for motor commands that passes on l_target [m], (M,)."""
 
         def take(message: Any) -> None:
             position = np.empty(len(self._order))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the motors of a ros2_control robot are connected to its muscles, as parameters."""
+"""Parameters for the connection of the motors of a ros2_control robot to its muscles."""
 
 from dataclasses import dataclass
 

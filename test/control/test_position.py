@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Modules that follow positions: limits, stop and methods where no module holds a tension."""
+"""Modules that follow positions: limits, stops and methods without tension control."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def vectors(low, high):
 
 
 def pull_in_this_posture(length, tension, command):
-    """Return the tensions [N] after the modules have gone from l to l_target, joints held."""
+    """Return the tensions [N] after the modules moved from l to l_target, with fixed joints."""
     stretch = ROBOT.elongation(tension) + length - command
     grid = np.linspace(0.0, 2.0 * MAX[0], 4001)
     table = ROBOT.elongation(grid[:, None] * np.ones(COUNT))
@@ -91,7 +91,7 @@ def test_a_stop_holds_and_then_pays_out_until_the_measured_tension_is_the_bias()
     left = pull_in_this_posture(0.0, np.full(COUNT, 150.0), sent[-1])
     np.testing.assert_allclose(left, BIAS, atol=3.0)
     is_slack = stopped(lambda _, command: sample(command, 5.0, ROBOT), 50)
-    assert (is_slack == 0.0).all()  # a tendon without tension stays where it is
+    assert (is_slack == 0.0).all()  # a tendon without tension is not moved
 
 
 def test_without_a_known_tension_a_stop_pays_out_the_stated_length():
@@ -130,7 +130,7 @@ class WithJointSensors(ClosedLoop):
 
 @pytest.fixture(scope='module')
 def loops():
-    """Return the arm under every method: on the way to a target for 5 s, or let alone."""
+    """Return the arm after 5 s with every method: moving to a target, or without one."""
     result = {}
     for method in METHODS:
         arm = EmulatedArm(ROBOT, 0, Individual(ROBOT, 0, NOMINAL))
@@ -148,7 +148,7 @@ def test_every_method_moves_the_arm_and_keeps_it_within_its_tensions(loops, meth
     loop = loops[method]
     assert loop.core.supervisor.is_running
     assert loop.core.limiter.command.kind == LENGTH
-    # Gravity compensation holds the arm where it was, away from the stop of the elbow.
+    # Gravity compensation holds the present posture, away from the stop of the elbow.
     goal, near = (THETA, 0.1) if method != 'float' else (np.zeros(2), 0.15)
     assert np.abs(loop.arm.theta - goal).max() < near
     assert loop.arm.tension.max() < LIMIT[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm whose tension nobody measures: unknown, never zero; what cannot be had is refused."""
+"""An arm without tension sensors: tensions count as unknown, not as zero, and limit the methods."""
 
 from dataclasses import replace
 
@@ -47,14 +47,14 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
     arm = make_arm(ROBOT, 0)
     read = arm.sense()
     assert np.isnan(read.tension).all()
-    for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):  # whatever is sent
+    for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):  # all ignored
         sample = MuscleStream(ROBOT, window=3).take_states(
             np.array([read.length, tension, read.temperature]), 0.0
         )
         assert np.isnan(sample.motor_tension).all()
         np.testing.assert_array_equal(sample.model_tension, ROBOT.assumed_tension)
         np.testing.assert_array_equal(sample.bone_tension, ROBOT.assumed_tension)
-    with pytest.raises(RejectionError):  # lengths are needed all the same
+    with pytest.raises(RejectionError):  # lengths are still required
         MuscleStream(ROBOT).take_states(
             np.array([read.length + 5.0, read.tension, read.temperature]), 0.0
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of modules that follow positions: a slack tendon is none, a ruptured one is found."""
+"""Faults of modules that follow positions: a rupture is detected, slack is not reported."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (600, 2)) * [1.0, 1e-4]
 
 
 def readings(mae, shorter=0.0):
-    """Return l and T with one tendon without tension, which is so much shorter than slack."""
+    """Return l and T with one tendon without tension; its length is below that of a slack one."""
     length, tension = rest_readings(ROBOT, THETA, np.full(ROBOT.muscle_count, 60.0))
     tension = tension.copy()
     tension[MUSCLE] = 0.0
@@ -64,15 +64,15 @@ def elongation(tension):
 def verdict(tension, length, slack):
     """Wind in by 20 mm after a while; T and l are functions of the wound length and of noise.
 
-    At first the tendon is so much longer than a slack one [m].
+    At first the tendon is longer by `slack` [m] than a taut one.
     """
     watched = Verification(MUSCLE, PositionLaw(BIAS[MUSCLE], elongation))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.028)
         pull, wound = tension(-command, shake), length(command, stir)
         likely = -slack - elongation(pull)  # the joints stay where they are
-        if found := watched.step(pull, wound, command, likely, DT):
-            return found.outcome
+        if result := watched.step(pull, wound, command, likely, DT):
+            return result.outcome
     raise AssertionError('no answer')
 
 
@@ -89,7 +89,7 @@ def followed(command, stir):
     ('tension', 'length', 'slack', 'outcome'),
     [
         (lambda wound, shake: pull_of(0.008 + wound) + shake, followed, -0.008, Outcome.HEALTHY),
-        # Slack at first: it is wound in until it pulls.
+        # The tendon is slack at first, and is wound in until it is taut.
         (lambda wound, shake: max(pull_of(wound - 0.01) + shake, 0.0), followed, 0.01,
          Outcome.HEALTHY),
         (lambda _, shake: 0.1 * abs(shake), followed, -0.008, Outcome.RUPTURED),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning from lengths and joint angles alone: the torque of an unknown tension says nothing."""
+"""Learning from lengths and joint angles only: unknown tensions give no torque balance."""
 
 import numpy as np
 

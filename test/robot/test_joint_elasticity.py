@@ -232,8 +232,8 @@ SPRUNG = '<joint name="elbow" stiffness="2" springref="0.4" damping="0.5" '
 def test_springs_are_learned_from_rest_samples(springy):
     """With half the stiffness and an offset of 0.2 rad: the remaining errors after 60 rest samples.
 
-    The balance of a joint counts to 0.3 of what its muscles exert, so that weak springs beside
-    strong muscles stay as stated.
+    The torque balance has a σ of 0.3 of the muscles' torques, so weak springs beside strong
+    muscles keep their stated values.
     """
     true = springy.kinematics.elasticity.deviating(
         np.array([0.5, 0.6, 1.8]), np.array([0.2, -0.2, 0.15])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kinds of muscle modules in muscles.yaml: what is legal together, and what it means."""
+"""Kinds of muscle modules in muscles.yaml: legal combinations and their effects."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 
 
 class GeometricBody:
-    """Answers as a network without any error would."""
+    """Behaves like a network without error."""
 
     friction = np.zeros(8)
     elasticity = None
@@ -89,7 +89,7 @@ def test_an_emulated_module_pulls_no_harder_than_its_largest_tension(tmp_path):
         arm.command_length(np.full(robot.muscle_count, -0.1))
         arm.step(0.01)
         most = max(most, float(arm.tension.max()))
-    assert 40.0 < most < 90.0  # joints that others move may pull harder for a moment
+    assert 40.0 < most < 90.0  # muscles may briefly exceed their demand while joints move
     assert arm.tension.max() < 63.0
 
 
