@@ -62,7 +62,7 @@ class Result(NamedTuple):
     control: float
     isolated: float  # share of the ruptures after which a muscle was isolated
     named: float
-    found: float  # mean time to the finding [s]
+    finding_time: float  # mean time to the finding [s]
     highest: float  # as a multiple of the limit
     wrong: float
     samples: float
@@ -143,14 +143,14 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
         loop.core.explore(True)
         loop.run(MOVING)
         arm.set_ruptured([arm.robot.muscles[m]])
-        found = LATEST
+        finding_time = LATEST
         for step in range(round(LATEST / SAMPLE_TIME)):
             loop.step()
-            if found == LATEST and loop.isolated:
-                found = step * SAMPLE_TIME
+            if finding_time == LATEST and loop.isolated:
+                finding_time = step * SAMPLE_TIME
             if loop.verdicts:
                 break
-        times.append(found)
+        times.append(finding_time)
         last = loop.verdicts[-1][0] if loop.verdicts else ()
         isolated += bool(last)
         named += last == (m,)
@@ -171,9 +171,11 @@ def measure(robot: Robot, kind: str, initial: Mae, reality: str, seed: int, shar
     after, wrong = estimate(arm, mae, seed, share * HELD_OUT, watched)
     arm.reset()
     distance, stopped = control(arm, mae, seed, max(2, round(share * TARGETS)), watched)
-    found = ruptures(arm, mae, seed, max(2, round(share * RUPTURES)))
+    shares_and_time = ruptures(arm, mae, seed, max(2, round(share * RUPTURES)))
     wrong += wrong_before + stops + stopped
-    return Result(before, after, distance, *found, watched.highest, wrong, len(learner.samples))
+    return Result(
+        before, after, distance, *shares_and_time, watched.highest, wrong, len(learner.samples)
+    )
 
 
 def line(reality: str, seed: str, kind: str, result: Result) -> str:
@@ -181,7 +183,8 @@ def line(reality: str, seed: str, kind: str, result: Result) -> str:
     return (
         f'{reality:<8} {seed:>4} {kind:<18} {result.before:>7.3f} {result.after:>7.3f} '
         f'{result.control:>8.3f} {result.isolated:>9.2f} {result.named:>6.2f} '
-        f'{result.found:>6.2f} {result.highest:>9.2f} {result.wrong:>6.1f} {result.samples:>8.0f}'
+        f'{result.finding_time:>6.2f} {result.highest:>9.2f} {result.wrong:>6.1f} '
+        f'{result.samples:>8.0f}'
     )
 
 

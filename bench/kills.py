@@ -123,7 +123,7 @@ class Child:
 
 
 def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> list[str]:
-    """Kill `kills` children one after another; return what was lost."""
+    """Kill `kills` children one after another; return descriptions of the losses."""
     rng = np.random.default_rng(seed)
     # States that may be on disk: a sample may be saved before the child can report it.
     possible = [SampleStore()]
@@ -168,7 +168,7 @@ def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[Sa
 
 def main(argv: list[str]) -> int:
     """Run the bench; return the exit status."""
-    parser = Parser('kills', 'Kills a learner at random moments: is anything lost?')
+    parser = Parser('kills', 'Kills a learner at random moments, and checks its saved state.')
     parser.add_robot(default='arm26')
     parser.add_argument('--kills', type=int, default=50, help='number of kills')
     parser.add_seed('of the moments')

@@ -74,7 +74,7 @@ def measure(body: str, folder: Path, minutes: float) -> Row:
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
     (folder / 'initial.safetensors').unlink(
         missing_ok=True
-    )  # of an interrupted run; training is timed
+    )  # remove the file of an interrupted run, because training is timed
     begun = time.process_time()
     nominal = initial(robot, folder)
     row = {'training': time.process_time() - begun}

@@ -144,7 +144,7 @@ class Response(NamedTuple):
     """Responses of body and simulator to a push or a forced joint, from the same rest.
 
     Attributes:
-        name: What was done.
+        name: Name of the push or the forced joint.
         body: Δθ of the body [rad], shape (D,).
         simulated: Δθ of the simulator [rad], shape (D,).
         body_tension: ΔT of the body [N], shape (M,).

@@ -79,9 +79,9 @@ def test_tendons_stand_where_their_lengths_put_them(link):
     theta = np.random.default_rng(0).uniform(-0.3, 0.3, (40, 2))
     length = link.routes.absolute_lengths(theta) - link.routes.length_at_zero - 0.004
     run = Run('', 0.0, length, length, theta, np.zeros((0, 2), int))
-    found, at_zero = fitted(LINK, run)
-    np.testing.assert_allclose(found.azimuths, AZIMUTHS, atol=0.02)
-    np.testing.assert_allclose(found.radius, LINK.radius, rtol=0.05)
+    estimated_link, at_zero = fitted(LINK, run)
+    np.testing.assert_allclose(estimated_link.azimuths, AZIMUTHS, atol=0.02)
+    np.testing.assert_allclose(estimated_link.radius, LINK.radius, rtol=0.05)
     np.testing.assert_allclose(at_zero, -0.004, atol=1e-3)
 
 

@@ -358,7 +358,7 @@ def urdf(source: Source) -> str:
     model, root, (_, pose) = source.model, source.links[0], source.place(source.links[0])
     upright, size = pin.SE3(pose.rotation, np.zeros(3)), np.linalg.norm(model.gravity.linear)
     if size < 1e-6:
-        source.note('chosen', 'gravity: along −z, the source has none')
+        source.note('chosen', 'gravity: along −z, because the source states none')
     else:
         down = pin.Quaternion.FromTwoVectors(model.gravity.linear / size, -np.eye(3)[2])
         upright = pin.SE3(down.matrix(), np.zeros(3)) * upright

@@ -589,4 +589,4 @@ def test_what_a_driver_that_follows_positions_gets_wrong_is_found(fault):
     verdict = driver.wind((BICEPS,))
     texts = FAULTS[what]
     assert verdict.faults
-    assert any(found.check == texts.check for found in verdict.faults), str(verdict)
+    assert any(fault.check == texts.check for fault in verdict.faults), str(verdict)

@@ -35,11 +35,11 @@ def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, i
     detector.use(mae)
     length, tension = readings(mae, shorter)
     message = observe(mae, length, tension, tension, DT)
-    found = [detector.step(message) for _ in range(round(1.5 * DEAD_TIME / DT))]
-    assert found[0] is None
-    assert (found[-1] is not None) == is_found
+    findings = [detector.step(message) for _ in range(round(1.5 * DEAD_TIME / DT))]
+    assert findings[0] is None
+    assert (findings[-1] is not None) == is_found
     if is_found:
-        assert (found[-1].muscle, found[-1].kind) == (MUSCLE, Kind.SLACK_TENDON)
+        assert (findings[-1].muscle, findings[-1].kind) == (MUSCLE, Kind.SLACK_TENDON)
 
 
 @pytest.mark.parametrize(
@@ -53,8 +53,8 @@ def test_a_module_that_does_not_go_where_it_is_commanded_is_jammed(mae, behind, 
     pull[MUSCLE] = tension
     command = length - behind * (np.arange(ROBOT.muscle_count) == MUSCLE)
     message = observe(mae, length, pull, pull, DT, command=command)
-    found = [detector.step(message) for _ in range(round(1.5 * JAM_TIME / DT))]
-    assert (found[-1] is not None) == is_found
+    findings = [detector.step(message) for _ in range(round(1.5 * JAM_TIME / DT))]
+    assert (findings[-1] is not None) == is_found
 
 
 def elongation(tension):
