@@ -124,7 +124,11 @@ class CheckDriver:
     def wind(self, verdict: Verdict) -> None:
         """Wind each muscle in slightly, and add what is wrong to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
-        read = import_heavy('musculoskeletal_ae.validity').read_muscle_states
+        read = partial(
+            import_heavy('musculoskeletal_ae.validity').read_muscle_states,
+            muscles=self.robot.muscle_count,
+            needs_tension=self.robot.knows_tension,
+        )
         publisher = self.node.create_publisher(Float64MultiArray, self.command, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():
@@ -136,7 +140,7 @@ class CheckDriver:
             nonlocal last, trying
             now = time.monotonic()
             try:
-                states = read(self.motors.reading(message), self.robot.muscle_count)
+                states = read(self.motors.reading(message))
             except MusculoskeletalError:
                 return
             last, target = now, winding.step(states, now)

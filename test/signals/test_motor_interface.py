@@ -130,6 +130,22 @@ def test_a_position_that_is_not_a_number_is_rejected_by_the_one_stream_of_all_me
     np.testing.assert_allclose(sample.motor_tension, robot.tension.bias)
 
 
+def test_without_tension_sensors_a_message_without_effort_is_used_and_otherwise_rejected(tmp_path):
+    robot = Robot.load('arm26')
+    interface = MotorInterface(MotorSettings(motor_state_topic='q'), robot.muscles)
+    message = joint_state(robot.muscles, position=[0.0] * robot.muscle_count, effort=[])
+    with pytest.raises(RejectionError, match='not finite: tension of muscle 0'):
+        MuscleStream(robot).take(interface.reading(message), 0.0)
+    for file in robot.description.directory.glob('*.*'):
+        text = file.read_text('utf-8')
+        without = 'actuation: position\ntension_source: none'
+        (tmp_path / file.name).write_text(text.replace('stiffness: 10000.0', without))
+    blind = Robot.load(tmp_path)
+    interface.reset()
+    sample = MuscleStream(blind).take(interface.reading(message), 0.0)
+    assert np.isnan(sample.motor_tension).all() and (sample.length == 0.0).all()
+
+
 anything = st.lists(st.floats(width=64), max_size=5)
 
 
