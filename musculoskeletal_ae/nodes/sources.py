@@ -205,10 +205,10 @@ class Sources:
     @property
     def intruders(self) -> str:
         """Topics that several nodes publish, with the names of those nodes; or ''."""
-        topics: dict[str, list[str]] = {}
+        topics: dict[str, set[str]] = {}  # motors and joints may share a topic
         for topic, each in self._authorships.items():
             if each.intruders:
-                topics.setdefault(each.intruders, []).append(self._shown(topic))
+                topics.setdefault(each.intruders, set()).add(self._shown(topic))
         return '; '.join(
             f'{", ".join(sorted(names))} come from {nodes}' for nodes, names in topics.items()
         )
@@ -221,9 +221,8 @@ class Sources:
         return f'stop all of them except {" and ".join(sorted(authors))} of this arm'
 
     def _shown(self, topic: str) -> str:
-        """Return the name of a topic, or the full name of the topic that takes its place."""
-        full = self._resolve(topic)
-        return topic if full.endswith(f'/{topic}') else full
+        """Return the name of a topic, or of the one that takes its place, in our namespace."""
+        return self._resolve(topic).removeprefix(f'{self._node.get_namespace().rstrip("/")}/')
 
     def _look(self, topic: str) -> None:
         full, publishers = self._resolve(topic), list[Publisher]()

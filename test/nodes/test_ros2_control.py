@@ -2,6 +2,7 @@
 """A ros2_control robot on the graph: its messages reach the nodes, and their commands reach it."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from graph import Process, executable
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -173,6 +175,15 @@ def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, trained_file)
     controller = host(graph, Controller, checkpoint=trained_file)
     graph.node.create_publisher(Float64MultiArray, COMMANDS, 10)
     graph.wait(lambda: COMMANDS in controller.core.watchdog.second_publisher, 'its detection')
+
+
+def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(graph):
+    node = host(graph, Estimator)
+    for name in ('first', 'second'):
+        other = graph.host(partial(Node, name))
+        other.create_publisher(JointState, STATES, 10)
+    graph.wait(lambda: node.intruders, 'their detection')
+    assert node.intruders.startswith(f'{STATES} come from ')
 
 
 def test_methods_that_command_tensions_are_refused(graph):
