@@ -60,7 +60,7 @@ def test_every_known_attack_is_tried_at_every_moment():
     assert len(set(attacks)) == len(attacks) == 2 * sum(map(len, KINDS.values()))
 
 
-def test_what_is_hostile_can_be_sent_and_told_from_what_is_not():
+def test_hostile_messages_can_be_sent_and_recognised():
     rng = random.Random(0)
     for kind in (Float64MultiArray, UInt8MultiArray):
         messages = [filled(kind(), rng) for _ in range(50)]

@@ -157,7 +157,7 @@ def test_the_experiments_are_those_that_the_help_names():
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason='only root can be somebody else')
-def test_a_checkout_of_somebody_else_is_told_apart(tmp_path):
+def test_a_checkout_of_another_user_is_reported(tmp_path):
     clone = tmp_path / 'clone'
     (clone / '.ci').mkdir(parents=True)
     for name in ('.ci/environment.sh', 'requirements.txt'):

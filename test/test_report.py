@@ -19,5 +19,5 @@ from musculoskeletal_ae.report import distinct
         (math.inf, (1.0,), ('inf', '1')),
     ],
 )
-def test_a_value_and_its_limit_are_told_apart_by_as_many_digits_as_that_takes(value, limits, texts):
+def test_a_value_and_its_limit_have_enough_digits_to_differ(value, limits, texts):
     assert distinct(value, *limits) == texts

@@ -91,7 +91,7 @@ def test_a_temperature_that_is_not_measured_is_nan_and_nothing_else_is():
 
 
 @pytest.mark.parametrize('unknown', [0.0, math.nan])
-def test_what_isolated_muscles_say_does_not_count(unknown):
+def test_values_of_isolated_muscles_are_ignored(unknown):
     legal = [[unknown, 2.0], [3.0, 4.0], [math.nan, 25.0]]
     broken = muscle_array([math.nan, 2.0, 3.0, 4.0, math.inf, 25.0])
     np.testing.assert_array_equal(read_muscle_states(broken, 2, [0], unknown), legal)
@@ -252,7 +252,7 @@ def test_what_is_no_trajectory_is_refused(message, reason):
         read_trajectory(message, JOINTS)
 
 
-def test_a_pose_may_say_its_position_only_and_frames_must_be_right():
+def test_a_pose_may_contain_a_position_only_and_needs_the_right_frame():
     message = PoseStamped()
     message.header.frame_id, message.pose.orientation.w = 'base', 0.0
     assert without_orientation(message)

@@ -81,7 +81,7 @@ def test_damage_is_never_read_without_a_word(recording, content, tmp_path):
             assert bag.unfinished or len(messages) == len(expected), trial
 
 
-def test_a_file_cut_anywhere_is_read_up_to_there_and_says_so(content, tmp_path):
+def test_a_truncated_file_is_read_up_to_its_end_and_reported(content, tmp_path):
     file = tmp_path / 'a.mcap'
     samples.write_mcap(file, content)
     whole = file.read_bytes()
@@ -120,13 +120,13 @@ def test_no_flipped_bit_changes_what_is_read(content, tmp_path):
         (b'SQLite format 3\0' + bytes(1000), 'cannot be read as a recording'),
     ],
 )
-def test_what_is_no_recording_is_named_so(data, problem, tmp_path):
+def test_a_file_that_is_no_recording_is_refused(data, problem, tmp_path):
     (tmp_path / 'a.db3').write_bytes(data)
     with pytest.raises(BagError, match=rf'a.db3: .*{problem}'):
         Bag.open(tmp_path / 'a.db3')
 
 
-def test_what_does_not_exist_is_named_so(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(BagError, match=r'nothing: cannot be read: No such file .*name another bag'):
         Bag.open(tmp_path / 'nothing')
     with pytest.raises(BagError, match=r'neither a readable metadata.yaml nor mcap'):

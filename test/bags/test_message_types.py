@@ -56,7 +56,7 @@ def test_our_types_are_those_of_the_installed_ros_messages(end):
         ({'topic': '/../etc'}, 'has a name that is not legal in ROS'),
     ],
 )
-def test_topics_of_another_type_than_they_say_are_not_decoded(options, problem, tmp_path):
+def test_topics_of_another_type_than_declared_are_not_decoded(options, problem, tmp_path):
     bag = Bag.open(write(tmp_path / 'a.mcap', **options))
     (topic,) = bag.topics.values()
     assert problem in topic.problem

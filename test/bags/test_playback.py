@@ -101,7 +101,7 @@ def motion(tmp_path, times, first=()):
     return taught_motion(bag, f'/{TAUGHT_TOPIC}', bag.start, bag.end)
 
 
-def test_what_was_shown_is_of_the_joints_that_most_messages_name(tmp_path):
+def test_a_demonstration_contains_the_joints_that_most_messages_name(tmp_path):
     taught = motion(tmp_path, [0.02 * k for k in range(1, 101)], first=(0.005, 0.01))
     assert taught.joints == ('elbow', 'shoulder')
     assert taught.theta[:, 0] == pytest.approx(1.0)

@@ -82,7 +82,7 @@ def test_records_that_a_reader_must_skip_are_skipped(tmp_path, content):
         {'topics_with_message_count': []},
     ],
 )
-def test_what_metadata_says_of_times_and_storage_is_not_needed(entries, bag, content):
+def test_times_and_storage_in_the_metadata_are_not_needed(entries, bag, content):
     change(bag, **entries)
     assert read(bag) == expected(content)
 

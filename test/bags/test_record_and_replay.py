@@ -193,7 +193,7 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
 
 
 @pytest.mark.parametrize('start', [0.0, 0.25])
-def test_a_replay_says_where_it_is_and_goes_where_it_is_told(tool, graph, tmp_path, start):
+def test_a_replay_publishes_its_position_and_follows_requests(tool, graph, tmp_path, start):
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
     positions = graph.listen(Float64MultiArray, 'replay/position')
@@ -235,7 +235,7 @@ def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
     assert 'without --clock' in output
 
 
-def test_what_cannot_be_done_is_one_clear_line(tool, bag, tmp_path):
+def test_an_impossible_request_is_reported_in_one_line(tool, bag, tmp_path):
     cases = [
         (('replay', tmp_path / 'nothing'), 1, 'No such file'),
         (('record', bag), 1, 'is not empty; name a new directory'),
@@ -290,7 +290,7 @@ def test_every_mistake_is_one_clear_line_and_status_2(parse, arguments, problem,
     assert message.count('\n') == 1
 
 
-def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
+def test_a_demonstration_is_replayed_as_one_trajectory(tool, graph, tmp_path):
     names, content = ('elbow', 'shoulder'), []
     for n in range(300):
         now = samples.START + n * 10_000_000
@@ -318,7 +318,7 @@ def test_what_was_shown_comes_back_as_one_trajectory(tool, graph, tmp_path):
 
 
 @pytest.mark.parametrize('takes', [True, False])
-def test_what_the_controller_makes_of_a_shown_motion_is_told(tool, graph, tmp_path, takes):
+def test_the_result_of_a_replayed_demonstration_is_reported(tool, graph, tmp_path, takes):
     controller = graph.host(Controller, robot='arm26')
     names = controller.robot.joints
     if takes:

@@ -125,7 +125,7 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
     assert misplaced_muscles(swapped, robot) == []  # too little data
 
 
-def test_who_is_isolated_is_not_known_where_nothing_says_it(arm, robot, tmp_path):
+def test_isolated_muscles_are_unknown_if_the_bag_does_not_contain_them(arm, robot, tmp_path):
     assert (streams(arm, robot, tmp_path).pairs().isolated == -1).all()
 
 
@@ -191,7 +191,7 @@ def test_the_check_of_muscles_in_another_order_fails(robot, tmp_path):
     assert any('muscles are not in the order of arm26' in fault for fault in faults)
 
 
-def test_the_check_of_damage_fails_and_says_where(arm, tmp_path):
+def test_the_check_of_a_damaged_bag_fails_and_names_the_place(arm, tmp_path):
     file = arm.write(tmp_path / 'bag') / 'bag_0.mcap'
     data = bytearray(file.read_bytes())
     data[2000] ^= 1

@@ -16,7 +16,7 @@ def series(bag, topic):
     return np.array([time for time, _ in messages]), [message for _, message in messages]
 
 
-def test_the_recorded_arm_was_moved_by_hand_and_repeated_what_it_was_shown():
+def test_the_recorded_arm_was_moved_by_hand_and_repeated_the_motion():
     bag = Bag.open(BAGS / 'teaching')
     pushed, wrenches = series(bag, '/hardware_emulator/external_wrench')
     assert np.linalg.norm([wrenches[0].wrench.force.x, wrenches[0].wrench.force.z]) > 15.0

@@ -93,7 +93,7 @@ def statuses(output):
     return [match for line in output.splitlines() if (match := STATUS.match(line))]
 
 
-def test_a_robot_nobody_saw_before_is_trained_once_brought_up_and_estimated(environment, tmp_path):
+def test_a_new_robot_is_trained_once_brought_up_and_estimated(environment, tmp_path):
     robot = write_robot(tmp_path / '.other')
     # The paper's network is trained in a few seconds.
     chosen = ['--robot', str(robot), '--preset', 'paper', '--seed', '3']
@@ -168,7 +168,7 @@ def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(env
     assert left_behind(left) == ''
 
 
-def test_a_cut_muscle_is_detected_and_a_dead_node_named(environment):
+def test_a_ruptured_muscle_is_detected_and_a_dead_node_named(environment):
     run = bringup(environment, '--robot', 'arm26', '--namespace', 'cut', '--no-learner')
     graph = Graph('/cut')
     graph.processes.append(run)
@@ -249,7 +249,7 @@ def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments
     assert expected in output
 
 
-def test_a_wrong_value_ends_it_with_what_the_node_says_of_it(environment):
+def test_a_wrong_value_ends_bringup_with_the_error_of_the_node(environment):
     run = bringup(environment, '--robot', 'arm26', '--reality', 'dream')
     _, output = run.ended()
     assert run.process.returncode == 1

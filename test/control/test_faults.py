@@ -127,7 +127,7 @@ PROMISES = {
 
 
 @pytest.mark.parametrize('fault', PROMISES)
-def test_under_each_fault_no_command_jumps_and_the_arm_goes_on_once_it_is_mended(loop, fault):
+def test_under_each_fault_no_command_jumps_and_the_arm_resumes_after_the_repair(loop, fault):
     held = loop.arm.theta
     loop.arm.faults.set([fault])
     loop.run(4.0)

@@ -23,7 +23,7 @@ FREE = np.full(2, np.inf)
 TIGHT = np.array([0.05, np.inf])
 
 
-class Followed:
+class FollowingBench:
     """A bench that follows a trajectory of one second, and the result of its goal."""
 
     def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0):
@@ -50,7 +50,7 @@ class Followed:
 
 
 def test_a_goal_that_is_reached_succeeds_at_the_end_of_its_trajectory():
-    followed = Followed(path=TIGHT, goal=TIGHT)
+    followed = FollowingBench(path=TIGHT, goal=TIGHT)
     (code, reported), steps = followed.run()
     assert (code, reported) == (SUCCESSFUL, '')
     duration = followed.bench.core.activities.follower.trajectory.duration
@@ -58,29 +58,29 @@ def test_a_goal_that_is_reached_succeeds_at_the_end_of_its_trajectory():
 
 
 def test_a_goal_in_the_future_is_waited_for():
-    followed = Followed(path=TIGHT, delay=0.5)
+    followed = FollowingBench(path=TIGHT, delay=0.5)
     (code, _), steps = followed.run()
     assert code == SUCCESSFUL
     assert steps >= 150
 
 
 def test_an_arm_that_does_not_follow_violates_the_path_tolerance_and_the_joint_is_named():
-    (code, reported), steps = Followed(path=TIGHT).run(moves=False)
+    (code, reported), steps = FollowingBench(path=TIGHT).run(moves=False)
     assert code == BEYOND_PATH
     assert ROBOT.joints[0] in reported
     assert steps < 100
 
 
 def test_an_arm_that_does_not_arrive_fails_after_the_goal_time_tolerance():
-    assert Followed(goal=TIGHT).run(400, moves=False) == (None, 400)
-    followed = Followed(goal=TIGHT, patience=0.5)
+    assert FollowingBench(goal=TIGHT).run(400, moves=False) == (None, 400)
+    followed = FollowingBench(goal=TIGHT, patience=0.5)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
     assert steps > 100.0 * (followed.bench.core.activities.follower.trajectory.duration + 0.5) - 2.0
 
 
 def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
-    followed = Followed(goal=TIGHT, patience=3.0)
+    followed = FollowingBench(goal=TIGHT, patience=3.0)
     step, bench = followed.bench.step, followed.bench
 
     def learning():
@@ -96,7 +96,7 @@ def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
 
 @pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])
 def test_what_ends_the_trajectory_ends_the_goal(event):
-    followed = Followed()
+    followed = FollowingBench()
     assert followed.run(20)[0] is None
     core = followed.bench.core
     if event == 'trajectory':

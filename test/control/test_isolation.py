@@ -234,7 +234,7 @@ def test_a_prismatic_joint_without_muscles_is_led_along_its_stop(sliding):
     np.testing.assert_array_equal(path[:, -1], [robot.upper[-1], goal[-1]])
 
 
-class Verified(Bench):
+class VerificationBench(Bench):
     """A stopped arm whose suspect is verified; only the suspect's module moves."""
 
     def __init__(self, **chosen):
@@ -249,7 +249,7 @@ class Verified(Bench):
 
 
 def test_a_suspect_is_wound_in_gently_during_verification_and_the_arm_goes_on_afterwards():
-    bench = Verified()
+    bench = VerificationBench()
     before = bench.wound(round((bench.core.settings.hold_time + PAYING_OUT) / 0.01) - 2)
     assert (np.diff(before) >= 0.0).all()  # paid out
     after = bench.wound(100)
@@ -267,7 +267,7 @@ def test_a_suspect_is_wound_in_gently_during_verification_and_the_arm_goes_on_af
 
 
 def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
-    bench = Verified()
+    bench = VerificationBench()
     bench.step(50)
     length, tension = rest_readings(ROBOT, REST)
     for _ in range(50):  # messages have stopped
@@ -281,7 +281,7 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
 
 
 def test_a_suspect_with_dead_sensors_is_wound_in_by_a_bounded_length():
-    bench = Verified()
+    bench = VerificationBench()
     bench.step(200)
     highest = bench.core.limiter.command.value[LOST]
     length, tension = rest_readings(ROBOT, REST)
@@ -373,7 +373,7 @@ def test_a_request_during_verification_ends_exploration(wish):
 
 
 def test_a_stop_by_stale_data_outlasts_a_later_verification():
-    bench = Verified()
+    bench = VerificationBench()
     bench.step(200)
     bench.isolate([])
     bench.core.anomaly(False)

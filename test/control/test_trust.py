@@ -17,7 +17,7 @@ TICK = 0.1 * DT  # [m] that the rate limit allows
 MUSCLE = ROBOT.muscles[0]
 
 
-class Lied(Bench):
+class DistortingBench(Bench):
     """A bench that distorts its messages and counts the rejected ones."""
 
     def __init__(self, **chosen):
@@ -69,7 +69,7 @@ LIES = st.one_of(
 @hypothesis_settings(max_examples=60)
 @given(st.lists(st.tuples(ROWS, LIES, st.integers(1, 30)), min_size=1, max_size=4))
 def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lies):
-    bench = Lied()
+    bench = DistortingBench()
     for row, lie, pause in lies:
         before = bench.core.limiter.command
         sent = bench.lies(1, **{row: lie}) + bench.step(pause)
@@ -89,7 +89,7 @@ def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lie
     ],
 )
 def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(row, lie, cause):
-    bench = Lied()
+    bench = DistortingBench()
     before = bench.core.limiter.command
     sent = bench.lies(70 if 'jumped' in cause else 200, **{row: lie})
     assert cause in bench.condition
@@ -107,7 +107,7 @@ def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(ro
 
 @pytest.mark.parametrize('known', [[], [2]])
 def test_modules_without_thermometers_do_not_stop_the_arm_and_a_hot_one_among_them_does(known):
-    bench = Lied()
+    bench = DistortingBench()
     bench.temperature = np.full(ROBOT.muscle_count, np.nan)
     bench.temperature[known] = 110.0
     bench.step(500)
@@ -120,7 +120,7 @@ def test_modules_without_thermometers_do_not_stop_the_arm_and_a_hot_one_among_th
 
 
 def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_lasts():
-    bench = Lied()
+    bench = DistortingBench()
     before = bench.core.limiter.command
     bench.blind = {'estimate'}
     for k in range(15):
@@ -134,7 +134,7 @@ def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_
 
 
 def test_a_glitch_of_temperature_changes_nothing_and_real_heat_pays_out_within_the_rate_limit():
-    bench = Lied()
+    bench = DistortingBench()
     bench.pull(np.full(ROBOT.muscle_count, 150.0))
     bench.step(300)
     limit, before = bench.core.watchdog.heat.planned.copy(), bench.core.limiter.command
@@ -148,7 +148,7 @@ def test_a_glitch_of_temperature_changes_nothing_and_real_heat_pays_out_within_t
 
 
 def test_temperatures_are_believed_only_as_fast_as_a_housing_can_warm():
-    bench = Lied()
+    bench = DistortingBench()
     bench.lies(3, temperature=lambda t: t * 0.0 + 199.0)
     bench.step(50)
     assert bench.cause == ''
@@ -156,7 +156,7 @@ def test_temperatures_are_believed_only_as_fast_as_a_housing_can_warm():
 
 
 def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
-    bench = Lied()
+    bench = DistortingBench()
     limit = bench.core.settings.temperature_limit
     bench.temperature = COLD.copy()
     bench.temperature[2] = limit + OVERHEATED + 1.0
@@ -173,7 +173,7 @@ def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
 
 
 def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_the_arm():
-    bench = Lied(hold_time=5.0)
+    bench = DistortingBench(hold_time=5.0)
     tension = np.full(ROBOT.muscle_count, 60.0)
     bench.pull(tension)
     tension[3] = 230.0
@@ -195,7 +195,7 @@ def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_t
 
 @pytest.mark.parametrize('what', ['muscles', 'estimate'])
 def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
-    bench = Lied(max_age=0.2, hold_time=0.5)
+    bench = DistortingBench(max_age=0.2, hold_time=0.5)
     bench.core.explore(True)
     bench.step(50)
     bench.blind = {what}
@@ -211,7 +211,7 @@ def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
 
 
 def test_data_that_stay_away_latch_the_stop_and_end_exploration():
-    bench = Lied(max_age=0.2, hold_time=0.5)
+    bench = DistortingBench(max_age=0.2, hold_time=0.5)
     bench.core.explore(True)
     bench.step(50)
     bench.blind = {'muscles'}
@@ -225,7 +225,7 @@ def test_data_that_stay_away_latch_the_stop_and_end_exploration():
 
 @pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
 def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
-    bench = Lied(max_age=0.2, hold_time=0.5)
+    bench = DistortingBench(max_age=0.2, hold_time=0.5)
     before = bench.step()[-1]
     bench.now += pause
     sent = bench.step(100)

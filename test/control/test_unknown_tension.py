@@ -86,7 +86,7 @@ def test_methods_that_need_a_tension_are_refused_with_the_reason(method, preset)
     assert core.settings is before
 
 
-def test_the_arm_goes_to_a_target_by_lengths_alone_and_says_what_it_lacks(loop):
+def test_the_arm_reaches_a_target_by_lengths_alone_and_reports_missing_tensions(loop):
     assert loop.core.supervisor.is_running
     assert np.abs(loop.arm.theta - THETA).max() < 0.15
     assert loop.core.limiter.command.kind == LENGTH

@@ -303,7 +303,7 @@ def test_messages_that_are_lost_on_the_way_are_no_fault_of_the_driver():
 
 
 @pytest.mark.parametrize('is_busy', [True, False])
-def test_a_gap_in_which_this_computer_did_not_run_is_told_apart(is_busy):
+def test_a_gap_in_which_this_computer_was_blocked_is_recognised(is_busy):
     messages = Messages()
     late = lambda n: 0.01 * n + (0.6 if n >= 100 else 0.0)  # noqa: E731
     messages.bring(300, lambda n: 1000.0 + late(n), late)
@@ -576,7 +576,7 @@ POSITION_FAULTS = {
 
 
 @pytest.mark.parametrize('fault', POSITION_FAULTS)
-def test_what_a_driver_that_follows_positions_gets_wrong_is_found(fault):
+def test_each_fault_of_a_driver_that_follows_positions_is_detected(fault):
     driver = Driver(POSITION, 0)
     driver.listen(1.0)
     home = np.stack(driver.arm.sense()[1:])

@@ -113,7 +113,7 @@ def hold(arm, robot, lines, seconds=1.5, tension=80.0):
     return arm.sense()
 
 
-def test_a_jammed_motor_stands_until_it_is_mended(arm, robot):
+def test_a_jammed_motor_stands_until_it_is_repaired(arm, robot):
     before = arm.sense().length
     after = hold(arm, robot, [f'stuck_motor:{robot.muscles[MUSCLE]}']).length
     assert after[MUSCLE] == pytest.approx(before[MUSCLE], abs=1e-3)
@@ -187,7 +187,7 @@ def test_an_illegal_fault_is_refused_with_the_legal_ones(line, arm):
 
 
 @pytest.mark.parametrize('name', KINDS)
-def test_every_kind_of_fault_can_be_set_by_name_and_mended(name, arm, robot):
+def test_every_kind_of_fault_can_be_set_by_name_and_repaired(name, arm, robot):
     assert read_fault(name, robot).kind == name
     arm.faults.set([name])
     hold(arm, robot, [name], 0.2)

@@ -180,7 +180,7 @@ def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trai
         assert after[name].max() < 2.0 * before[name].max() + 1e-3
 
 
-class Answering(Trainer):
+class ScriptedTrainer(Trainer):
     """A trainer whose updates the test chooses."""
 
     answer = None
@@ -191,7 +191,7 @@ class Answering(Trainer):
 
 
 def test_the_learner_publishes_no_refused_network_and_rolls_back_on_an_anomaly(trained):
-    learner = Learner(ROBOT, trained['default'], preset='default', trainer=Answering)
+    learner = Learner(ROBOT, trained['default'], preset='default', trainer=ScriptedTrainer)
     good = learner.poll(0.0)
     with pytest.raises(GateError):
         learner.replace(ATTACKS['weights × 1.5'](trained['default']))
@@ -216,7 +216,7 @@ def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(
     gate.check(trained['default'])
 
 
-def test_a_learner_that_begins_anew_does_not_roll_back_to_a_network_of_before(trained):
+def test_a_restarted_learner_does_not_roll_back_to_an_earlier_network(trained):
     learner = Learner(ROBOT, trained['paper'], preset='default')
     learner.replace(None)
     learner.begin(trained['default'])

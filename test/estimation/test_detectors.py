@@ -15,7 +15,7 @@ from musculoskeletal_ae.mae.units import State
 DT = 0.01
 
 
-class Watched:
+class MonitorBench:
     """A health monitor with a network, and the tensions commanded to its modules."""
 
     def __init__(self, robot, mae, threshold=0.0, preset='default'):
@@ -38,7 +38,7 @@ class Watched:
 @pytest.fixture
 def watch(robot):
     def make(mae, threshold=0.0, preset='default'):
-        return Watched(robot, mae, threshold, preset)
+        return MonitorBench(robot, mae, threshold, preset)
 
     return make
 
@@ -89,7 +89,7 @@ def test_an_anomaly_takes_five_messages_in_a_row(
     assert finding.evidence.startswith(named)
 
 
-def test_a_reset_starts_the_count_anew(calibrated, watch, wound):
+def test_a_reset_restarts_the_count(calibrated, watch, wound):
     watched = watch(calibrated)
     watched.findings(wound, IN_A_ROW - 1)
     watched.health.reset()

@@ -24,7 +24,7 @@ def states(message):
     return np.array([message.length, message.tension, np.full(6, 25.0)])
 
 
-class Stepped:
+class EstimatorBench:
     """An estimator and both of its clocks."""
 
     def __init__(self, robot, mae) -> None:
@@ -52,7 +52,7 @@ class Stepped:
 
 @pytest.fixture
 def stepped(robot, calibrated):
-    return Stepped(robot, calibrated)
+    return EstimatorBench(robot, calibrated)
 
 
 def test_the_estimator_waits_for_a_checkpoint(robot, healthy):
@@ -120,7 +120,7 @@ def test_a_jump_of_the_clock_clears_counts_but_not_the_latched_anomaly(stepped, 
 
 
 def test_an_old_command_makes_no_muscle_a_suspect(robot, mae, slack):
-    stepped = Stepped(robot, mae)
+    stepped = EstimatorBench(robot, mae)
     stepped.core.commanded(stepped.now, length=slack.length - 0.003)
     stepped.now += COMMAND_AGE
     assert not any(estimate.detected for estimate in stepped.step(slack, 100))
@@ -131,7 +131,7 @@ def test_an_old_command_makes_no_muscle_a_suspect(robot, mae, slack):
 
 
 def test_a_pause_between_messages_does_not_count_as_time_without_tension(robot, mae, slack):
-    stepped = Stepped(robot, mae)
+    stepped = EstimatorBench(robot, mae)
     for _ in range(round(DEAD_TIME / LONGEST_PERIOD)):
         stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
         assert not stepped.step(slack, dt=10.0)[0].detected

@@ -18,7 +18,7 @@ SEVERAL = 0.05 * SIGNS
 ONE = 0.06 * (np.arange(6) == 2)
 
 
-class Wandering:
+class MovingArm:
     """An estimator and a moving model arm, whose lengths and joint sensors may have offsets."""
 
     def __init__(self, robot, mae, **detection):
@@ -62,10 +62,10 @@ class Wandering:
         (ONE, 'stop', Kind.LENGTH_JUMP),
     ],
 )
-def test_lengths_that_jump_revoke_their_offsets_until_they_are_found_anew(
+def test_a_jump_of_lengths_revokes_the_offsets_until_a_calibration(
     robot, mae, jump, on_anomaly, kind
 ):
-    arm = Wandering(robot, mae, on_anomaly=on_anomaly)
+    arm = MovingArm(robot, mae, on_anomaly=on_anomaly)
     arm.go(2.0, sensors=False)
     arm.off = jump
     arm.go(2.0, sensors=False)
@@ -82,7 +82,7 @@ def test_lengths_that_jump_revoke_their_offsets_until_they_are_found_anew(
 
 
 def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.core = Estimator(robot)
     arm.go(1.0)
     arm.off = SEVERAL
@@ -91,7 +91,7 @@ def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
 
 
 def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.core.calibrate_lengths()
     arm.go(3.0)
     before = arm.core.calibration
@@ -101,7 +101,7 @@ def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
 
 
 def test_offsets_are_those_of_before_once_joint_sensors_agree_with_the_lengths(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.go(8.0)
     before = arm.offsets
     arm.off = SEVERAL
@@ -117,7 +117,7 @@ def test_offsets_are_those_of_before_once_joint_sensors_agree_with_the_lengths(r
 
 @pytest.mark.parametrize('size', [0.03, 0.08])
 def test_lengths_that_drift_are_found_by_joint_sensors(robot, mae, size):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.go(8.0)
     for share in np.linspace(0.0, 1.0, 50):
         arm.off = 2.0 * share * size * SIGNS
@@ -128,14 +128,14 @@ def test_lengths_that_drift_are_found_by_joint_sensors(robot, mae, size):
 
 
 def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.off = 2.0 * SEVERAL
     arm.go(4.0)
     assert arm.kind is Kind.LENGTHS_DISAGREE
 
 
 def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.go(8.0)
     arm.joint_off = np.array([0.0, 1.0])
     arm.go(4.0)
@@ -150,13 +150,13 @@ def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(r
 
 
 def test_a_healthy_arm_with_joint_sensors_is_healthy(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.go(20.0)
     assert arm.kind is None
 
 
 def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
-    arm = Wandering(robot, mae)
+    arm = MovingArm(robot, mae)
     arm.joint_off = np.full(2, np.nan)
     arm.go(6.0)
     assert arm.kind is None

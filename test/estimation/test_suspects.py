@@ -29,7 +29,7 @@ def suspects(robot):
         (Kind.VALUES_MISSING, 'isolate', False, (2,), False),
     ],
 )
-def test_what_a_finding_leads_to(suspects, kind, on_anomaly, latched, isolated, verified):
+def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, isolated, verified):
     suspects.settings = Detection(on_anomaly=on_anomaly)
     assert suspects.take(Finding(2, kind, ''), (), 0.0) == isolated
     assert (suspects.finding is not None) == latched

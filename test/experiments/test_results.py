@@ -116,7 +116,7 @@ def learns(_study, _seed):
         (fails, learns, 'InfeasibleError in online_learning: no tension at all'),
     ],
 )
-def test_a_part_that_fails_is_told_everywhere_and_the_others_go_on(
+def test_a_failed_part_is_reported_everywhere_and_the_others_continue(
     monkeypatch, tmp_path, capsys, learning, measuring, told
 ):
     monkeypatch.setattr(runner, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(2))
@@ -149,7 +149,7 @@ def is_killed(name, study, seed):
     return Measured({'error_rad': 0.5}, {})
 
 
-def test_of_what_runs_as_a_worker_is_killed_only_that_fails_whose_worker_is_killed_again(
+def test_after_the_kill_of_a_worker_only_a_part_whose_worker_is_killed_again_fails(
     arm26, tmp_path, monkeypatch
 ):
     os.mkfifo(tmp_path / 'fifo')
@@ -162,9 +162,7 @@ def test_of_what_runs_as_a_worker_is_killed_only_that_fails_whose_worker_is_kill
     assert all(isinstance(each, Measured) for rows in measured.values() for each in rows.values())
 
 
-def test_where_initial_training_fails_every_part_is_told_and_no_report_lacks(
-    monkeypatch, tmp_path, capsys
-):
+def test_if_initial_training_fails_every_part_reports_it(monkeypatch, tmp_path, capsys):
     def train(_study, _preset):
         raise InfeasibleError('no tension at all')
 

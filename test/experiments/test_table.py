@@ -27,7 +27,7 @@ def rows(key):
     return [row for _, row in ROWS if row.default == key]
 
 
-def test_the_page_says_what_the_committed_results_say():
+def test_the_page_shows_the_committed_results():
     text = (REPOSITORY / 'doc' / 'results.md').read_text(encoding='utf-8')
     between = text.split(BEGIN)[1].split(END)[0]
     remedy = 'run: python -m musculoskeletal_ae.experiments.results doc/results.md'

@@ -24,7 +24,7 @@ def imported(tmp_path_factory):
     return robot, initial_mae(robot, steps=900).mae, folder
 
 
-def test_what_is_exported_loads_and_is_as_near_to_the_network_as_the_report_says(imported, capsys):
+def test_an_exported_model_loads_and_is_as_close_to_the_network_as_reported(imported, capsys):
     robot, mae, folder = imported
     checkpoint.save(mae, folder / 'mae.safetensors')
     out = folder / 'model'

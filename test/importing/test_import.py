@@ -64,7 +64,7 @@ CURVE = '0.1 0.5 0.1 -0.05 0.02'
     ],
     ids=['polynomial', 'pulleys', 'side above', 'side below'],
 )
-def test_what_mujoco_computes_with_is_computed_with_here(mjcf, tmp_path, old, new):
+def test_all_quantities_that_mujoco_uses_are_imported(mjcf, tmp_path, old, new):
     assert old in mjcf.read_text()
     mjcf.write_text(mjcf.read_text().replace(old, new))
     lengths, arms, flips = import_robot(mjcf, tmp_path / 'out').comparison
@@ -73,7 +73,7 @@ def test_what_mujoco_computes_with_is_computed_with_here(mjcf, tmp_path, old, ne
     assert not any(flips.values())
 
 
-def test_a_point_on_the_rim_of_what_it_wraps_round_is_tied_to_it(mjcf, tmp_path):
+def test_a_point_on_the_rim_of_a_wrapped_object_is_attached_to_it(mjcf, tmp_path):
     """MuJoCo's choice would depend on rounding, and vary with the posture."""
     drum = (
         '<geom name="pulley" type="cylinder" size="0.03" fromto="0 -0.02 0 0 0.02 0" mass="0.01"/>'
@@ -152,7 +152,7 @@ FORCES = 'forcelimited="true" forcerange="-100 500"'
         (f'<motor {RANGE}"0 250"/>', None),
     ],
 )
-def test_what_pushes_is_no_strength_and_what_pulls_together_adds(mjcf, tmp_path, actuators, limit):
+def test_only_actuators_that_pull_contribute_strength(mjcf, tmp_path, actuators, limit):
     muscle = '<muscle name="m3" tendon="out" force="150"/>'
     mjcf.write_text(mjcf.read_text().replace(muscle, actuators))
     result = import_robot(mjcf, tmp_path / 'out')
@@ -221,7 +221,7 @@ def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
 
 
 @pytest.mark.parametrize('turn', ['0', '3'])
-def test_a_side_site_on_the_axis_means_what_mujoco_makes_of_it(mjcf, tmp_path, turn):
+def test_a_side_site_on_the_axis_has_the_same_effect_as_in_mujoco(mjcf, tmp_path, turn):
     text = mjcf.read_text().replace('euler="1.57 0 0.1"', f'euler="0 0 {turn}"')
     mjcf.write_text(text.replace('pos="-0.06 0 -0.3"', 'pos="0 0 -0.5"'))
     assert max(import_robot(mjcf, tmp_path / 'out').comparison.lengths.values()) < 1e-6
@@ -280,7 +280,7 @@ def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
     np.testing.assert_allclose(second.routes.absolute_lengths(theta), expected, atol=1e-9)
 
 
-def test_cardsflow_muscles_of_one_name_are_told_apart(cardsflow, tmp_path):
+def test_cardsflow_muscles_with_the_same_name_are_distinguished(cardsflow, tmp_path):
     cardsflow.write_text(bodies.CARDSFLOW.replace('"back"', '"front"'))
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.muscles == ('front', 'front_')
@@ -300,7 +300,7 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
         read_source(cardsflow)
 
 
-def test_a_model_without_routes_is_refused_with_what_was_dropped(tmp_path):
+def test_a_model_without_routes_is_refused_with_the_dropped_muscles(tmp_path):
     text = re.sub('<spatial .*?</spatial>', '', bodies.MJCF, flags=re.DOTALL)
     file = put(tmp_path, 'own.xml', re.sub('<muscle [^>]*>', '', text))
     with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: a fixed one'):

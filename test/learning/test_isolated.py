@@ -4,7 +4,7 @@
 import numpy as np
 
 from learning.conftest import job
-from learning.test_learner import Prepared
+from learning.test_learner import IdleTrainer
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 
@@ -36,7 +36,7 @@ def test_readings_of_an_isolated_muscle_do_not_change_its_body(learned):
 def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     arm26, initial, stage, tmp_path
 ):
-    learner = Learner(arm26, initial, trainer=Prepared, directory=tmp_path)
+    learner = Learner(arm26, initial, trainer=IdleTrainer, directory=tmp_path)
     for _ in range(3):
         learner.accept(stage.sample())
     learner.isolate((LOST,))
@@ -48,7 +48,7 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     assert checkpoint.from_bytes(data, arm26).isolated == (LOST,)
     assert learner.trainer.jobs[-1].isolated == (LOST,)
     learner.close()
-    again = Learner(arm26, trainer=Prepared, directory=tmp_path)
+    again = Learner(arm26, trainer=IdleTrainer, directory=tmp_path)
     assert again.isolated == again.mae.isolated == (LOST,)
     assert len(again.samples) == 4
     assert [sample.isolated for sample in again.samples.samples] == [()] * 3 + [(LOST,)]
@@ -59,7 +59,7 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
 
 
 def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
-    learner = Learner(arm26, initial, trainer=Prepared)
+    learner = Learner(arm26, initial, trainer=IdleTrainer)
     learner.anomaly(True)
     version = learner.mae.version
     learner.isolate((LOST,))

@@ -17,7 +17,7 @@ from musculoskeletal_ae.signals.body_state import LengthOffsets
 DT = 0.01
 
 
-class Prepared(Trainer):
+class IdleTrainer(Trainer):
     """A trainer that returns its initial network when the test allows it."""
 
     def __init__(self, *arguments) -> None:
@@ -50,7 +50,7 @@ class Prepared(Trainer):
 
 @pytest.fixture
 def learner(arm26, initial):
-    return Learner(arm26, initial, trainer=Prepared)
+    return Learner(arm26, initial, trainer=IdleTrainer)
 
 
 def accept(learner, stage, count):
@@ -144,7 +144,7 @@ def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner
 
 
 def test_preset_paper_makes_one_update_of_a_sample_from_the_twenty_first_on(arm26, initial, stage):
-    learner = Learner(arm26, initial, 'paper', trainer=Prepared)
+    learner = Learner(arm26, initial, 'paper', trainer=IdleTrainer)
     for count in range(1, 23):
         learner.accept(stage.sample())
         for now in (3.0 * count, 3.0 * count + 1.5):
@@ -297,7 +297,7 @@ def test_a_replaced_network_drops_samples_and_continues_the_version_count(learne
     assert learner.poll(5.0) is None
 
 
-class Partly(Arm):
+class PartlySensedArm(Arm):
     """An arm of which only some joints have sensors."""
 
     read = ()
@@ -314,8 +314,8 @@ class Partly(Arm):
 
 
 def test_without_joint_sensors_rest_is_detected_from_the_muscles(arm26, initial, stage):
-    learner = Learner(arm26, initial, trainer=Prepared, joint_source='none')
-    arm = Partly(learner, stage)
+    learner = Learner(arm26, initial, trainer=IdleTrainer, joint_source='none')
+    arm = PartlySensedArm(learner, stage)
     for _ in range(25):
         arm.rest(1.1)
     assert len(learner.samples) >= 20
@@ -325,8 +325,8 @@ def test_without_joint_sensors_rest_is_detected_from_the_muscles(arm26, initial,
 
 def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial, stage):
     for read, samples in (((), 0), ((1,), 3)):
-        learner = Learner(arm26, initial, trainer=Prepared)
-        arm = Partly(learner, stage)
+        learner = Learner(arm26, initial, trainer=IdleTrainer)
+        arm = PartlySensedArm(learner, stage)
         arm.read = read
         for _ in range(6):
             arm.rest(1.1)
@@ -342,8 +342,8 @@ UP = np.array([0.0, 0.0, 9.8])  # [m/s²] of an accelerometer that hangs as its 
 def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_received_in(
     arm26, initial, stage
 ):
-    learner = Learner(arm26, initial, trainer=Prepared, joint_source='none')
-    arm, last, rests = Partly(learner, stage), stage.sample(), []
+    learner = Learner(arm26, initial, trainer=IdleTrainer, joint_source='none')
+    arm, last, rests = PartlySensedArm(learner, stage), stage.sample(), []
     for heard in (['upper_arm'], ['upper_arm', 'forearm'], []):
         last, before = stage.sample(), last
         rests.append((last, heard))
@@ -365,8 +365,8 @@ def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_recei
 
 
 def test_an_accelerometer_reading_in_motion_is_not_used_for_the_next_rest(arm26, initial, stage):
-    learner = Learner(arm26, initial, trainer=Prepared, joint_source='none')
-    arm, start, end = Partly(learner, stage), stage.sample(), stage.sample()
+    learner = Learner(arm26, initial, trainer=IdleTrainer, joint_source='none')
+    arm, start, end = PartlySensedArm(learner, stage), stage.sample(), stage.sample()
     arm.rest(1.0, start)
     for sample in between(start, end, 40):
         arm.send(sample)

@@ -22,7 +22,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-from .test_learner import Prepared, accept
+from .test_learner import IdleTrainer, accept
 
 BACKUP = 'backup-1.state'
 
@@ -193,13 +193,11 @@ def test_a_file_that_cannot_be_used_is_kept_and_the_one_before_it_is_used(
     assert not_used == ''
 
 
-def test_where_no_state_can_be_used_learning_starts_anew_and_says_so(
-    tmp_path, arm26, stage, initial
-):
+def test_without_a_usable_state_learning_restarts_with_a_report(tmp_path, arm26, stage, initial):
     written(tmp_path, arm26, stage, 3)
     for name in (NEWEST, PREVIOUS):
         damage(tmp_path / name)
-    with closing(Learner(arm26, initial, trainer=Prepared, directory=tmp_path)) as learner:
+    with closing(Learner(arm26, initial, trainer=IdleTrainer, directory=tmp_path)) as learner:
         message = learner.report().values['saved state not used']
         assert 'learning starts again' in message
         assert 'backup-1.state' in message and 'backup-2.state' in message
@@ -244,7 +242,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     store.forget(0, newest=1)
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
-    with closing(Learner(arm26, initial, directory=tmp_path, trainer=Prepared)) as learner:
+    with closing(Learner(arm26, initial, directory=tmp_path, trainer=IdleTrainer)) as learner:
         loaded = learner.samples
         assert loaded.numbers == store.numbers
         for one, other in zip(loaded.samples, store.samples, strict=True):
@@ -273,7 +271,7 @@ def test_a_directory_serves_one_learner_at_a_time(tmp_path, arm26):
 
 
 @pytest.mark.parametrize('place', ['file/state', 'nul\0'])
-def test_a_directory_that_cannot_be_made_is_named_with_what_to_give(tmp_path, arm26, place):
+def test_a_directory_that_cannot_be_created_is_reported_with_a_remedy(tmp_path, arm26, place):
     (tmp_path / 'file').write_text('x')
     with pytest.raises(
         StateError, match=r'state_directory.*cannot be written.*set a writable directory'
@@ -292,7 +290,7 @@ def begun(arm26, initial, tmp_path):
     def begin():
         for learner in learners:
             learner.close()
-        learners.append(Learner(arm26, initial, trainer=Prepared, directory=tmp_path / 'state'))
+        learners.append(Learner(arm26, initial, trainer=IdleTrainer, directory=tmp_path / 'state'))
         return learners[-1]
 
     yield begin
@@ -398,7 +396,9 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
         patch.setattr(CheckpointValidator, 'check', refuse)
         messages = []
         for _ in range(2):  # no network replaces the state
-            with closing(Learner(arm26, trainer=Prepared, directory=tmp_path / 'state')) as again:
+            with closing(
+                Learner(arm26, trainer=IdleTrainer, directory=tmp_path / 'state')
+            ) as again:
                 assert_same(again.samples, before.samples)
                 messages.append(again.report().values.get('saved state not used', ''))
     assert 'does not explain the arm' in messages[0] and BACKUP in messages[0]

@@ -53,7 +53,7 @@ def test_old_postures_are_not_forgotten_when_new_samples_are_all_alike(learned):
     assert error(update.mae, *states) < 1.2 * before
 
 
-class Giving(Stage):
+class CompliantStage(Stage):
     """An arm with compliant route points, which no calibrated body can describe."""
 
     def sample(self):
@@ -71,7 +71,7 @@ def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
             update = updater.update(job(store, steps=150, **parts))
         return error(update.mae, observed.theta, observed.tension, observed.length)
 
-    stage = Giving(other_body)
+    stage = CompliantStage(other_body)
     store = stage.store(30)
     observed, messages = (stage.store(400).observations() for _ in range(2))
     # Over eight bodies and streams 0.91 with a standard deviation of 0.02.

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from learning.test_learner import Arm, Prepared
+from learning.test_learner import Arm, IdleTrainer
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.offset_history import OffsetHistory
@@ -15,7 +15,7 @@ OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
 POSTURE = 1.0 + MARGIN + 0.5  # [s] of rest after which there is a sample
 
 
-class Displaced(Arm):
+class ArmWithOffsets(Arm):
     """An arm with length offsets."""
 
     off = np.zeros(6)
@@ -26,12 +26,12 @@ class Displaced(Arm):
 
 @pytest.fixture
 def learner(arm26, initial):
-    return Learner(arm26, initial, trainer=Prepared)
+    return Learner(arm26, initial, trainer=IdleTrainer)
 
 
 @pytest.fixture
 def arm(learner, stage):
-    arm = Displaced(learner, stage)
+    arm = ArmWithOffsets(learner, stage)
     for _ in range(2):
         arm.rest(POSTURE)
     assert len(learner.samples) == 2
@@ -131,7 +131,7 @@ def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
             np.testing.assert_allclose(sample.length, expected.length)
 
 
-def test_nothing_is_learned_after_a_jump_of_lengths_until_they_are_found_anew(learner, arm):
+def test_nothing_is_learned_after_a_jump_of_lengths_until_a_calibration(learner, arm):
     arm.off = OFF
     arm.rest(4.0)
     for _ in range(3):

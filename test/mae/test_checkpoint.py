@@ -273,7 +273,7 @@ def test_any_changed_byte_gives_a_sound_network_or_a_checkpoint_error(place, fli
 
 
 @given(st.integers(0, len(GOOD) - 1))
-def test_any_cut_file_is_refused(length):
+def test_any_truncated_file_is_refused(length):
     with pytest.raises(CheckpointError):
         from_bytes(GOOD[:length])
 
@@ -284,7 +284,7 @@ def test_any_header_gives_a_checkpoint_error(header):
         from_bytes(len(header).to_bytes(8, 'little') + header)
 
 
-def test_what_tells_a_push_from_friction_comes_back_and_unsound_values_are_refused():
+def test_contact_statistics_are_restored_and_invalid_values_are_refused():
     touch = TouchStatistics(np.array([0.1, 0.05]), np.array([0.3]), 90.0)
     mae = from_bytes(to_bytes(replace(small(), touch=touch)))
     assert mae.touch.time == 90.0 and mae.touch.calibrated

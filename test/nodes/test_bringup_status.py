@@ -23,7 +23,7 @@ def diagnostics(
     return DiagnosticArray(status=[status])
 
 
-def test_before_the_first_sample_it_says_why_the_error_may_rise():
+def test_before_the_first_sample_a_hint_explains_why_the_error_may_rise():
     situation = Situation('/left')
     assert situation.hint() == ''  # there is no learner
     situation.diagnosed(diagnostics('/left/learner', samples='0'))
@@ -32,13 +32,13 @@ def test_before_the_first_sample_it_says_why_the_error_may_rise():
     assert situation.hint() == '' and (situation.samples, situation.checkpoints) == ('3', '2')
 
 
-def test_a_learned_network_is_not_said_to_have_learned_nothing():
+def test_there_is_no_hint_with_a_network_that_has_learned():
     situation = Situation('/left')
     situation.diagnosed(diagnostics('/left/learner', samples='0', network_learned='True'))
     assert situation.hint() == ''
 
 
-def test_it_says_with_how_many_samples_learning_begins():
+def test_the_hint_states_the_number_of_samples_required():
     situation = Situation('/left')
     situation.diagnosed(diagnostics('/left/learner', samples='3', samples_to_begin_with='20'))
     assert 'learning begins with 20 samples' in situation.hint()
@@ -46,14 +46,14 @@ def test_it_says_with_how_many_samples_learning_begins():
     assert situation.hint() == ''
 
 
-def test_what_is_not_known_is_said_to_be_waited_for():
+def test_unknown_values_are_shown_with_the_missing_topic():
     assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
     assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'
     none = figures(True, math.nan, math.nan)
     assert none == 'error waits for estimated_joint_states  A waits for anomaly'
 
 
-def test_joint_sensors_that_fell_silent_are_waited_for(graph, capsys):
+def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
     node = graph.host(bringup_status.BringupStatus, robot='arm26')
     node.anomalies.append(0.5)
     node._measured(np.zeros(2))

@@ -89,7 +89,7 @@ def test_a_topic_of_the_wrong_type_is_reported(graph):
         (['--tension', '35'], 'needs at least 50 N, not 35 N'),
     ],
 )
-def test_what_cannot_be_moved_is_refused_at_once(options, problem, capsys):
+def test_a_muscle_that_cannot_be_moved_is_refused_at_once(options, problem, capsys):
     arguments = ['--robot', 'arm26', '--seconds', '1000', '--move', *options]
     assert check_driver.main(arguments) == 1
     assert problem in capsys.readouterr().err
@@ -122,7 +122,7 @@ def test_ctrl_c_ends_check_driver_without_a_traceback(graph):
     assert 'Traceback' not in output
 
 
-def test_nodes_say_what_they_wait_for(graph):
+def test_nodes_report_the_topics_that_they_wait_for(graph):
     estimator = graph.start('estimator', robot='arm26')
     waiting = estimator.wait_for_output('waiting for')
     assert f'{graph.namespace}/muscle_states, which has no publisher' in waiting

@@ -100,7 +100,7 @@ def test_without_control_msgs_there_is_no_action(graph, arm26, trained_file, mon
     assert ControlledArm(graph, arm26, trained_file).controller.action is None
 
 
-class Asked(Waitable):
+class FakeServer(Waitable):
     """A stand-in for an action server in a wait set."""
 
     def __init__(self, node):
@@ -142,7 +142,7 @@ def test_requests_of_an_action_are_served_at_once(monkeypatch):
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('asked', context=context)
-    asked = Asked(node)
+    asked = FakeServer(node)
     lean = executor.LeanExecutor(context=context)
     lean.add_node(node)
     spun = threading.Thread(target=lambda: _until_shutdown(lean), daemon=True)

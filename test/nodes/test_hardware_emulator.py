@@ -78,7 +78,7 @@ def test_length_commands_move_the_arm_and_their_absence_makes_it_safe(arm, arm26
     arm.wait(lambda: rows(arm, arm26)[1].max() < 35.0, 'the safe state after the timeout')
 
 
-def test_a_muscle_is_ruptured_and_mended_at_run_time(arm, arm26):
+def test_a_muscle_is_ruptured_and_repaired_at_run_time(arm, arm26):
     name = arm26.muscles[3]
     success, reason = arm.set_parameter('hardware_emulator', 'ruptured_muscles', ['biceps'])
     assert not success
@@ -143,7 +143,7 @@ def test_a_reset_brings_the_arm_back(arm, arm26):
     np.testing.assert_allclose(np.array(arm.next('joint_states').position), start, atol=0.05)
 
 
-def test_an_impossible_wrench_is_rejected_and_a_broken_simulation_mended_by_a_reset(arm, arm26):
+def test_an_impossible_wrench_is_rejected_and_a_reset_repairs_a_broken_simulation(arm, arm26):
     push = arm.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
     message = WrenchStamped()
     message.wrench.torque.x = 1000.0

@@ -111,7 +111,7 @@ STRANGE = {
 }
 
 
-def test_what_a_stranger_says_for_the_estimator_stops_the_arm_and_changes_nothing(
+def test_messages_in_the_name_of_the_estimator_stop_the_arm_and_change_nothing(
     graph, arm26, trained_file
 ):
     arm = ControlledArm(graph, arm26, trained_file)

@@ -131,7 +131,7 @@ def test_a_joint_that_slides_is_drawn_in_millimetres(tmp_path):
     ]
 
 
-def test_what_slides_is_as_stiff_as_a_pinion_that_moves_it(tmp_path):
+def test_a_prismatic_joint_has_the_stiffness_of_a_pinion_that_moves_it(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True, stiffness=2000.0))
     result = check_robot(robot, 20)
     held = result.held
@@ -145,7 +145,7 @@ def test_what_slides_is_as_stiff_as_a_pinion_that_moves_it(tmp_path):
     np.testing.assert_allclose(result.stiffness[held], lowest, rtol=1e-6)
 
 
-def test_what_slides_is_told_in_newtons_and_shares_of_the_tension(tmp_path, capsys):
+def test_prismatic_joints_are_reported_in_newtons_and_shares_of_the_tension(tmp_path, capsys):
     def back(document):
         (entry,) = (m for m in document['muscles'] if m['name'] == 'slider_out')
         entry['route'][0]['xyz'] = [0.0, -0.02, -0.1]
@@ -327,7 +327,7 @@ def finger(directory, **top):
     return write_muscles(directory, document)
 
 
-def test_a_finger_is_judged_by_its_own_size_and_told_that_it_is_small(tmp_path, capsys):
+def test_the_check_scales_with_the_size_of_a_finger_and_warns_that_it_is_small(tmp_path, capsys):
     status, printed, _ = verdict(capsys, finger(tmp_path / 'arm'))
     assert status == 0, printed
     assert 'nearest to 1.5 N' in printed and 'stiffness >= 0.0' in printed
@@ -337,7 +337,7 @@ def test_a_finger_is_judged_by_its_own_size_and_told_that_it_is_small(tmp_path, 
     assert re.fullmatch(r'flexor( +-\d\.\d){3}', row)
 
 
-def test_a_finger_that_is_soft_or_weak_is_told_by_how_much(tmp_path, capsys):
+def test_the_report_states_how_soft_or_weak_a_finger_is(tmp_path, capsys):
     _, printed, _ = verdict(capsys, finger(tmp_path / 'soft', stiffness=20.0))
     assert 'fault: the arm is' in printed and 'not stiff' in printed
     assert '-0.0 N·m' not in printed
@@ -424,7 +424,7 @@ def test_a_plot_that_cannot_be_written_is_an_error_not_a_traceback(tmp_path, cap
 @pytest.mark.parametrize(
     'change', [{'radius': 30.0}, {'xyz': [0.0, 0.0, 300.0]}, {'radius': 0.045}]
 )
-def test_a_wire_that_touches_nowhere_what_it_should_wrap_round_is_told(change, tmp_path):
+def test_an_object_that_no_tendon_touches_is_reported(change, tmp_path):
     folder = copy_robot('arm26', tmp_path)
     document = read_muscles(folder)
     (route,) = (m['route'] for m in document['muscles'] if m['name'] == 'triceps_lateral')
@@ -497,7 +497,7 @@ def test_a_limit_is_no_remedy_where_no_limit_holds_the_arm(tmp_path):
     assert lines[-1] == 'other routes may help: see --suggest'
 
 
-def test_where_nothing_helps_it_says_so(tmp_path):
+def test_the_report_states_if_no_remedy_helps(tmp_path):
     def idle(document):
         for muscle in document['muscles']:
             muscle['route'] = IDLE
@@ -507,7 +507,7 @@ def test_where_nothing_helps_it_says_so(tmp_path):
     assert lines[1:] == ['other routes may help: see --suggest']
 
 
-def test_stiffness_is_no_remedy_where_the_elastic_unit_is_what_gives(tmp_path):
+def test_stiffness_is_no_remedy_if_the_elastic_element_is_too_soft(tmp_path):
     directory = write_robot(tmp_path, series_elastic=SOFT)
     lines, _ = remedies_of(directory, 'not_stiff')
     change(directory, lambda d: d.update(stiffness=1e8))
@@ -516,7 +516,7 @@ def test_stiffness_is_no_remedy_where_the_elastic_unit_is_what_gives(tmp_path):
     assert remedy.startswith('series_elastic.rate ')
 
 
-def test_what_suffices_together_only_is_named_together(tmp_path):
+def test_changes_that_suffice_only_together_are_reported_together(tmp_path):
     lines, _ = remedies_of(write_robot(tmp_path, **FAULTY['soft in both'][1]), 'not_stiff')
     assert lines[-1].startswith('together: stiffness ')
     assert 'series_elastic.rate' in lines[-1]

@@ -40,7 +40,7 @@ def energy(robot, theta):
     return pin.computePotentialEnergy(kin.model, kin.data, kin.tree.angles(theta))
 
 
-def test_what_follows_from_a_coupled_joint_is_the_derivative_over_theta(robot):
+def test_quantities_of_coupled_joints_are_derivatives_with_respect_to_theta(robot):
     kin = robot.kinematics
     assert robot.joints == ('bend', 'lift', 'swing')
     for theta in robot.random_postures(4, np.random.default_rng(0)):
@@ -113,7 +113,7 @@ def test_the_emulated_joint_follows_its_master(robot):
 MIMIC = '<mimic joint="bend" multiplier="-0.5" offset="0.2"/><axis xyz="0 0 1"/>'
 
 
-def test_a_urdf_mimic_is_followed_and_what_stands_still_is_named(tmp_path):
+def test_a_urdf_mimic_is_followed_and_joints_held_fixed_are_named(tmp_path):
     robot = Robot.load(coupled_arm(tmp_path / 'listed', couplings=[COUPLED]))
     coupled_arm(tmp_path)
     plain = Robot.load(tmp_path)
@@ -171,7 +171,7 @@ def test_a_continuous_joint_may_mimic_a_listed_one_since_it_needs_no_limits(tmp_
 
 
 @pytest.mark.parametrize('master', ['wrist', 'toe'])
-def test_a_mimic_of_what_does_not_move_is_refused_by_the_name_of_urdf_and_joint(tmp_path, master):
+def test_a_mimic_of_a_fixed_joint_is_refused_with_the_names_of_urdf_and_joint(tmp_path, master):
     urdf = coupled_arm(tmp_path) / 'robot.urdf'
     mimic = f'<axis xyz="0 0 1"/><mimic joint="{master}"/>'
     urdf.write_text(urdf.read_text().replace('<axis xyz="0 0 1"/>', mimic))

@@ -272,7 +272,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize('case', STRANGE)
-def test_a_urdf_that_nobody_writes_by_mistake_is_refused(case, tmp_path):
+def test_a_malicious_or_strange_urdf_is_refused(case, tmp_path):
     edit, problem = STRANGE[case]
     file = copy_robot('arm26', tmp_path) / 'robot.urdf'
     text = file.read_text()

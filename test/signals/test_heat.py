@@ -60,7 +60,7 @@ class Motors:
         self.heat.step(self.pulled, self.read, 1.0)
 
 
-class Watched(Motors):
+class ObservedMotors(Motors):
     """The same modules, observed by the estimator."""
 
     def __init__(self, mae, **options):
@@ -133,7 +133,7 @@ def test_cool_muscles_are_not_limited_and_short_pulls_may_be_stronger_than_long_
 
 @pytest.mark.parametrize('constant', ['loss', 'housing_resistance'])
 def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, constant):
-    motors = Watched(trained['default'], seed=1)
+    motors = ObservedMotors(trained['default'], seed=1)
     motors.run(1.2 * LEARNED)
     assert motors.heat.changed == {}
     assert motors.core.cause == ''
@@ -149,7 +149,7 @@ def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, 
 
 
 def test_an_anomaly_of_a_cool_muscle_is_reported_without_a_stop(trained):
-    motors = Watched(trained['default'], seed=1, most=0.6 * TENSION.limit)
+    motors = ObservedMotors(trained['default'], seed=1, most=0.6 * TENSION.limit)
     motors.run(1.2 * LEARNED)
     motors.wound.loss[2] *= 2.2
     motors.run(600)

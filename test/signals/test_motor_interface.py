@@ -92,7 +92,7 @@ def test_an_effort_that_does_not_exist_is_an_unknown_tension_not_zero():
         (joint_state(stamp=0), 'no stamp'),
     ],
 )
-def test_a_message_that_says_nothing_certain_of_the_motors_is_rejected(message, reason):
+def test_an_ambiguous_message_of_the_motors_is_rejected(message, reason):
     assert refused(message) == reason
 
 

@@ -124,7 +124,7 @@ def test_lengths_that_jump_together_are_all_named_and_displaced_until_new_offset
     assert not stream.displaced
 
 
-def test_a_jump_in_a_pause_of_the_messages_is_told_from_one_that_was_seen():
+def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
     stream = MuscleStream(ROBOT)
     assert jump_together(stream, size=0.09, pause=2.0 * LIMITS.pause) == [0, 1, 2]
     assert stream.has_displaced_unseen

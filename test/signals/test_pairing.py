@@ -23,7 +23,7 @@ def test_the_nearest_angle_within_half_a_period_is_paired():
     assert third.theta is None
 
 
-def test_a_clock_that_goes_back_starts_pairing_anew():
+def test_a_clock_that_jumps_back_restarts_the_pairing():
     pairing = Pairing(0.01)
     pairing.muscles(1.7e9, 'message')
     assert pairing.muscles(0.0, 'message') is None
