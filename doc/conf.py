@@ -5,6 +5,7 @@
 .venv/bin/python -m sphinx -W doc build/doc      # then open build/doc/index.html
 """
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -26,8 +27,8 @@ html_title = project
 myst_heading_anchors = 3
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'description'
-# Only nodes/ and the page need them, and neither is part of the reference.
-autodoc_mock_imports = ['rclpy', 'viser', 'mujoco']
+# Only nodes/ and the page need these, and neither is part of the reference.
+autodoc_mock_imports = ['rclpy', 'viser']
 #: fields of records are explained where they are defined; napoleon would list them twice
 napoleon_use_ivar = True
 # The diagram of stops.md is drawn by GitHub; here it is shown as text.
@@ -46,6 +47,19 @@ def write_reference(_: Sphinx) -> None:
     apidoc.main(['-f', '-q', '-T', '-M', '-d', '1', '-o', out, str(PACKAGE), *left_out])
 
 
+def name_files(_: Sphinx, page: str, source: list[str]) -> None:
+    """Replace links to files outside doc/, which the site does not contain, by their paths."""
+
+    def replaced(link: re.Match[str]) -> str:
+        text, target = link.groups()
+        path = os.path.relpath(FOLDER / Path(page).parent / target.partition('#')[0], FOLDER.parent)
+        if path.startswith(f'{FOLDER.name}{os.sep}'):
+            return link[0]
+        return f'`{path}`' if text.strip('`') == path else f'{text} (`{path}`)'
+
+    source[0] = re.sub(r'(?<!!)\[([^\]]+)\]\((\.\./[^)\s]+)\)', replaced, source[0])
+
+
 def as_written(*event: Any) -> None:
     """Preserve bars, stars and `code`, and show indented blocks as equations."""
     lines: list[str] = event[-1]
@@ -62,6 +76,7 @@ def as_written(*event: Any) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Let Sphinx write the reference before it reads the pages."""
+    """Let Sphinx write the reference before it reads the pages, and adapt pages and docstrings."""
     app.connect('builder-inited', write_reference)
+    app.connect('source-read', name_files)
     app.connect('autodoc-process-docstring', as_written, priority=400)  # before napoleon
