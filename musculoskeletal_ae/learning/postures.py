@@ -161,8 +161,9 @@ class GroupFit:
         for _ in range(SCALINGS):
             inverse = solve_triangular(root, np.eye(len(root)))[parameters]
             undetermined = float(scaled @ np.square(inverse).sum(axis=1))
-            determined_count = max(1.0, len(parameters) - undetermined)
-            scaled = prior.precision / max(self._least_ratio, chi_square / determined_count)
+            # One more parameter at its expected deviation: without samples the ratio is 1.
+            ratio = (chi_square + 1.0) / (max(0.0, len(parameters) - undetermined) + 1.0)
+            scaled = prior.precision / max(self._least_ratio, ratio)
             common = equations.common.copy()
             common[parameters, parameters] += scaled - prior.precision
             root = Eliminated(equations._replace(common=common), 0.0, SMALL).root
