@@ -28,6 +28,7 @@ import numpy as np
 from bench.recordings_learn import (
     Model,
     Statics,
+    bend_gain,
     effort_slope,
     error,
     joined,
@@ -144,21 +145,36 @@ def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str,
         for split in SPLITS[name](recording):
             for label, model in models(recording, split, Path(folder) / 'robot', learned):
                 off = error(model, split.test)
+                off = round(off, 4)
                 results.append(Result(name, split.name, len(split.training.length), label, off))
                 print(f'{name}: {split.name}: {label}: {off:.4f} rad', flush=True)
+    return results, observations(recording)
+
+
+def observations(recording: Recording) -> dict[str, Any]:
+    """Return what the runs of a recording show besides the errors of models."""
     shown: dict[str, Any] = {}
-    if name == 'soft_neck':
-        azimuths = np.array(recording.link.azimuths)
+    azimuths = np.array(recording.link.azimuths)
+    if recording.link.name == 'soft_neck':
+        none, half, whole = recording.runs
+        gains = {run.name: bend_gain(run, azimuths) for run in recording.runs}
         slopes = {run.name: effort_slope(run, azimuths) for run in recording.runs}
-        none, half, whole = slopes.values()
-        shown = {'effort_slope': slopes, 'payload_by_effort_kg': (none - half) / (none - whole)}
-    if name == 'soft_arm':
+        first = gains[none.name]
+        shown['bend for the same lengths, over that at 0 g'] = {
+            name: round(gain / first, 3) for name, gain in gains.items()
+        }
+        shown['slope of the efforts over the commanded bend [1/m]'] = {
+            name: round(slope, 1) for name, slope in slopes.items()
+        }
+        share = (slopes[none.name] - slopes[half.name]) / (slopes[none.name] - slopes[whole.name])
+        shown['payload of the 500 g run by its efforts [kg]'] = round(share, 3)
+    if recording.link.name == 'soft_arm':
         for with_theta in (False, True):
             for with_effort in (False, True):
                 inputs = ['lengths'] + ['currents'] * with_effort + ['angles'] * with_theta
                 share = payload_share(recording.runs, with_effort, with_theta)
-                shown[f'payload R² by {", ".join(inputs)}'] = share
-    return results, shown
+                shown[f'R² of the payload by {", ".join(inputs)}'] = round(share, 3)
+    return shown
 
 
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
@@ -197,6 +213,8 @@ def main(argv: list[str]) -> int:
         results, also = learn(repository, Files(clone))
         rows += [result._asdict() for result in results]
         shown[repository.name] = also
+        for key, value in also.items():
+            print(f'{key}: {value}')
     if not rows:
         raise MusculoskeletalError(f'{args.clones}: no clone of any repository; use --fetch')
     args.out.mkdir(parents=True, exist_ok=True)

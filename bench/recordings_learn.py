@@ -188,6 +188,15 @@ def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float
     return float(1.0 - (off @ off) / (plain @ plain))
 
 
+def bend_gain(run: Run, azimuths: Array) -> float:
+    """Return by how much the bend at rest rises with the commanded one [rad/m]."""
+    out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+    rest = run.at_rest()
+    wound = -rest.length @ out
+    wound, theta = wound - wound.mean(axis=0), rest.theta - rest.theta.mean(axis=0)
+    return float((wound * theta).sum() / (wound * wound).sum())
+
+
 def effort_slope(run: Run, azimuths: Array) -> float:
     """Return by how much the efforts at rest rise with the commanded bend, in units of effort/m."""
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
