@@ -331,16 +331,16 @@ class Arm(ABC):
         self._command.length_error[:] = self._length_bias + np.asarray(offset)
 
     def set_ruptured(self, muscles: Iterable[str]) -> None:
-        """Rupture the named muscles and mend all others; a mended muscle takes up T_bias.
+        """Rupture the named muscles and repair all others; a repaired muscle returns to T_bias.
 
         Raises:
             MusculoskeletalError: If a name is unknown; nothing changes then.
         """
         ruptured = np.zeros(self.robot.muscle_count, dtype=bool)
         ruptured[self.robot.muscle_indices(muscles)] = True
-        mended = (self._muscle.ruptured > 0.0) & ~ruptured
+        repaired = (self._muscle.ruptured > 0.0) & ~ruptured
         self._muscle.ruptured[:] = ruptured
-        self._attach(mended)
+        self._attach(repaired)
 
     def set_faults(self, lines: Iterable[str]) -> None:
         """Activate the faults of the lines and end all others; shortened tendons take up T_bias.

@@ -27,7 +27,7 @@ GRASPING = 60.0  # [s] from grasp to release and from release to grasp
 #: a muscle carries tension if T exceeds T_bias by this much, far beyond the sensor's noise
 CARRYING = 10.0  # [N]
 SLOT = 20.0  # [s] for each muscle: wait until it carries tension, rupture, mend, recover
-LATEST_RUPTURE, RUPTURE_TIME = 14.0, 3.0  # [s] in the slot; [s] until the muscle is mended
+LATEST_RUPTURE, RUPTURE_TIME = 14.0, 3.0  # [s] in the slot; [s] until the muscle is repaired
 SLACKENING = 0.1  # [s] after a rupture until no tension is left
 RECOVERY = 2.0  # [s] after mending, while the arm swings back
 LONGEST_WAIT = 5.0  # [s] of the random wait, for ruptures both in motion and at rest

@@ -54,7 +54,7 @@ PUSH_EVERY, PUSH = 10.0, (10.0, 30.0)  # [s], [N]
 
 
 class IsolatingLoop(ClosedLoop):
-    """A closed loop with the estimator's detector, which isolates broken muscles."""
+    """A closed loop with the estimator's detector, which isolates faulty muscles."""
 
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
         """Connect an arm at rest."""

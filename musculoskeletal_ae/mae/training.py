@@ -56,7 +56,7 @@ def random_states(
 
 
 def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield mini-batches of the samples forever, shuffled anew in each epoch."""
+    """Yield mini-batches of the samples forever, shuffled again in each epoch."""
     while True:
         order = rng.permutation(len(samples))
         for i in range(0, max(len(order) - batch, 0) + 1, batch):

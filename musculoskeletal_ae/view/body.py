@@ -26,7 +26,7 @@ from musculoskeletal_ae.robot.routes import ARC
 LARGEST_MESH = 50_000_000  # [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
 POSTURES = 20  # random postures that have to fit into the picture
-DASHES = 5  # tubes per straight segment of a muscle; sound muscles show no gaps
+DASHES = 5  # tubes per straight segment of a muscle; healthy muscles show no gaps
 #: red, green, blue at T_bias and at T_limit
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 
@@ -185,7 +185,7 @@ def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dic
     position = first[:, None] + middle[:, None] * line[:, None]
     radius = 0.5 * drawing.MUSCLE_WIDTH * (1.0 + 1.5 * drawing.tension_share(robot, tension))
     radius = np.where(kinds == Kind.SUSPECT, drawing.MUSCLE_WIDTH * 1.5, radius)[owner]
-    # Tubes of sound muscles overlap slightly to hide the seams.
+    # Tubes of healthy muscles overlap slightly to hide the seams.
     dash = np.where(kinds >= Kind.ISOLATED, 0.55, 1.02)[owner] * length / DASHES
     each = {
         'batched_wxyzs': turn,

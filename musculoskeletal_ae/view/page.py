@@ -222,7 +222,7 @@ class Page:
             self._ball.position = kin.end_effector_pose(theta).translation
 
     def _mark(self) -> None:
-        """Label muscles: all if requested, else those that are picked or not sound."""
+        """Label muscles: all if requested, else those that are picked or faulty."""
         for name, kind, label in zip(self._robot.muscles, self._kinds.tolist(), self._labels):
             label.visible = self._names.value or kind > Kind.SOUND or name == self._picked
             label.text = MARKS[kind] + name + (f' {Kind(kind).name.lower()}' if kind else '')
