@@ -98,7 +98,7 @@ def failures_of(worst: float, filled: float, most: float, times: list[float]) ->
     if quarter:
         first, last = np.median(times[:quarter]), np.median(times[-quarter:])
         if last > SLOWER * first:
-            problems.append(f'an update took {first:.2f} s at first and {last:.2f} s at last')
+            problems.append(f'updates took {first:.2f} s at first and {last:.2f} s at last')
     return problems
 
 

@@ -157,7 +157,7 @@ def main(argv: list[str]) -> int:
             passed &= good
             print(
                 f'individual {seed}, {how:8s} {got["before_rad"]:.4f} → {got["after_rad"]:.4f}'
-                f' rad, × {got["ratio"]:.2f} after {got["seconds"]:.0f} s; zeros within '
+                f' rad, × {got["ratio"]:.2f} after {got["seconds"]:.0f} s; offsets within '
                 f'{1e3 * got["worst_zero_m"]:.1f} mm, '
                 f'{got["alarms"]} + {got["alarms_after"]} alarms, '
                 f'≤ {1e3 * got["fastest_m_s"]:.0f} mm/s, ≤ {got["highest_n"]:.0f} N, ranges '

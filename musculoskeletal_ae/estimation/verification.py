@@ -59,9 +59,7 @@ USUAL_BIAS = 30.0  # T_bias for which the tensions below apply; for other arms t
 CLOSE = 8.0  # absolute tolerance of T relative to T_ref [N]
 SHARE = 0.35  # relative tolerance, as a share of T_ref − T_bias
 TIGHT = 20.0  # excess over T_ref that shows a jam although the suspect was not wound in [N]
-STRETCHED = (
-    1.5  # stretch of a healthy tendon at which it has tension, as a multiple of that at T_bias
-)
+STRETCHED = 1.5  # multiple of the stretch at T_bias at which a healthy tendon has tension
 LONGEST_WINDING = 2.5  # [s] for which a slack tendon is wound in, at most
 BEHIND = 0.005  # decrease of a position command that a healthy module follows [m]
 STANDS = 0.0005  # largest motion of a jammed muscle module [m]

@@ -6,8 +6,8 @@ error hardly rose when a 3.6 kg dumbbell was grasped. When muscle #2 was deactiv
 learning but hardly before.
 
 Here. The networks before and after learning process one recording: the held-out motion, with 3.6 kg
-in the hand from its middle on. Then, with the payload, every muscle in turn ruptures for 3 s and is
-repaired. A muscle ruptures when it carries more than 10 N above T_bias, after a wait of at most 14 s.
+in the hand from its middle on. Then, with the payload, every muscle in turn ruptures for 3 s and
+is repaired. A muscle ruptures when it carries more than 10 N above T_bias, after at most 14 s.
 A muscle that never does ruptures at the end of the wait; it is shown in grey and not counted.
 Messages pass one by one through the detector of the estimator node. A rupture is detected by the
 first alarm that starts after it; an undetected rupture counts with 3 s. It is named correctly if

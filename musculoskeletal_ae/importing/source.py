@@ -121,7 +121,7 @@ class Source:
         if (size := np.linalg.norm(axis)) < 1e-9:
             raise ValueError(f'joint {name}: expected a direction as its axis')
         if self.model.existJointName(name):
-            raise ValueError(f'joint {name}: expected a name that no other has, nor pinocchio')
+            raise ValueError(f'joint {name}: expected a unique name that pinocchio does not use')
         low, high = (np.array([limit]) for limit in self.limited(name, slides, *limits))
         most = np.full(1, 1e3)
         joint: int = self.model.addJoint(parent, kind(axis / size), at, name, most, most, low, high)

@@ -36,7 +36,7 @@ class Limits(NamedTuple):
     temperature_step: float = 5.0
     temperature_rate: float = 50.0
     #: how far a length may exceed its range within the joint limits [m], because tendons wrap, are
-    #: wound up with slack, or are tied elsewhere; a slack tendon can be wound in further
+    #: wound in with slack, or are attached elsewhere; a slack tendon can be wound in further
     length_margin: float = 0.1
     slack_length_margin: float = 1.0
     #: a tendon with less than this share of T_bias is slack

@@ -8,12 +8,12 @@ time to wind in slack. The detector waits while the winch moves at `slack_speed`
 has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count.
 
 A module that follows positions maintains no tension, and a tendon may be slack because its command
-is long. The rule then looks for a tendon that is stretched and does not pull:
+is long. The rule then looks for a tendon that is stretched, but has no tension:
 
     T < slack_share · T_bias for DEAD_TIME, and l(θ, 0) − l > STRETCH · L_e(T_bias)
 
-θ is estimated from the tendons that are not slack. A tendon that ruptures while it carries nothing
-is found as soon as it should carry something.
+θ is estimated from the tendons that are not slack. A rupture of a tendon without load
+is detected as soon as the tendon should carry load.
 """
 
 import numpy as np
