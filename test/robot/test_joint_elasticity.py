@@ -31,6 +31,7 @@ from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
@@ -248,6 +249,17 @@ def test_springs_are_learned_from_rest_samples(springy):
     )
     assert off[0] < 0.15 * before[0]
     assert off.sum() < 0.35 * before.sum()
+
+
+def test_without_tensions_springs_stay_as_stated(springy):
+    modules = {'actuation': 'position', 'tension_source': 'none'}
+    robot = Robot(with_modules(springy.description, **modules))
+    true = springy.kinematics.elasticity.deviating(np.full(3, 0.5), np.full(3, 0.2))
+    body = CalibratedBody(robot)
+    fit_body(body, rests(springy.with_elasticity(true), 20))
+    stated = springy.kinematics.elasticity
+    np.testing.assert_allclose(body.elasticity.stiffness, stated.stiffness, rtol=1e-6)
+    np.testing.assert_allclose(body.elasticity.preload, stated.preload, rtol=1e-6)
 
 
 def test_an_update_publishes_learned_springs_and_control_uses_them(springy):
