@@ -196,7 +196,7 @@ class CheckpointKeeper:
             self._state.keep(self._samples, self.publication.checkpoint, changed)
 
     def save(self) -> Path:
-        """Save samples and network at once; return the state directory.
+        """Save samples and network at once, the network also as a checkpoint; return the directory.
 
         Raises:
             StateError: If there is no directory, or it cannot be written.

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Saves the learner's state to disk, so that nothing is lost if the learner is killed.
 
-    learner.state     the samples and the newest network
-    previous.state    the state before that, used if the newest one is unusable
-    backup-N.state    states that the user replaced or that were unusable
-    lock              locked by the learner that uses the directory
+    learner.state          the samples and the newest network
+    previous.state         the state before that, used if the newest one is unusable
+    backup-N.state         states that the user replaced or that were unusable
+    network.safetensors    the network of the last explicit save, as a checkpoint for other tools
+    lock                   locked by the learner that uses the directory
 
 Each save replaces the whole file atomically, and a checksum detects damage. To restore a state,
 copy its file to `learner.state` while no learner is running.
@@ -25,6 +26,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
+NETWORK = 'network.safetensors'
 LARGEST = (
     1 << 26
 )  # largest size of a state [bytes]; those of the shipped arms are 100 times smaller
@@ -87,8 +89,9 @@ class StateStore:
             raise
         self._lock = lock
         # Remove the temporary files of a learner that was killed while it saved.
-        for unfinished in self.directory.glob('.*.state.*'):
-            unfinished.unlink()
+        for pattern in ('.*.state.*', f'.{NETWORK}.*'):
+            for unfinished in self.directory.glob(pattern):
+                unfinished.unlink()
 
     def close(self) -> None:
         """Release the directory. No save is needed, because the newest state is on disk."""
@@ -169,15 +172,24 @@ class StateStore:
             self._next_attempt = now + RETRY_INTERVAL
 
     def save(self, samples: SampleStore, network: bytes | None) -> None:
-        """Save the state at once.
+        """Save the state at once, and the network as a checkpoint file of its own.
 
         Raises:
-            StateError: If the state cannot be saved.
+            StateError: If the state or the network cannot be saved.
         """
         self._next_attempt = 0.0
         self.keep(samples, network)
         if trouble := self.trouble(samples):
             raise StateError(trouble)
+        if network is None:
+            return
+        try:
+            write_whole(self.directory / NETWORK, network)
+        except OSError as error:
+            raise StateError(
+                f'samples and network are saved, but not the checkpoint {self.directory / NETWORK} '
+                f'({error}); free disk space and try again'
+            ) from error
 
     def trouble(self, samples: SampleStore) -> str:
         """Return why the newest state is not on disk and how many samples are missing, or ''."""

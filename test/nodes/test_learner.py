@@ -18,7 +18,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.learning.margin import MARGIN
-from musculoskeletal_ae.learning.state import NEWEST
+from musculoskeletal_ae.learning.state import NETWORK, NEWEST
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
@@ -162,6 +162,7 @@ def test_the_learner_publishes_and_saves_checkpoints_and_replaces_a_dead_trainin
     assert learner.report().level == 'ok'
     assert (Path(state) / NEWEST).exists()
     assert graph.call(Trigger, 'learner/save').success
+    assert checkpoint.load(Path(state) / NETWORK, arm26).version in versions(graph, arm26)
     first = learner.report().values['training process']
     os.kill(int(first), signal.SIGKILL)
     learner.learn(lambda: learner.report().values['training process restarts'] == '1', 'a notice')
