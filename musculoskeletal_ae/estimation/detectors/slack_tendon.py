@@ -29,7 +29,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 #: stretch of a tendon without tension that shows a rupture, as a multiple of that at T_bias: with
 #: healthy statistics of the real arm, and without. Healthy slack tendons of networks that have not
 #: learned the arm seem to be stretched by up to 1.5.
-STRETCH, UNCALIBRATED = 0.8, 3.0
+STRETCH, UNCALIBRATED = 1.5, 3.0
 DEAD_TIME = 0.5  # [s] without tension after which a muscle is reported
 
 
