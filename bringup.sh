@@ -5,7 +5,15 @@
 # "The system" at the end starts the nodes with their parameters.
 set -u
 unset CDPATH # otherwise cd may print the directory
-repository=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd -P) || exit 1
+here=$(cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")" && pwd -P) || exit 1
+if [ -e "$here/setup.py" ]; then
+  repository=$here
+  is_installed=false
+else
+  # Installed as lib/musculoskeletal_ae/bringup.sh: the sourced workspace has everything else.
+  repository=$(cd "$here/../../share/musculoskeletal_ae" && pwd -P) || exit 1
+  is_installed=true
+fi
 
 usage() {
   cat <<'EOF'
@@ -172,7 +180,18 @@ robot_directory=$repository/config/$robot
 
 # shellcheck source=.ci/environment.sh
 . "$repository/.ci/environment.sh"
-environment_setup
+package=$repository/musculoskeletal_ae
+log_folder=$repository/log
+if [ $is_installed = true ]; then
+  python=$(command -v python3)
+  executables=$here
+  package=$("$python" -c 'import musculoskeletal_ae; print(musculoskeletal_ae.__path__[0])') ||
+    fail 'Source the workspace in which musculoskeletal_ae is installed, and its virtual environment.'
+  log_folder=${ROS_LOG_DIR:-${ROS_HOME:-$HOME/.ros}/log}
+  mkdir -p "$log_folder" || exit 1
+else
+  environment_setup
+fi
 
 # Keep an emulated arm off the network. A driver may run on another machine.
 if [ $hardware = false ] && [ $network = false ]; then
@@ -190,7 +209,7 @@ flock -w 5 "$arm_lock" ||
   refuse "namespace '/$namespace' is in use by another bringup.sh (ROS_DOMAIN_ID ${ROS_DOMAIN_ID:-0}):\
  stop that one, or give this one a --namespace of its own"
 
-logs=$(mktemp -d "$repository/log/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
+logs=$(mktemp -d "$log_folder/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
 export ROS_LOG_DIR=$logs
 say "logs in $logs"
 
@@ -270,7 +289,6 @@ trap 'exit 129' HUP
 # Sets $checkpoint. The name of the file contains a hash of everything that determines the network.
 train_once() {
   local cache=${XDG_CACHE_HOME:-${HOME:-$repository}/.cache}/musculoskeletal_ae hash
-  local package=$repository/musculoskeletal_ae
   mkdir -p "$cache" || exit 1
   hash=$(
     find "$robot_directory"/{robot.urdf,muscles.yaml} "$package"/{robot,mae,presets,paper} \

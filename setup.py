@@ -47,6 +47,14 @@ def config_files() -> list[tuple[str, list[str]]]:
     return list(folders.items())
 
 
+def bag_files() -> list[tuple[str, list[str]]]:
+    """List the shipped recordings, each a directory of its own under share/."""
+    folders = sorted({file.parent for file in Path('bags').glob('*/metadata.yaml')})
+    listed = [(folder.as_posix(), sorted(folder.iterdir())) for folder in folders]
+    listed.append(('bags', [Path('bags/README.md')]))
+    return [(f'share/{NAME}/{to}', [file.as_posix() for file in files]) for to, files in listed]
+
+
 NEEDED = requirements()
 setup(
     name=NAME,
@@ -56,6 +64,10 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
+        # `ros2 run musculoskeletal_ae bringup.sh`; the other file has functions that it uses.
+        (f'lib/{NAME}', ['bringup.sh']),
+        (f'share/{NAME}/.ci', ['.ci/environment.sh']),
+        *bag_files(),
         *config_files(),
     ],
     install_requires=NEEDED.pop(''),

@@ -43,6 +43,7 @@ TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
 TEACHING_RATE = 50.0  # [Hz]
 TAUGHT = ',muscle_tension_command,estimated_joint_states,joint_trajectory'
 LEFT_OUT = ',anomaly_detected,isolated_muscles,target_joint_states'  # of `isolation`
+ANOMALY = ',anomaly,anomaly_detected'  # of `rupture`: A before and after the muscle is cut
 PUSHED = 'hardware_emulator/external_wrench'
 POSTURE = [0.2, -0.6, 0.1, -1.2, 0.0]  # [rad]
 
@@ -206,7 +207,7 @@ PUSHES = ((15.0, 0.0, 10.0), (0.0, 0.0, 0.0), (-10.0, 8.0, 12.0), (0.0, 0.0, 0.0
 #: recorded motion, random seed of the exploration, and further topics
 RECORDINGS: dict[str, tuple[Callable[[Arm], None], int | None, str]] = {
     'exploration': (exploration, 101, ''),
-    'rupture': (rupture, 102, ''),
+    'rupture': (rupture, 102, ANOMALY),
     'faults': (faults, 103, ''),
     'teaching': (teaching, None, f'{TAUGHT},{PUSHED}'),
     'isolation': (isolation, 104, LEFT_OUT),

@@ -31,7 +31,7 @@ from musculoskeletal_ae.mae.training import initial_mae, random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, visible
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper
-from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS
+from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -210,7 +210,8 @@ def eager_proposed_paper(
         lengths = network.decode(latent)[:, -muscles:] / LENGTH_SCALE
         jacobian = (lengths[1:] - lengths[0]) / step / TENSION_SCALE  # (D, M), acts on scaled T
         z, aim, load = latent[0], _tensor(theta), _tensor(torque)
-        steps = torch.linspace(0.0, paper.SEARCH.largest_step, paper.SEARCH.candidates + 1)
+        count = paper.SEARCH.candidates
+        steps = paper.SEARCH.largest_step * torch.arange(count) / count
 
     def loss(y: Tensor) -> Tensor:
         pull = y[..., joints : joints + muscles]
@@ -218,7 +219,7 @@ def eager_proposed_paper(
         return (
             tension_weight * pull.norm(dim=-1)
             + posture_weight * (y[..., :joints] - aim).norm(dim=-1)
-            + torque_weight * (load + pull @ jacobian.T).norm(dim=-1)
+            + torque_weight * TORQUE_UNITS * (load + pull @ jacobian.T).norm(dim=-1)
         )
 
     for _ in range(paper.SEARCH.epochs):

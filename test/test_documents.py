@@ -122,7 +122,7 @@ def test_options_and_executables_that_the_documents_name_exist():
         if line.startswith('./bringup.sh'):
             for option in re.findall(r' (--[\w-]+)', line):
                 assert f'{option} ' in bringup, line
-        for name in re.findall(r'(?:\$bin/|ros2 run musculoskeletal_ae )(\w+)', line):
+        for name in re.findall(r'(?:\$bin/|ros2 run musculoskeletal_ae )([\w.]+)', line):
             assert f"'{name}'" in setup, line
 
 
@@ -148,3 +148,15 @@ def test_no_two_commands_of_the_documents_write_to_the_same_place():
             for made in MAKES.findall(command.line):
                 makers.setdefault(made.rstrip('/'), []).append((page, command.line))
     assert {place: pages for place, pages in makers.items() if len(pages) > 1} == {}
+
+
+def test_every_symbol_that_the_audit_of_the_paper_names_exists():
+    text = (ROOT / 'notes' / 'paper_audit.md').read_text('utf-8')
+    rows = re.findall(r'^\| (\d+) \|.*\| (exact|open|deviation) \| \w* ?\|$', text, re.M)
+    assert [int(number) for number, _ in rows] == list(range(1, 111))
+    named = re.findall(r'`([\w/]+\.py):(\w+)`', text)
+    assert len(named) > 90
+    for file, symbol in named:
+        source = (ROOT / 'musculoskeletal_ae' / file).read_text('utf-8')
+        defined = rf'^\s*(?:def|class) {symbol}\b|^(?:[A-Z_]+, )*{symbol}\b[^\n]*='
+        assert re.search(defined, source, re.M), f'{file}:{symbol}'

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from functools import cache
+from importlib import import_module
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -108,3 +109,15 @@ def test_the_example_learns_without_ros(tmp_path):
     before, after = (float(word) for word in done.stdout.split() if word.startswith('0.'))
     assert after < before
     assert (tmp_path / 'a.safetensors').exists()
+
+
+def test_bringup_and_the_recordings_are_installed_with_the_package(monkeypatch):
+    import_module('setuptools')  # provides distutils where Python has none
+    core = import_module('distutils.core')
+    monkeypatch.chdir(ROOT)
+    files = dict(core.run_setup('setup.py', stop_after='init').data_files)
+    assert files['lib/musculoskeletal_ae'] == ['bringup.sh']
+    assert files['share/musculoskeletal_ae/.ci'] == ['.ci/environment.sh']
+    installed = {name for names in files.values() for name in names}
+    recordings = {file.as_posix() for file in Path('bags').glob('*/*')}
+    assert recordings and recordings <= installed

@@ -9,8 +9,11 @@ NAMES = (
     'simulation',
     'loss_change',
     'body_change',
+    'layers',
     'motion',
     'resilience',
     'robustness',
     'sensors',
 )
+#: those that repeat an experiment or a statement of the paper
+PAPER = NAMES[:7]

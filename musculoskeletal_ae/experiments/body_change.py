@@ -7,16 +7,25 @@ from linear to strongly curved, which the paper attributes to wear of #2’s ela
 friction in #6.
 
 Here. The figures show l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0.
-They compare ① of the network before and after learning with the true body. All other joints are at
-θ = 0, even where this lies outside a joint’s limits (by 5° at the elbow). "Shape" is the error of a
-curve after subtracting its mean difference from the true curve. "Worn" is the first individual with
-a worn series elastic element at #2 and high tendon friction at #6, which explores and learns again.
+They compare ① of both presets' networks before and after learning with the true body. All other
+joints are at θ = 0, even where this lies outside a joint’s limits (by 5° at the elbow). The
+shoulder's lower limit is −70°, so that networks extrapolate from there to −120°. "Change" is the
+largest difference of a muscle's curve before and after learning; a "relative" change compares l −
+l(0), because the printed curves pass the origin. "True change" is the difference between the true
+body and its model, which a perfect learner would find. "Model error" is the error of the initial
+network on its own model. "Excursion" is the range of a muscle's length over the joint's limits.
+"Nonlinearity" is the largest distance of l(T) from its chord, relative to its span. "Shape" is the
+error of a curve after subtracting its mean difference from the true curve. "Worn" is the first
+individual with a worn series elastic element at #2 and high tendon friction at #6, which explores
+and learns again.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments import plots
@@ -37,7 +46,7 @@ POINTS = 101  # points of the tension curves
 COLUMNS = 5  # of plots
 WORN = 0.5  # factor of the stiffening rate of the worn element
 WORN_FRICTION = 0.4  # capstan exponent of the tendon with high friction (mean of others: 0.1)
-LABELS = {'before': 'before learning', 'after': 'after learning', 'true': 'true body'}
+SMALL = 1e-9  # [m]
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -59,30 +68,88 @@ def measure(study: Study, seed: int) -> Measured:
         'angle': (np.degrees(SWEEP), inside, swept, no_tension),
         'tension': (tension, within, at_zero, stretched),
     }
-    traces: dict[str, Any] = {}
+    traces: dict[str, Any] = {name: {} for name in sweeps}
     numbers: dict[str, Any] = {'joint': robot.joints[joint]}
-    for name, (x, trained, *points) in sweeps.items():
-        curves = {when: mae.lengths(*points) for when, mae in study.networks(seed).items()}
-        curves['true'] = true.muscle_lengths(*points)
-        traces[name] = x, trained, curves
-        change = 1e3 * np.abs(curves['after'] - curves['before'])[trained].max(axis=0)
-        numbers[f'{name}_change_mm'] = dict(zip(robot.muscles, change.tolist(), strict=True))
-        for when in plots.WHEN:
-            # Each curve has its own offset, so compare only the shapes.
-            off = (curves[when] - curves['true'])[trained]
-            shape = 1e3 * (off - off.mean(axis=0)).std(axis=0)
-            numbers[f'{name}_{when}_shape_mm'] = float(shape.mean())
+    for preset in study.presets:
+        networks, values = study.networks(seed, preset), dict[str, Any]()
+        for name, (x, trained, *points) in sweeps.items():
+            curves = {when: mae.lengths(*points) for when, mae in networks.items()}
+            curves['true'] = true.muscle_lengths(*points)
+            traces[name][preset] = x, trained, curves
+            origin = int(np.abs(x).argmin())
+            values |= _changes(robot, name, origin, trained, curves)
+            off = curves['before'] - robot.muscle_lengths(*points)
+            values[f'{name}_model_error_mm'] = _by_muscle(robot, (off - off[origin])[trained])
+        numbers |= study.with_prefix(preset, values)
+    model = robot.muscle_lengths(swept, no_tension)
+    deviation = true.muscle_lengths(swept, no_tension) - model
+    deviation -= deviation[np.abs(SWEEP).argmin()]
+    # What a perfect learner would change, and how far each muscle moves at all.
+    numbers['angle_true_change_mm'] = _by_muscle(robot, deviation[inside])
+    numbers['angle_true_change_all_mm'] = _by_muscle(robot, deviation)
+    excursion = 1e3 * np.ptp(model[inside], axis=0)
+    numbers['angle_excursion_mm'] = dict(zip(robot.muscles, excursion.tolist(), strict=True))
     if seed == study.seeds[0]:
         arm = worn_arm(robot, seed)
         learner, loop = new_learner_and_loop(study, arm, seed, study.preset)
         teach(learner, explore(loop, learner, 60.0 * study.minutes))
-        changed = {
-            'before': traces['tension'][2]['before'],
+        worn = {
+            'before': traces['tension'][study.preset][2]['before'],
             'after': learner.mae.lengths(at_zero, stretched),
             'true': arm.individual.muscle_lengths(at_zero, stretched),
         }
-        traces['worn'] = tension, within, changed
+        for when, curve in worn.items():
+            bend = nonlinearity(curve).tolist()
+            numbers[f'worn_nonlinearity_{when}'] = dict(zip(robot.muscles, bend, strict=True))
+        traces['worn'] = {study.preset: (tension, within, worn)}
     return Measured(numbers, traces)
+
+
+def _changes(
+    robot: Robot, name: str, origin: int, trained: Bools, curves: Mapping[str, Array]
+) -> dict[str, Any]:
+    """Return the numbers of the curves (points, M) of one sweep [m], named `angle` or `tension`.
+
+    A change is the largest one of each curve; "relative" is that of l − l(origin), because the
+    printed curves pass the origin. "All" takes the printed range, and otherwise the trained range
+    counts.
+    """
+    change = curves['after'] - curves['before']
+    relative = change - change[origin]
+    numbers: dict[str, Any] = {
+        f'{name}_change_mm': _by_muscle(robot, change[trained]),
+        f'{name}_change_all_mm': _by_muscle(robot, change),
+        f'{name}_relative_change_mm': _by_muscle(robot, relative[trained]),
+        f'{name}_relative_change_all_mm': _by_muscle(robot, relative),
+    }
+    for when in plots.WHEN:
+        # Each curve has its own offset, so compare only the shapes.
+        off = (curves[when] - curves['true'])[trained]
+        shape = 1e3 * (off - off.mean(axis=0)).std(axis=0)
+        numbers[f'{name}_{when}_shape_mm'] = float(shape.mean())
+        numbers[f'{name}_{when}_origin_mm'] = float(1e3 * np.abs(curves[when][origin]).max())
+    if name == 'tension':
+        for when, curve in curves.items():
+            bend = nonlinearity(curve)
+            numbers[f'nonlinearity_{when}'] = dict(zip(robot.muscles, bend.tolist(), strict=True))
+    return numbers
+
+
+def _by_muscle(robot: Robot, change: Array) -> dict[str, float]:
+    """Return the largest absolute change (points, M) [m] of each muscle [mm], by its name."""
+    largest = 1e3 * np.abs(change).max(axis=0)
+    return dict(zip(robot.muscles, largest.tolist(), strict=True))
+
+
+def nonlinearity(curve: Array) -> Array:
+    """Return the largest distance of curves (points, M) from their chords, relative to their span.
+
+    It is 0 for a straight line.
+    """
+    share = np.linspace(0.0, 1.0, len(curve))[:, None]
+    chord = curve[0] + share * (curve[-1] - curve[0])
+    bend: Array = np.abs(curve - chord).max(axis=0) / np.maximum(np.ptp(curve, axis=0), SMALL)
+    return bend
 
 
 def worn_arm(robot: Robot, seed: int) -> EmulatedArm:
@@ -112,10 +179,13 @@ def length_against_tension(study: Study, rows: Rows) -> Plot:
     )
 
 
-def worn_muscles(study: Study, rows: Rows) -> Plot:
-    """Draw l over the tension of the individual with worn muscles."""
+def worn_muscles(study: Study, rows: Rows) -> Plot | None:
+    """Draw l over the tension of the individual with worn muscles, if it was measured."""
     title = 'muscle length at θ = 0, #2 worn, #6 with high friction'
-    return _panels(study, rows, 'worn', 'T [N]', title), (
+    figure = _panels(study, rows, 'worn', 'T [N]', title)
+    if figure is None:
+        return None
+    return figure, (
         'Muscle length against tension at θ = 0, before and after learning, for an individual '
         'with a worn series elastic element in muscle 2 '
         f'({WORN:g} × its stiffening rate) and high tendon friction in muscle 6 (capstan exponent '
@@ -125,27 +195,46 @@ def worn_muscles(study: Study, rows: Rows) -> Plot:
 
 def _panels(study: Study, rows: Rows, name: str, xlabel: str, title: str) -> Any:
     (seed, row), robot = first_individual(rows), study.robot
-    x, trained, curves = row.traces[name]
+    if name not in row.traces:
+        return None
+    by_preset = row.traces[name]
     count = min(COLUMNS, robot.muscle_count)
     height = -(-robot.muscle_count // count)
-    size = 2.6 * count + 0.6, 2.4 * height + 0.9
+    size = 2.6 * count + 0.6, 2.4 * height + 1.1
     figure, panels = plots.new_figure(*size, height, count, sharex=True)
     for panel in panels[robot.muscle_count :]:
         panel.set_axis_off()
     for m, (muscle, panel) in enumerate(zip(robot.muscles, panels)):
-        for when, label in LABELS.items():
-            y, width = 1e3 * curves[when][:, m], 1.0 if when == 'true' else 1.8
-            style = {'color': plots.WHEN.get(when, plots.TRUE), 'lw': width}
-            panel.plot(x, y, ls=':', **style)
-            panel.plot(x, np.where(trained, y, np.nan), label=label if m == 0 else None, **style)
+        lines = [
+            (f'{preset}, {when} learning', preset, when, x, trained, curves[when])
+            for preset, (x, trained, curves) in by_preset.items()
+            for when in plots.WHEN
+        ]
+        x, trained, curves = by_preset[study.preset]
+        for label, preset, when, *_, curve in [
+            *lines,
+            ('true body', study.preset, 'true', x, trained, curves['true']),
+        ]:
+            style = _line_style(study, preset, when)
+            y = 1e3 * curve[:, m]
+            panel.plot(x, y, **(style | {'ls': ':', 'lw': 0.8}))
+            panel.plot(x, np.where(trained, y, np.nan), label='' if m else label, **style)
         lowest = m + count >= robot.muscle_count
         ylabel = 'l [mm]' if m % count == 0 else ''
-        plots.tidy(panel, xlabel if lowest else '', ylabel, f'{m + 1} {muscle}')
+        plots.tidy(panel, xlabel if lowest else '', ylabel, f'#{m + 1} {muscle}')
         panel.title.set_fontsize(9)
         panel.tick_params(labelbottom=lowest)
-    figure.legend(loc='outside lower center', ncols=3, fontsize=9)
+    figure.legend(loc='outside lower center', ncols=5, fontsize=9)
     figure.suptitle(f'individual {seed}: {title}')
     return figure
+
+
+def _line_style(study: Study, preset: str, when: str) -> dict[str, Any]:
+    """Return the style of a curve: colour by time, dashes by preset."""
+    if when == 'true':
+        return {'color': plots.TRUE, 'lw': 1.0, 'ls': '-'}
+    dashes = '-' if preset == study.preset else '--'
+    return {'color': plots.WHEN[when], 'lw': 1.6, 'ls': dashes}
 
 
 PLOTS = (length_against_angle, length_against_tension, worn_muscles)

@@ -116,7 +116,10 @@ def measure(study: Study, seed: int) -> Measured:
     networks = {'default': study.network(seed), AS_PRINTED: study.network(seed, AS_PRINTED)}
     ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
-    numbers: dict[str, Any] = {'qp_bound_n': float(ended.bound.mean())}
+    numbers: dict[str, Any] = {
+        'qp_bound_n': float(ended.bound.mean()),
+        'targets': len(ended.target),
+    }
     for name, tension in ended.tension.items():
         offset, there = ended.offset[name], ended.bound_there[name]
         common, held = offset.mean(axis=1, keepdims=True), np.isfinite(there)

@@ -5,24 +5,25 @@ Paper (§IV-B). The same motions are estimated before and after learning: 0.414 
 error hardly rose when a 3.6 kg dumbbell was grasped. When muscle #2 was deactivated, A rose after
 learning but hardly before.
 
-Here. The networks before and after learning process one recording: the held-out motion, with 3.6 kg
-in the hand from its middle on. Then, with the payload, every muscle in turn ruptures for 3 s and
-is repaired. A muscle ruptures when it carries more than 10 N above T_bias, after at most 14 s.
-A muscle that never does ruptures at the end of the wait; it is shown in grey and not counted.
-Messages pass one by one through the detector of the estimator node. A rupture is detected by the
-first alarm that starts after it; an undetected rupture counts with 3 s. It is named correctly if
-the muscle is the suspect in that message. In a second recording, with 20 s of motion before and 20
-s after the grasp, every muscle in turn is switched off instead, as in the paper ("switched off"):
-its module is commanded zero tension for 3 s, and its tendon stays intact. Healthy messages are
-those of the held-out motion and of another motion in which the payload is grasped and released
-every minute, one hour in total over all individuals. False alarms are alarms that start in the
-latter. AUROC compares d of healthy messages with d of messages from 0.1 s after a rupture on.
+Here. The networks of both presets before and after learning process one recording: the held-out
+motion, with 3.6 kg in the hand from its middle on. Then, with the payload, every muscle in turn
+ruptures for 3 s and is repaired. A muscle ruptures when it carries more than 10 N above T_bias,
+after at most 14 s. A muscle that never does ruptures at the end of the wait; it is shown in grey
+and not counted. Messages pass one by one through the detector of the estimator node. A rupture is
+detected by the first alarm that starts after it; an undetected rupture counts with 3 s. It is named
+correctly if the muscle is the suspect in that message. In a second recording, with 20 s of motion
+before and 20 s after the grasp, every muscle in turn is switched off instead, as in the paper
+("switched off"): its module is commanded zero tension for 3 s, and its tendon stays intact. Healthy
+messages are those of the held-out motion and of another motion in which the payload is grasped and
+released every minute, one hour in total over all individuals. False alarms are alarms that start in
+the latter. AUROC compares d of healthy messages with d of messages from 0.1 s after a rupture on.
 "Threshold" is the detector’s threshold of d. A and d "ruptured min" are the smallest median, over
-muscles, during a rupture. Preset `paper` decides on A alone.
+muscles, during a rupture. Preset `paper` decides by A instead of d; the detectors of the node that
+do not use the network (frozen sensors, heat) find nothing in these recordings.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from musculoskeletal_ae.experiments.baselines import baseline_errors
 from musculoskeletal_ae.experiments.detection import (
     PAYLOAD,
     RUPTURE_TIME,
+    DetectorOutput,
     GraspAndRupture,
     anomaly_levels,
     detection,
@@ -41,6 +43,7 @@ from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     SAMPLE_TIME,
     Motion,
+    Recording,
     estimation_error,
     mean_error,
     record,
@@ -56,7 +59,6 @@ from musculoskeletal_ae.experiments.study import (
     Study,
     first_individual,
 )
-from musculoskeletal_ae.presets.registry import AS_PRINTED
 
 HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0  # [s] of motion for false alarms, over all individuals
@@ -71,8 +73,7 @@ OFF_KEYS = ('detection_s', 'detected_share', 'named_share')  # reported for swit
 
 def measure(study: Study, seed: int) -> Measured:
     """Return the results and traces of one individual."""
-    robot, networks = study.robot, study.networks(seed)
-    printed = study.network(seed, AS_PRINTED)
+    robot = study.robot
     plan = GraspAndRupture(robot, study.held_out_time, seed)
     driven_by = study.network(None, 'default')
     faulty = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
@@ -81,6 +82,66 @@ def measure(study: Study, seed: int) -> Measured:
     healthy = record(study.arm(seed), driven_by, stream, duration, grasp_and_release)
     plan_off = GraspAndRupture(robot, OFF_TIME, seed, switched_off=True)
     switched_off = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan_off.duration, plan_off)
+    recordings = Recordings(plan, faulty, healthy, plan_off, switched_off)
+    numbers, outputs, off_outputs = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+    for preset in study.presets:
+        values, outputs[preset], off_outputs[preset] = _preset(study, seed, preset, recordings)
+        numbers |= study.with_prefix(preset, values)
+    held_out = study.stream(seed, 'held_out')
+    for when, mae in study.networks(seed).items():
+        numbers[f'{when}_held_out_rad'] = estimation_error(mae, held_out)
+    exploring = study.stream(seed, 'exploring')
+    numbers['baselines'] = baseline_errors(robot, study.rests(seed), exploring, held_out)
+    second = plan_off.order[0]
+    at = float(plan_off.rupture[second]) + 0.9 * RUPTURE_TIME
+    moments = MOMENTS | {f'#{second + 1} switched off': at}
+    steps = [round(time / SAMPLE_TIME) for time in moments.values()]
+    postures = {'arm': switched_off.theta}
+    for preset, by_time in off_outputs.items():
+        postures |= {f'{preset}, {when} learning': out.theta for when, out in by_time.items()}
+    tension = switched_off.tension[steps]
+    end = rows_between(0.0, float(plan_off.rupture[second]) + RUPTURE_TIME + PLOT_TAIL)
+    traces = {
+        'moments': list(moments),
+        'motions': {name: Motion(theta[steps], tension) for name, theta in postures.items()},
+        'theta': faulty.theta,
+        'outputs': outputs[study.preset],
+        'grasp': plan.grasp,
+        'first_ruptured': robot.muscles[plan.order[0]],
+        'rupture': float(plan.rupture[plan.order[0]]),
+        'off': {
+            'theta': switched_off.theta[end],
+            'outputs': {
+                preset: {when: (out.theta[end], out.anomaly[end]) for when, out in by_time.items()}
+                for preset, by_time in off_outputs.items()
+            },
+            'grasp': plan_off.grasp,
+            'muscle': f'#{second + 1} {robot.muscles[second]}',
+            'start': float(plan_off.rupture[second]),
+        },
+    }
+    return Measured(numbers, traces)
+
+
+class Recordings(NamedTuple):
+    """What the networks of both presets process."""
+
+    plan: GraspAndRupture
+    faulty: Recording  # of `plan`
+    healthy: Recording
+    plan_off: GraspAndRupture
+    switched_off: Recording  # of `plan_off`
+
+
+def _preset(
+    study: Study, seed: int, preset: str, recordings: Recordings
+) -> tuple[dict[str, Any], dict[str, DetectorOutput], dict[str, DetectorOutput]]:
+    """Return a preset's numbers, and its outputs for the ruptures and for the switched-off muscles.
+
+    Outputs are by `before` and `after` learning.
+    """
+    robot, networks = study.robot, study.networks(seed, preset)
+    plan, faulty, healthy, plan_off, switched_off = recordings
     outputs, healthy_outputs, off_outputs = (
         {when: run_detector(robot, mae, recording) for when, mae in networks.items()}
         for recording in (faulty, healthy, switched_off)
@@ -95,34 +156,15 @@ def measure(study: Study, seed: int) -> Measured:
     numbers |= anomaly_levels(plan_off, off_outputs, healthy_outputs, OFF)
     numbers |= anomaly_levels(plan, outputs, healthy_outputs, 'ruptured')
     numbers['auroc'] = numbers['d_ruptured_auroc']
+    for prefix in ('a_before', 'a'):  # the muscle that the paper deactivated
+        level, healthy_median = numbers[f'{prefix}_{OFF}'], numbers[f'{prefix}_healthy_median']
+        numbers[f'{prefix}_{OFF}_second'] = level[plan_off.order[0]]
+        numbers[f'{prefix}_{OFF}_second_ratio'] = level[plan_off.order[0]] / healthy_median
     mae, healthy_after = networks['after'], healthy_outputs['after']
     off_numbers = detection(robot, plan_off, off_outputs['after'], healthy_after, mae)
     numbers |= {f'{OFF}_{key}': off_numbers[key] for key in OFF_KEYS}
     numbers |= detection(robot, plan, outputs['after'], healthy_after, mae)
-    by_a, healthy_by_a = (run_detector(robot, printed, each) for each in (faulty, healthy))
-    numbers |= study.with_prefix(AS_PRINTED, detection(robot, plan, by_a, healthy_by_a, printed))
-    held_out = study.stream(seed, 'held_out')
-    for when, mae in networks.items():
-        numbers[f'{when}_held_out_rad'] = estimation_error(mae, held_out)
-    exploring = study.stream(seed, 'exploring')
-    numbers['baselines'] = baseline_errors(robot, study.rests(seed), exploring, held_out)
-    second = plan_off.order[0]
-    at = float(plan_off.rupture[second]) + 0.9 * RUPTURE_TIME
-    moments = MOMENTS | {f'#{second + 1} switched off': at}
-    steps = [round(time / SAMPLE_TIME) for time in moments.values()]
-    postures = {'arm': switched_off.theta}
-    postures |= {f'{when} learning': output.theta for when, output in off_outputs.items()}
-    tension = switched_off.tension[steps]
-    traces = {
-        'moments': list(moments),
-        'motions': {name: Motion(theta[steps], tension) for name, theta in postures.items()},
-        'theta': faulty.theta,
-        'outputs': outputs,
-        'grasp': plan.grasp,
-        'first_ruptured': robot.muscles[plan.order[0]],
-        'rupture': float(plan.rupture[plan.order[0]]),
-    }
-    return Measured(numbers, traces)
+    return numbers, outputs, off_outputs
 
 
 def _plot_range(trace: Mapping[str, Any]) -> tuple[slice, Any]:
@@ -167,6 +209,42 @@ def grasp_and_cut(_: Study, rows: Rows) -> Plot:
         'Estimation error, anomaly A, and the distance d on which the detector decides, for '
         f'the same recording before and after learning. The arm grasps {PAYLOAD:g} kg (dashed); '
         f'then {ruptured} ruptures (yellow) and is repaired.'
+    )
+
+
+def deactivated(_: Study, rows: Rows) -> Plot:
+    """Draw the error and A while the second muscle is switched off, a column for each preset."""
+    seed, row = first_individual(rows)
+    off = row.traces['off']
+    theta, by_preset = off['theta'], off['outputs']
+    figure, panels = plots.new_figure(
+        6.0 * len(by_preset), 5.4, 2, len(by_preset), sharex=True, sharey='row'
+    )
+    time, start = times(len(theta)), off['start']
+    for column, (preset, outputs) in enumerate(by_preset.items()):
+        upper, lower = both = panels[column :: len(by_preset)]
+        for panel in both:
+            panel.set_yscale('log')
+            panel.axvline(off['grasp'], color=plots.MARK, ls='--', lw=1)
+            panel.axvspan(start, start + RUPTURE_TIME, color='#F0E442', alpha=0.5, lw=0)
+        for when, (estimated, anomaly) in outputs.items():
+            style: dict[str, Any] = {
+                'color': plots.WHEN[when],
+                'lw': 1,
+                'label': f'{when} learning',
+            }
+            error = np.linalg.norm(estimated - theta, axis=1)
+            plots.line(upper, time, error, 25, **style)
+            plots.line(lower, time, anomaly, **style)
+        ylabels = ('‖θ_est − θ‖ [rad], 0.25 s mean', 'A [scaled units]')
+        plots.tidy(upper, '', '' if column else ylabels[0], f'preset {preset}')
+        plots.tidy(lower, 'time [s]', '' if column else ylabels[1])
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside lower center', ncols=2, fontsize=9)
+    figure.suptitle(f'individual {seed}')
+    return figure, (
+        f'Estimation error and A as in the paper: the arm grasps {PAYLOAD:g} kg (dashed), then '
+        f'{off["muscle"]} is switched off (yellow).'
     )
 
 
@@ -271,5 +349,5 @@ def baselines(study: Study, rows: Rows) -> Plot:
     )
 
 
-PLOTS = (appearance, grasp_and_cut, tracking, cuts, baselines)
-EXPERIMENT = Experiment(__doc__, measure, PLOTS, 7.0)
+PLOTS = (appearance, deactivated, grasp_and_cut, tracking, cuts, baselines)
+EXPERIMENT = Experiment(__doc__, measure, PLOTS, 11.0)

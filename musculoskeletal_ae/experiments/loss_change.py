@@ -5,13 +5,16 @@ Paper (§IV-D). The elbow is bent to 90°, −50 N in z and 50 N in y act on the
 forced to 30°.
 
 Here. The elbow is flexed to 90°. A force of −50 N in z acts on the hand, then one of 50 N in y.
-Then the shoulder is forced to 30° and released. `proposed` computes the command that holds the
-posture, with the learned network. The same forces act on the emulated arm. Its joints cannot be
-forced, so only the simulator runs the last two phases. On robots without elbow_pitch and
-shoulder_pitch, joints named elbow and shoulder take their roles, or else the last and the first
-joint.
+Then the shoulder is forced to 30° and released. Each preset runs its own simulator on its networks
+before and after learning; with preset `paper`, L_sim,1 is minimised in the first three phases and
+L_sim,2 while the shoulder is forced. Each preset's `proposed` computes the command that holds the
+posture, with its learned network. The same forces act on an emulated arm with the same command.
+Its joints cannot be forced, so only the simulator runs the last two phases. On robots without
+elbow_pitch and shoulder_pitch, joints named elbow and shoulder take their roles, or else the last
+and the first joint.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +34,7 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -62,37 +66,63 @@ ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1  # step
 
 def measure(study: Study, seed: int) -> Measured:
     """Return the results and traces of one individual."""
-    robot, networks = study.robot, study.networks(seed)
+    robot = study.robot
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[elbow(robot)] = flexed(robot)
-    command = _command(robot, networks['after'], theta)
-    traces = {'arm': _run_arm(study.arm(seed), command)}
-    for when, mae in networks.items():
-        traces[when] = _run_simulator(Simulation(robot, mae, study.preset), robot, command)
-    numbers: dict[str, Any] = {
+    traces, numbers = dict[str, Any](), dict[str, Any]()
+    for preset in study.presets:
+        networks = study.networks(seed, preset)
+        command = _command(robot, networks['after'], theta, preset)
+        motions = {'arm': _run_arm(study.arm(seed), command)}
+        for when, mae in networks.items():
+            motions[when] = _run_simulator(Simulation(robot, mae, preset), robot, command)
+        traces[preset] = motions
+        numbers |= study.with_prefix(preset, _numbers(robot, motions))
+    numbers |= {
         'flexed_joint': robot.joints[elbow(robot)],
         'flexed_rad': float(theta[elbow(robot)]),
         'forced_joint': robot.joints[shoulder(robot)],
         'forced_rad': within(robot, shoulder(robot), FORCED),
     }
-    for phase, end in zip(PHASES, ENDS, strict=True):
-        numbers[phase.name] = {
-            who: {
-                'theta_rad': trace.theta[end].tolist(),
-                'tension_n': float(np.linalg.norm(trace.tension[end])),
-            }
-            for who, trace in traces.items()
-            if who != 'arm' or phase in SHARED
-        }
     return Measured(numbers, traces)
 
 
-def _command(robot: Robot, mae: Mae, theta: Array) -> Array:
-    """Return the lengths with which `proposed` holds a posture, by a network."""
+def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
+    """Return the state of arm and simulators at the end of each phase, by its name.
+
+    `flexed_rad` and `forced_rad` are the angles of the joint to flex and of the joint to force.
+    `error_rad` and `error_n` are the distances of a simulator from the arm.
+    """
+    numbers = dict[str, Any]()
+    for phase, end in zip(PHASES, ENDS, strict=True):
+        numbers[phase.name] = {}
+        for who, motion in motions.items():
+            theta, tension = motion.theta[end], motion.tension[end]
+            if who == 'arm' and phase not in SHARED:
+                continue
+            values = {
+                'theta_rad': theta.tolist(),
+                'flexed_rad': float(theta[elbow(robot)]),
+                'forced_rad': float(theta[shoulder(robot)]),
+                'tension_n': float(np.linalg.norm(tension)),
+            }
+            if who != 'arm' and phase in SHARED:
+                arm = motions['arm']
+                values['error_rad'] = float(np.linalg.norm(theta - arm.theta[end]))
+                values['error_n'] = float(np.linalg.norm(tension - arm.tension[end]))
+            numbers[phase.name][who] = values
+    return numbers
+
+
+def _command(robot: Robot, mae: Mae, theta: Array, preset: str) -> Array:
+    """Return the lengths with which a preset's `proposed` holds a posture, by a network."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
         return robot.muscle_lengths(theta, np.full(robot.muscle_count, robot.tension.bias))
     start = least_tension(robot.routes.muscle_jacobian(theta), torque, limits.bias, limits.limit)
+    method = preset_named(preset).length_methods().get('proposed')
+    if method is not None:
+        return method.command(robot, mae, theta, torque, start.tension).length
     return proposed(robot, mae, theta, torque, start.tension, limits.limit).length
 
 
@@ -133,33 +163,40 @@ def _phases(numbers: dict[str, Any]) -> list[str]:
 
 
 def loss_change(study: Study, rows: Rows) -> Plot:
-    """Draw joint angles and tensions over time."""
+    """Draw joint angles and tensions over time, a column for each preset."""
     (seed, row), robot = first_individual(rows), study.robot
-    figure, panels = plots.new_figure(12.0, 7.4, 2, sharex=True)
-    after, arm = row.traces['after'], row.traces['arm']
-    time = STEP * np.arange(len(after.theta))
+    presets = list(row.traces)
+    figure, panels = plots.new_figure(
+        5.6 * len(presets) + 2.4, 7.4, 2, len(presets), sharex=True, sharey='row'
+    )
+    time = STEP * np.arange(len(row.traces[presets[0]]['after'].theta))
     edges = np.cumsum([0.0, *(phase.duration for phase in PHASES)])
     shared = time < edges[len(SHARED)] - 1e-9
     degrees = [(*plot_unit(robot, joint), name) for joint, name in enumerate(robot.joints)]
     newtons = [(1.0, 'N', name) for name in robot.muscles]
-    for panel, key, lines in zip(panels, Motion._fields, (degrees, newtons), strict=True):
-        for i, (factor, unit, name) in enumerate(lines):
-            label = name if unit in ('deg', 'N') else f'{name} [{unit}]'
-            simulated = factor * getattr(after, key)[:, i]
-            panel.plot(time, simulated, color=f'C{i}', lw=1.6, label=label)
-            emulated = np.where(shared, factor * getattr(arm, key)[:, i], np.nan)
-            panel.plot(time, emulated, color=f'C{i}', lw=1.0, ls='--')
-        panel.plot([], [], color=plots.TRUE, lw=1.6, label='simulator after learning')
-        panel.plot([], [], color=plots.TRUE, lw=1.0, ls='--', label='emulated arm')
-        for edge in edges[1:-1]:
-            panel.axvline(edge, color='#BBBBBB', lw=1)
-        panel.set_xlim(0.0, edges[-1])
-    plots.tidy(panels[0], '', 'joint angle [deg]', legend='right')
-    plots.tidy(panels[1], 'time [s]', 'muscle tension [N]', legend='right')
-    style = {'ha': 'center', 'va': 'bottom', 'fontsize': 9}
-    for at, name in zip(0.5 * (edges[:-1] + edges[1:]), _phases(row.numbers), strict=True):
-        panels[0].text(at, 1.02, name, transform=panels[0].get_xaxis_transform(), **style)
-    figure.suptitle(f'individual {seed}')
+    for column, preset in enumerate(presets):
+        after, arm = row.traces[preset]['after'], row.traces[preset]['arm']
+        both = panels[column], panels[len(presets) + column]
+        for panel, key, lines in zip(both, Motion._fields, (degrees, newtons), strict=True):
+            for i, (factor, unit, name) in enumerate(lines):
+                label = name if unit in ('deg', 'N') else f'{name} [{unit}]'
+                simulated = factor * getattr(after, key)[:, i]
+                panel.plot(time, simulated, color=f'C{i}', lw=1.6, label=label)
+                emulated = np.where(shared, factor * getattr(arm, key)[:, i], np.nan)
+                panel.plot(time, emulated, color=f'C{i}', lw=1.0, ls='--')
+            panel.plot([], [], color=plots.TRUE, lw=1.6, label='simulator')
+            panel.plot([], [], color=plots.TRUE, lw=1.0, ls='--', label='emulated arm')
+            for edge in edges[1:-1]:
+                panel.axvline(edge, color='#BBBBBB', lw=1)
+            panel.set_xlim(0.0, edges[-1])
+        legend = 'right' if preset == presets[-1] else ''
+        ylabels = ('joint angle [deg]', 'muscle tension [N]') if column == 0 else ('', '')
+        plots.tidy(both[0], '', ylabels[0], f'preset {preset}\n\n', legend=legend)
+        plots.tidy(both[1], 'time [s]', ylabels[1], legend=legend)
+        style = {'ha': 'center', 'va': 'bottom', 'fontsize': 7}
+        for at, name in zip(0.5 * (edges[:-1] + edges[1:]), _phases(row.numbers), strict=True):
+            both[0].text(at, 1.02, name, transform=both[0].get_xaxis_transform(), **style)
+    figure.suptitle(f'individual {seed}: the simulator after learning')
     return figure, (
         'The simulator after learning while forces act on the hand and a joint is forced. '
         'Dashed: the emulated arm under the same forces (its joints cannot be forced).'
@@ -171,10 +208,14 @@ def loss_change_pictures(study: Study, rows: Rows) -> Plot:
     seed, (numbers, traces) = first_individual(rows)
     names = [name.replace('\n', ' ') for name in _phases(numbers)[:4]]
     moments = dict(zip(names, map(int, ENDS[:4]), strict=True))
-    motions = {f'{when} learning': traces[when] for when in plots.WHEN}
+    motions = {
+        f'{preset}, {when} learning': motions[when]
+        for preset, motions in traces.items()
+        for when in plots.WHEN
+    }
     return plots.pictures(study.robot, motions, moments, f'simulator of individual {seed}'), (
-        'The simulator at the end of each phase, before and after learning.'
+        'The simulator of each preset at the end of each phase, before and after learning.'
     )
 
 
-EXPERIMENT = Experiment(__doc__, measure, (loss_change, loss_change_pictures), 0.5)
+EXPERIMENT = Experiment(__doc__, measure, (loss_change, loss_change_pictures), 1.0)

@@ -14,7 +14,8 @@ import sys
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,9 +55,9 @@ def measure(args: Namespace) -> None:
     if args.readme:  # check the file before hours of work
         _around_table(args.readme)
     args.out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
+    with _work_folder(args) as folder:
         study = Study(
-            robot, args.preset, args.seeds, args.minutes, args.quick, Path(folder), args.reality
+            robot, args.preset, args.seeds, args.minutes, args.quick, folder, args.reality
         )
         with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
 
@@ -68,11 +69,43 @@ def measure(args: Namespace) -> None:
         files = [*write(study, parts, args.out), write_report(args.out)]
     if args.readme:
         files += update_readme(args.readme, args.out)
+    if args.page:
+        from musculoskeletal_ae.experiments.paper_page import update_page  # imports this module
+
+        files += update_page(args.page, args.out)
     print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
     measured = read(args.out)
     if failed := failures({name: measured[name] for name in names}):
         problem = f'some experiments failed: {"; ".join(failed)}'
         raise MusculoskeletalError(f'{problem}; the results of all others are written')
+
+
+@contextmanager
+def _work_folder(args: Namespace) -> Iterator[Path]:
+    """Yield the folder of networks and recordings: that of `--keep`, or a temporary one.
+
+    Raises:
+        MusculoskeletalError: If the kept folder belongs to a run with other options.
+    """
+    if args.keep is None:
+        with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
+            yield Path(folder)
+        return
+    args.keep.mkdir(parents=True, exist_ok=True)
+    options = {
+        key: str(getattr(args, key)) for key in ('robot', 'preset', 'minutes', 'quick', 'reality')
+    }
+    file = args.keep / 'options.json'
+    if file.is_file():
+        before = json.loads(file.read_text(encoding='utf-8'))
+        if before != options:
+            changed = ', '.join(f'{key} {before.get(key)}' for key in options)
+            problem = f'--keep {args.keep} holds parts of a run with other options ({changed})'
+            raise MusculoskeletalError(f'{problem}; repeat them, or name an empty folder')
+    elif any(args.keep.iterdir()):
+        raise MusculoskeletalError(f'--keep {args.keep}: expected an empty or new folder')
+    file.write_text(json.dumps(options), encoding='utf-8')
+    yield args.keep
 
 
 def write(
@@ -90,7 +123,8 @@ def write(
         failed = {str(seed): text for seed, text in by_seed.items() if isinstance(text, str)}
         if failed:
             result['failed'] = failed
-        drawn = {f'{draw.__name__}.png': draw(study, rows) for draw in plots if rows}
+        every = {f'{draw.__name__}.png': draw(study, rows) for draw in plots if rows}
+        drawn = {file: plot for file, plot in every.items() if plot is not None}
         result['plots'] = [{'file': file, 'caption': text} for file, (_, text) in drawn.items()]
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(result, indent=1, ensure_ascii=False)
@@ -211,8 +245,8 @@ class Row(Strict, frozen=True):
     def number(self, result: Mapping[str, Any], key: str) -> float | None:
         """Return the measured value of a key, or None."""
         if not self.worst:
-            return _flat(result).get(key)
-        every = [_flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
+            return flat(result).get(key)
+        every = [flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
         known = [number for number in every if number is not None]
         worst = min if self.more_is_better else max
         return worst(known, default=None)
@@ -343,7 +377,7 @@ def _page(folder: Path, results: Results) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(flat=_flat, cell=_cell, individuals=individuals)
+    environment.filters.update(flat=flat, cell=_cell, individuals=individuals)
     return environment.get_template(TEMPLATE).render(
         results=results,
         failures=failures(results),
@@ -358,12 +392,12 @@ def _page(folder: Path, results: Results) -> str:
     )
 
 
-def _flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
+def flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
     """Return nested numbers by their path."""
     rows: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):
-            rows.update(_flat(value, f'{before}{key}.'))
+            rows.update(flat(value, f'{before}{key}.'))
         else:
             rows[f'{before}{key}'] = value
     return rows

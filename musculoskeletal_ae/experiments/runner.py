@@ -61,7 +61,7 @@ def run(
     done, running, pool_broken = 0.0, dict[Future[Any], Part](), False
 
     def begin(name: str, seed: int) -> None:
-        train = online_learning.train_initial, study, name
+        train = _train, online_learning.train_initial, study, name
         try:
             future = pool.submit(*(train if name in PRESETS else (_measure, name, study, seed)))
         except BrokenProcessPool as error:  # the pool broke after the last check
@@ -116,9 +116,17 @@ def _pool(jobs: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(jobs, context, _start)
 
 
+def _train(train: Callable[[Study, str], None], study: Study, preset: str) -> None:
+    study.remember(f'{preset}_initial', lambda: train(study, preset))
+
+
 def _measure(name: str, study: Study, seed: int) -> Measured:
-    measured = EXPERIMENTS[name].measure(study, seed)
-    return measured._replace(numbers=round_numbers(measured.numbers))
+    def measure() -> Measured:
+        measured = EXPERIMENTS[name].measure(study, seed)
+        return measured._replace(numbers=round_numbers(measured.numbers))
+
+    result: Measured = study.remember(f'{name}_{seed}', measure)
+    return result
 
 
 def _start() -> None:

@@ -26,7 +26,6 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import AS_PRINTED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -39,13 +38,13 @@ def measure(study: Study, seed: int) -> Measured:
     """Return the results and traces of one individual."""
     recording = study.stream(seed, 'held_out')
     arm = Motion(recording.theta, recording.tension)
-    numbers, traces = dict[str, Any](), {'arm': arm}
-    for preset in dict.fromkeys([study.preset, AS_PRINTED]):
+    numbers, traces = dict[str, Any](), dict[str, Any]()
+    for preset in study.presets:
+        traces[preset] = {'arm': arm}
         for when, mae in study.networks(seed, preset).items():
             motion = simulate(study.robot, mae, preset, recording)
             numbers |= study.with_prefix(preset, _errors(when, motion, arm))
-            if preset == study.preset:
-                traces[when] = motion
+            traces[preset][when] = motion
     body, rows = study.arm(seed, friction=False), []
     for command in recording.command:
         body.command_length(command)
@@ -80,39 +79,49 @@ def _errors(name: str, motion: Motion, arm: Motion) -> dict[str, float]:
 
 
 def simulation_pictures(study: Study, rows: Rows) -> Plot:
-    """Draw arm and simulator at several moments."""
+    """Draw arm and simulators at several moments."""
     seed, (_, traces) = first_individual(rows)
+    arm = traces[study.preset]['arm']
     # Moments near the ends of cycles, where the arm rests at the random tensions of the third step.
-    cycles = np.arange(len(traces['arm'].theta) * SAMPLE_TIME // CYCLE)
+    cycles = np.arange(len(arm.theta) * SAMPLE_TIME // CYCLE)
     chosen = np.linspace(0, len(cycles) - 1, min(MOMENTS, len(cycles))).round().astype(int)
     steps = ((cycles[chosen] * CYCLE + 9.9) / SAMPLE_TIME).astype(int)
     moments = {f'{SAMPLE_TIME * n:.0f} s': int(n) for n in steps}
-    motions = {'arm': traces['arm']}
-    motions |= {f'simulator {when} learning': traces[when] for when in plots.WHEN}
+    motions = {'arm': arm}
+    for preset, of_preset in traces.items():
+        motions |= {f'{preset}, {when} learning': of_preset[when] for when in plots.WHEN}
     title = f'individual {seed}, same commands'
     return plots.pictures(study.robot, motions, moments, title), (
         'The emulated arm (true posture, measured tensions, drawn with the model’s routes), and '
-        'the simulator before and after learning under the same commands.'
+        'the simulator of each preset before and after learning under the same commands.'
     )
 
 
 def simulation_errors(_: Study, rows: Rows) -> Plot:
-    """Draw the errors over time."""
-    seed, (numbers, traces) = first_individual(rows)
-    figure, panels = plots.new_figure(12.0, 5.6, 2, sharex=True)
-    distances = {when: _distances(traces[when], traces['arm']) for when in plots.WHEN}
-    for panel, key, unit, symbol in zip(panels, PRINTED, ('rad', 'N'), 'θT', strict=True):
-        for when, colour in plots.WHEN.items():
-            values = distances[when][key]
-            label = f'{when} learning: mean {numbers[f"{when}_{key}"]:.3g} {unit}'
-            plots.line(panel, times(len(values)), values, 25, color=colour, lw=0.9, label=label)
-        before, after = PRINTED[key]
-        label = f'printed: {before:g} → {after:g} {unit}'
-        panel.axhline(after, color=plots.MARK, ls=':', lw=1, label=label)
-        panel.set_ylim(bottom=0.0)
-        plots.tidy(panel, '', f'‖{symbol}_sim − {symbol}‖ [{unit}]', legend='above')
-    panels[0].set_title(f'individual {seed}', loc='left')
-    panels[1].set_xlabel('time [s]')
+    """Draw the errors over time, a column for each preset."""
+    seed, row = first_individual(rows)
+    traces = row.traces
+    figure, panels = plots.new_figure(
+        6.0 * len(traces), 5.6, 2, len(traces), sharex=True, sharey='row'
+    )
+    for column, (preset, motions) in enumerate(traces.items()):
+        distances = {when: _distances(motions[when], motions['arm']) for when in plots.WHEN}
+        both = panels[column :: len(traces)]
+        for panel, key, unit, symbol in zip(both, PRINTED, ('rad', 'N'), 'θT', strict=True):
+            for when, colour in plots.WHEN.items():
+                values = distances[when][key]
+                label = f'{when} learning: {values.mean():.3g} {unit}'
+                time = times(len(values))
+                plots.line(panel, time, values, 25, color=colour, lw=0.9, label=label)
+            before, after = PRINTED[key]
+            label = f'printed: {before:g} → {after:g} {unit}'
+            panel.axhline(after, color=plots.MARK, ls=':', lw=1, label=label)
+            panel.set_ylim(bottom=0.0)
+            ylabel = f'‖{symbol}_sim − {symbol}‖ [{unit}]' if column == 0 else ''
+            plots.tidy(panel, 'time [s]' if key == 'n' else '', ylabel)
+            panel.legend(fontsize=8, loc='lower right', bbox_to_anchor=(1.0, 1.0), frameon=False)
+        both[0].set_title(f'preset {preset}', loc='left')
+    figure.suptitle(f'individual {seed}', x=0.01, ha='left')
     return figure, (
         'Distance of the simulator from the arm under the same commands (0.25 s running mean). '
         'Dotted: the mean after learning that the paper prints.'

@@ -10,6 +10,7 @@ add its name to `NAMES`, and add its rows to table.yaml.
 """
 
 import math
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import Recording
+from musculoskeletal_ae.files import write_whole
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import AS_PRINTED
@@ -50,6 +52,23 @@ class Study:
     quick: bool  # whether to shorten everything, for a trial run
     folder: Path  # of streams and networks
     reality: str = 'kin'  # emulator model of the individuals, see `make_arm`
+
+    def remember(self, part: str, measure: Callable[[], Any]) -> Any:
+        """Return the kept result of a part of the run, or measure and keep it.
+
+        Results are pickled, so a folder from an untrusted source must not be reused.
+        """
+        file = self.folder / f'{part}.pickle'
+        if file.is_file():
+            return pickle.loads(file.read_bytes())  # noqa: S301 (a file of this user's own run)
+        result = measure()
+        write_whole(file, pickle.dumps(result))
+        return result
+
+    @property
+    def presets(self) -> tuple[str, ...]:
+        """Preset `paper`, and the preset of the run if that is another one."""
+        return tuple(dict.fromkeys((AS_PRINTED, self.preset)))
 
     @property
     def held_out_time(self) -> float:
@@ -146,5 +165,6 @@ class Experiment(NamedTuple):
     #: the module's docstring in three paragraphs: heading; "Paper (section). …"; "Here. …"
     text: str | None
     measure: Callable[[Study, int], Measured]  # measures the individual of a seed
-    plots: tuple[Callable[[Study, Rows], Plot], ...]  # each has the name of its file
+    #: each draws the plot with its name, or returns None if a kept part has no data for it
+    plots: tuple[Callable[[Study, Rows], Plot | None], ...]
     weight: float  # relative duration, for scheduling and the progress bar

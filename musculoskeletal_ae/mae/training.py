@@ -134,7 +134,20 @@ def initial_mae(
     """
     chosen = preset_named(preset)
     steps = chosen.initial_steps(robot.groups) if steps is None else steps
-    network, losses, by = chosen.train_initial(robot, seed, steps, progress)
+    trained = chosen.train_initial(robot, seed, steps, progress)
+    return completed(robot, trained, preset, seed)
+
+
+def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
+    """Add history and anomaly statistics, not calibrated, to a trained network.
+
+    Args:
+        robot: The geometric model.
+        trained: The network of the initial training.
+        preset: Name of the preset that trained it.
+        seed: Random seed of the training.
+    """
+    network, losses, by = trained
     history = (
         f'initial training on the geometric model of {robot.description.directory.name}: '
         f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {by}'

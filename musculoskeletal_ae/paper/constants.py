@@ -29,6 +29,10 @@ CONTROL_WEIGHTS = (1.0, 1.0, 0.01)  # w₁ of ‖T‖, w₂ of the posture, w₃
 CONTROL_LARGEST_STEP = 0.5  # γ_max
 CONTROL_CANDIDATES = 10  # C_batch, called N_batch in the text
 CONTROL_EPOCHS = 10  # C_epoch
+# The unit of τ in w₃ and w₆ is not printed. We chose N·mm: for τ in N·m, w₃ is 10 and w₆ is 1. With
+# N·m the torque hardly counts: the simulated arm ignores a force of 50 N, which the paper's arm
+# follows, and `proposed` is far less accurate than `second` (doc/results/paper.md).
+TORQUE_UNITS = 1e3  # [N·mm/(N·m)]
 JOINT_STEP = 0.01  # Δθ [rad] of the muscle Jacobian; not printed
 
 # §III-F: the simulations.

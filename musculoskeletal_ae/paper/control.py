@@ -14,8 +14,8 @@
                 l_target = l_calc + l_comp(T_calc)                                           (12)
 
 The muscle modules compute (5). The paper does not state the following, which we chose: T_current is
-read once, when a method starts. τ in (9) is in N·m and T in the network's units. G is a forward
-difference with Δθ = 0.01 rad.
+read once, when a method starts, and is limited to the highest permitted tension. τ in (9) is in
+N·mm and T in the network's units. G is a forward difference with Δθ = 0.01 rad.
 
 Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command. T
 is T_const or T_current.
@@ -34,6 +34,7 @@ from musculoskeletal_ae.paper.constants import (
     CONTROL_LARGEST_STEP,
     CONTROL_WEIGHTS,
     JOINT_STEP,
+    TORQUE_UNITS,
 )
 from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
 from musculoskeletal_ae.robot.robot import Robot
@@ -83,8 +84,21 @@ def control_loss(
     return (
         Term(tension_weight, tension_rows, np.zeros(muscles)),
         Term(posture_weight, rows[:joints], theta),
-        Term(torque_weight, jacobian.T @ tension_rows / TENSION_SCALE, -torque),
+        torque_term(torque_weight, jacobian, tension_rows, torque),
     )
+
+
+def torque_term(weight: float, jacobian: Array, tension_rows: Array, torque: Array) -> Term:
+    """Return w ‖τ_target + Gᵀ T‖₂ with τ in N·mm, as (9) and (13) contain it.
+
+    Args:
+        weight: w₃ or w₆.
+        jacobian: G [m/rad], (M, D).
+        tension_rows: Rows that select scaled T from scaled (θ, T, l), (M, D+2M).
+        torque: τ_target [N·m], (D,).
+    """
+    matrix = TORQUE_UNITS * jacobian.T @ tension_rows / TENSION_SCALE
+    return Term(weight, matrix, -TORQUE_UNITS * torque)
 
 
 def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_STEP) -> Array:

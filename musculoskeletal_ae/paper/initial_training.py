@@ -18,6 +18,7 @@ from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, Progress, TrainedNetwork, one_thread, shuffled
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.paper.constants import (
+    HIDDEN,
     INITIAL_BATCH,
     INITIAL_SAMPLES,
     INITIAL_STEPS,
@@ -54,7 +55,11 @@ def loss(network: Network, values: Tensor, mask: Tensor) -> Tensor:
 
 
 def train(
-    robot: Robot, seed: int = 0, steps: int = INITIAL_STEPS, progress: Progress | None = None
+    robot: Robot,
+    seed: int = 0,
+    steps: int = INITIAL_STEPS,
+    progress: Progress | None = None,
+    hidden: tuple[int, ...] = HIDDEN,
 ) -> TrainedNetwork:
     """Train a new network by Adam; encode each sample under ①, ② or ③ at random.
 
@@ -63,11 +68,12 @@ def train(
         seed: Seed of the states, weights, masks and the order of the samples.
         steps: Total number of mini-batches.
         progress: Called after every mini-batch.
+        hidden: Units of the encoder's hidden layers.
     """
     rng = np.random.default_rng(seed)
     count = min(INITIAL_SAMPLES, steps * INITIAL_BATCH)
     samples: Array = random_states(robot, count, rng).scaled()
-    network = new_network(robot.joint_count, robot.muscle_count, seed)
+    network = new_network(robot.joint_count, robot.muscle_count, seed, hidden)
     optimiser = Optimiser(network, STEP_SIZE, muon=False)
     generator = torch.Generator(torch.get_default_device()).manual_seed(seed)
     losses = []

@@ -4,8 +4,10 @@
     g = dL/dz                                                                               (10)
     z ← z − γ g/‖g‖₂                                                                        (11)
 
-Each of C iterations takes the best of N step sizes γ in [0, γ_max]. The losses (9), (13) and (14)
-are sums of norms of affine maps of the decoded state:
+Each of C iterations takes the best of N step sizes. They are the lower ends γ_k = k γ_max/N, k = 0
+… N − 1, of N equal parts of [0, γ_max]; because 0 is one of them, the loss never rises. The paper
+does not state which point of each part it takes. The losses (9), (13) and (14) are sums of norms of
+affine maps of the decoded state:
 
     L(z) = Σ_k w_k ‖A_k y − b_k‖₂,   y = f_decode(z) in scaled units
 """
@@ -71,8 +73,7 @@ class Loss:
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
     """Return z (D+M,) after the descent from an initial z (D+M,)."""
     loss = Loss(terms)
-    # With γ = 0 among the candidates, the loss never rises.
-    steps = np.linspace(0.0, search.largest_step, search.candidates + 1)[:, None]
+    steps = search.largest_step * np.arange(search.candidates)[:, None] / search.candidates
     for _ in range(search.epochs):
         y, pullback = mae.decode_scaled.with_pullback(z)
         gradient = pullback(loss.gradient(y))

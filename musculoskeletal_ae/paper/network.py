@@ -18,12 +18,21 @@ import torch
 from musculoskeletal_ae.mae.network import Layers, Network
 from musculoskeletal_ae.paper.constants import ACTIVATION, HIDDEN
 
-LAYERS = Layers(HIDDEN, ACTIVATION)
 
+def new_network(
+    joints: int, muscles: int, seed: int = 0, hidden: tuple[int, ...] = HIDDEN
+) -> Network:
+    """Return a network of D joints and M muscles with random weights.
 
-def new_network(joints: int, muscles: int, seed: int = 0) -> Network:
-    """Return a network of D joints and M muscles with random weights."""
+    Args:
+        joints: D.
+        muscles: M.
+        seed: Random seed of the weights.
+        hidden: Units of the encoder's hidden layers; the decoder's are the reverse.
+    """
     values = joints + 2 * muscles
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Network(joints, muscles, LAYERS, np.zeros(values), np.ones(values))
+        return Network(
+            joints, muscles, Layers(hidden, ACTIVATION), np.zeros(values), np.ones(values)
+        )

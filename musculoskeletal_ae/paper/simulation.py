@@ -11,22 +11,20 @@ and, where joints are forced to θ_fix,
 
     (θ_sim, T_sim) ← f_decode(z) after the descent (`latent_descent`)
 
-l_sim is the commanded length l_target (in the Japanese text: the muscle length sent to the robot).
-Only θ_sim and T_sim are updated. τ_target = g(θ_sim) − JᵀF, plus the torque of the joints' springs.
-For a muscle without a command, l_sim is its present length, so that it does not resist.
-
-The paper does not state that θ_sim and T_sim are kept within the limits of joints and modules; we
-do so. This bounds the iteration for any network, and without it tensions fall below T_bias. On one
-minute of individual 0, ‖T_sim − T‖ would be 573 N instead of 220 N before learning, and 219 N
-instead of 173 N after. (With l_target − l_comp(T_sim), the length at which MSC carries T_sim, it
-would be 85 N, and 0.34 rad instead of 0.49.)
+The paper does not state the following, which we chose. l_sim is the commanded length l_target, as
+the Japanese text says ("the muscle length sent to the robot"). The English text says "the current
+muscle length in the current simulation", which can also be read as l_target − l_comp(T_sim), the
+length at which muscle stiffness control carries T_sim. τ is in N·mm, as in (9). Only θ_sim and
+T_sim are updated. τ_target = g(θ_sim) − JᵀF, plus the torque of the joints' springs. For a muscle
+without a command, l_sim is its present length. θ_sim and T_sim are kept within the limits of joints
+and modules, which bounds the iteration for any network. doc/results/paper.md compares the readings.
 """
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, Mask
 from musculoskeletal_ae.paper.constants import (
     LENGTH_WEIGHT,
     POSTURE_WEIGHT,
@@ -36,7 +34,7 @@ from musculoskeletal_ae.paper.constants import (
     TENSION_WEIGHT,
     TORQUE_WEIGHT,
 )
-from musculoskeletal_ae.paper.control import muscle_jacobian
+from musculoskeletal_ae.paper.control import muscle_jacobian, torque_term
 from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
@@ -89,7 +87,7 @@ class LatentSimulation:
         forced = np.flatnonzero(np.isfinite(fixed))
         if not len(forced):
             jacobian = muscle_jacobian(mae, theta, tension)
-            terms.append(Term(TORQUE_WEIGHT, jacobian.T @ tension_rows / TENSION_SCALE, -torque))
+            terms.append(torque_term(TORQUE_WEIGHT, jacobian, tension_rows, torque))
             z = mae.encode(Mask.TENSION_LENGTH, tension=tension, length=length)
         else:
             terms.append(Term(POSTURE_WEIGHT, row[forced], fixed[forced]))

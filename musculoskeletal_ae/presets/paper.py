@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from musculoskeletal_ae.paper.constants import INITIAL_STEPS, THRESHOLD
+from musculoskeletal_ae.paper.constants import HIDDEN, INITIAL_STEPS, THRESHOLD
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,12 +26,18 @@ if TYPE_CHECKING:
 
 
 class PaperPreset:
-    """The methods of the paper; see `Preset` for the meaning of each part."""
+    """The methods of the paper; see `Preset` for the meaning of each part.
+
+    `hidden` replaces the printed units of the encoder's hidden layers (`experiments/layers.py`).
+    """
 
     name = 'paper'
     least_samples = THRESHOLD + 1
     validates_updates = False
     simulates_on_devices = False
+
+    def __init__(self, hidden: tuple[int, ...] = HIDDEN) -> None:
+        self._hidden = hidden
 
     def initial_steps(self, groups: Iterable[Group]) -> int:  # noqa: ARG002
         """Return the same number of mini-batches for any body (§III-B)."""
@@ -49,7 +55,7 @@ class PaperPreset:
         """Train on L_initial with Adam (§III-B)."""
         from musculoskeletal_ae.paper.initial_training import train
 
-        return train(robot, seed, steps, progress)
+        return train(robot, seed, steps, progress, self._hidden)
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
         """Return an updater that learns from the samples alone (§III-C)."""

@@ -5,7 +5,7 @@ import os
 from argparse import ArgumentTypeError
 from pathlib import Path
 
-from musculoskeletal_ae.experiments import NAMES
+from musculoskeletal_ae.experiments import NAMES, PAPER
 from musculoskeletal_ae.options import Parser, exit_status, whole
 from musculoskeletal_ae.stop_signals import import_heavy
 
@@ -22,7 +22,10 @@ def main(argv: list[str] | None = None) -> int:
         "and writes DIR/NAME/result.json, plots, and DIR/report.html with the paper's numbers "
         'beside ours. Exit status 1: a part failed or a file is unusable, 2: invalid options.',
     )
-    text = f'{", ".join(NAMES)}; several, separated by commas; or all'
+    text = (
+        f'{", ".join(NAMES)}; several, separated by commas; all; '
+        'or paper, which is those that repeat the paper'
+    )
     parser.add_argument('names', metavar='NAME', type=_names, help=text)
     parser.add_robot()
     parser.add_preset('preset to measure; results of preset paper are always shown beside it')
@@ -33,8 +36,15 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_out('DIR', 'results and report', Path('experiments'))
     cores = len(os.sched_getaffinity(0))
     parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='processes')
+    text = (
+        'keep networks, recordings and measured parts there; a later run with the same options '
+        'measures only the parts that are missing (use only folders of your own runs)'
+    )
+    parser.add_argument('--keep', type=Path, metavar='DIR', help=text)
     text = 'also write the results table between the markers of this page'
     parser.add_argument('--readme', type=Path, metavar='FILE', help=text)
+    text = 'also write the page FILE.md that shows the paper beside ours, and its pictures'
+    parser.add_argument('--page', type=Path, metavar='FILE.md', help=text)
     args = parser.parse_args(argv)
     args.seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
@@ -42,7 +52,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _names(text: str) -> tuple[str, ...]:
-    names = NAMES if text == 'all' else tuple(dict.fromkeys(text.split(',')))
+    groups = {'all': NAMES, 'paper': PAPER}
+    names = groups.get(text) or tuple(dict.fromkeys(text.split(',')))
     if unknown := [name for name in names if name not in NAMES]:
-        raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)} or all')
+        raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)}, all or paper')
     return names

@@ -91,7 +91,7 @@ def test_the_length_command_makes_the_module_pull_with_the_planned_tension(robot
 
 def test_preset_paper_lowers_the_printed_loss(trained):
     robot, mae = Robot.load('arm26'), trained['paper']
-    theta, torque, _ = holdable(robot, 0)
+    theta, torque, _ = holdable(robot, 2)
     tension = np.full(6, 100.0)
     terms = paper.control_loss(robot, mae, theta, torque, tension)
     start = mae.encode(Mask.THETA_TENSION, theta, tension)

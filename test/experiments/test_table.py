@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import PAPER, paper_page
 from musculoskeletal_ae.experiments.results import (
     BEGIN,
     END,
@@ -19,6 +20,7 @@ from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.presets.registry import AS_PRINTED
 
 REPOSITORY = Path(__file__).parents[2]
+PAGE = REPOSITORY / 'doc' / 'results' / 'paper.md'
 ROWS = [(name, row) for name, rows in TABLE.items() for row in rows]
 
 
@@ -35,11 +37,34 @@ def test_the_page_shows_the_committed_results():
 
 
 def test_committed_results_are_of_full_runs_of_every_experiment():
-    results = read(REPOSITORY / KEPT)
-    assert set(results) == set(EXPERIMENTS)
-    for name, result in results.items():
+    results, of_page = read(REPOSITORY / KEPT), read(PAGE.with_suffix(''))
+    assert set(results) | set(of_page) == set(EXPERIMENTS)
+    assert set(of_page) <= set(PAPER)
+    for name, result in [*results.items(), *of_page.items()]:
         assert not result['about']['quick'], name
-        assert len(result['about']['seeds']) >= 5, name
+    assert all(len(result['about']['seeds']) >= 5 for result in results.values())
+
+
+def test_the_page_of_the_paper_shows_the_results_and_pictures_beside_it():
+    folder = PAGE.with_suffix('')
+    page = PAGE.read_text(encoding='utf-8')
+    remedy = f'run: python -m musculoskeletal_ae.experiments.paper_page {PAGE}'
+    assert page == paper_page.text(read(folder), folder), remedy
+    for picture in folder.glob('*.png'):
+        assert f']({folder.name}/{picture.name})' in page
+        assert picture.stat().st_size <= paper_page.LARGEST
+
+
+def test_every_row_of_the_paper_is_filled_from_the_results_of_its_page():
+    page = PAGE.read_text(encoding='utf-8')
+    for name, rows_of_table in paper_page.TABLES.items():
+        for row in rows_of_table:
+            assert f'| {row.quantity} |' in page, (name, row.quantity)
+
+
+def test_a_page_without_results_is_refused(tmp_path):
+    with pytest.raises(MusculoskeletalError, match='no results'):
+        paper_page.update_page(tmp_path / 'paper.md')
 
 
 @pytest.mark.parametrize(('name', 'row'), ROWS, ids=[row.quantity for _, row in ROWS])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from musculoskeletal_ae.paper.latent_descent import Loss, Term
+from musculoskeletal_ae.paper.latent_descent import Loss, StepSearch, Term, descend
+from musculoskeletal_ae.robot.robot import Robot
 
 RNG = np.random.default_rng(0)
 TERMS = (
@@ -22,6 +23,23 @@ def test_the_gradient_is_the_difference_quotient():
     y, step = RNG.normal(size=7), 1e-6
     quotient = [(LOSS(y + d) - LOSS(y - d)) / (2 * step) for d in step * np.eye(7)]
     np.testing.assert_allclose(LOSS.gradient(y), quotient, rtol=1e-6)
+
+
+def test_a_step_is_the_best_of_n_and_the_loss_never_rises(trained):
+    mae, robot = trained['paper'], Robot.load('arm26')
+    values = robot.joint_count + 2 * robot.muscle_count
+    terms = [Term(1.0, np.eye(values), RNG.normal(size=values))]
+    z = RNG.normal(size=robot.joint_count + robot.muscle_count)
+    sizes, losses = [], [Loss(terms)(mae.decode_scaled(z))]
+    for _ in range(20):
+        moved = descend(mae, z, terms, StepSearch(0.5, 10, 1))
+        sizes.append(np.linalg.norm(moved - z))
+        losses.append(Loss(terms)(mae.decode_scaled(moved)))
+        z = moved
+    assert (np.diff(losses) <= 0.0).all() and losses[-1] < losses[0]
+    parts = np.array(sizes) / 0.05
+    np.testing.assert_allclose(parts, parts.round(), atol=1e-6)
+    assert parts.max() < 10.0
 
 
 def test_a_norm_that_is_zero_has_no_gradient_and_no_nan():

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page that shows every figure and number of the paper beside ours.
+
+    python -m musculoskeletal_ae.experiments.paper_page doc/results/paper.md
+
+rewrites a page from the results and pictures in the folder beside it (`paper/` beside `paper.md`).
+`experiment paper --page doc/results/paper.md` first copies its own results and plots there. The
+text is in paper.md.jinja, and the rows of the tables are in paper.yaml.
+"""
+
+import shutil
+import sys
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import PAPER
+from musculoskeletal_ae.experiments.results import NOTHING, Results, Row, flat, individuals, read
+from musculoskeletal_ae.files import read_table, write_whole
+from musculoskeletal_ae.presets.registry import AS_PRINTED
+
+TEMPLATE = 'paper.md.jinja'  # beside this file
+#: rows of the tables, by the name that the template uses; they name no experiment twice
+TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[Row, ...]])
+#: pictures of the page: name, and the plot of an experiment
+PICTURES = {
+    'figure_5': ('online_learning', 'online_learning'),
+    'figure_6': ('body_change', 'length_against_angle'),
+    'figure_7': ('body_change', 'length_against_tension'),
+    'figure_7_worn': ('body_change', 'worn_muscles'),
+    'figure_8': ('estimation', 'appearance'),
+    'figure_9': ('estimation', 'deactivated'),
+    'figure_10': ('control', 'control'),
+    'figure_11': ('simulation', 'simulation_pictures'),
+    'figure_12': ('simulation', 'simulation_errors'),
+    'figure_13': ('loss_change', 'loss_change_pictures'),
+    'figure_13_motion': ('loss_change', 'loss_change'),
+    'layers': ('layers', 'layers'),
+}
+LARGEST = 60_000  # [bytes] of a picture
+WIDEST, COLOURS = 1000, 128  # [pixels]; a small palette makes small files
+SMALLER = 0.9  # factor of the width until a picture is small enough
+
+
+def update_page(page: Path, measured: Path | None = None) -> list[Path]:
+    """Rewrite the page; return the files written.
+
+    Args:
+        page: File of the page; results and pictures are in the folder of the same name beside it.
+        measured: Output folder of `experiment`, from which both are first copied; or None.
+    """
+    folder, files = page.with_suffix(''), list[Path]()
+    if measured is not None:
+        for name in PAPER:
+            result = measured / name / 'result.json'
+            if result.is_file():
+                files.append(folder / name / 'result.json')
+                files[-1].parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(result, files[-1])
+        for picture, (name, plot) in PICTURES.items():
+            drawn = measured / name / f'{plot}.png'
+            if drawn.is_file():
+                files.append(folder / f'{picture}.png')
+                write_whole(files[-1], _reduced(drawn))
+    page.write_text(text(read(folder), folder), encoding='utf-8')
+    return [*files, page]
+
+
+def text(results: Results, folder: Path) -> str:
+    """Return the page for the results and pictures in a folder.
+
+    Raises:
+        MusculoskeletalError: If there are no results.
+    """
+    if not results:
+        raise MusculoskeletalError(f'{folder} has no results; run experiment paper --page first')
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=False,  # noqa: S701 (Markdown, not HTML)
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    captions = {
+        (name, plot['file']): plot['caption']
+        for name, result in results.items()
+        for plot in result.get('plots', ())
+    }
+
+    def picture(name: str) -> str:
+        experiment, plot = PICTURES[name]
+        if not (folder / f'{name}.png').is_file():
+            return ''
+        caption = captions.get((experiment, f'{plot}.png'), '').replace('`', '')
+        return f'![{caption}]({folder.name}/{name}.png)\n\n{caption}\n'
+
+    return environment.get_template(TEMPLATE).render(
+        results=results,
+        flat={name: flat(result) for name, result in results.items()},
+        individuals=individuals,
+        minutes=next(iter(results.values()))['about']['minutes'],
+        picture=picture,
+        rows=rows,
+        number=number,
+    )
+
+
+def rows(results: Results, name: str, table: str = '') -> str:
+    """Return a table of an experiment as Markdown; '' if the experiment was not run.
+
+    Args:
+        results: All results.
+        name: Name of the experiment.
+        table: Name of the table in paper.yaml, if it is not that of the experiment.
+    """
+    if name not in results:
+        return ''
+    result = results[name]
+    heading = f'preset `{AS_PRINTED}` | preset `{result["about"]["preset"]}`'
+    lines = [f'| {_who(result)} | paper, on Musashi | {heading} |', '|---|---|---|---|']
+    for row in TABLES[table or name]:
+        cells = row.cells(result)
+        lines.append(
+            f'| {cells.quantity} | {cells.printed} | {cells.as_printed} | {cells.default} |'
+        )
+    return '\n'.join(lines)
+
+
+def number(values: Mapping[str, Any], key: str, digits: int = 3) -> str:
+    """Return a number as text; a dash if it was not measured."""
+    value = values.get(key)
+    return NOTHING if value is None else f'{value:.{digits}f}'
+
+
+def _who(result: Mapping[str, Any]) -> str:
+    return individuals([int(seed) for seed, numbers in result['seeds'].items() if numbers])
+
+
+def _reduced(file: Path) -> bytes:
+    """Return a picture as a small PNG with a palette."""
+    from PIL import Image  # matplotlib depends on it
+
+    with Image.open(file) as opened:
+        picture = opened.convert('RGB')
+    width = min(WIDEST, picture.width)
+    while True:
+        size = width, round(width * picture.height / picture.width)
+        stream = BytesIO()
+        resized = picture.resize(size, Image.Resampling.LANCZOS)
+        # This method keeps the colours of thin lines; the usual one mixes them with white.
+        small = resized.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        small.save(stream, 'PNG', optimize=True)
+        if len(stream.getvalue()) <= LARGEST:
+            return stream.getvalue()
+        width = int(SMALLER * width)
+
+
+if __name__ == '__main__':
+    update_page(Path(sys.argv[1]))
