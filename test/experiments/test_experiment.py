@@ -21,11 +21,13 @@ KEYS = {
     'fit_start_rad fit_end_rad samples samples_to_halve paper_samples_to_halve',
     'estimation': 'before_rad before_payload_rad after_rad after_payload_rad '
     'a_before_healthy_max a_before_ruptured_min a_healthy_max a_ruptured_min threshold '
+    'paper_after_payload_rad paper_a_switched_off_second '
     'detection_s false_alarms auroc named_share',
     'control': 'qp_bound_n',
     'simulation': 'before_rad after_rad before_n after_n frictionless_rad',
     'loss_change': '',
-    'body_change': '',
+    'body_change': 'angle_change_mm paper_angle_change_mm nonlinearity_true',
+    'layers': 'layers trainings',
     'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m '
     'wrench_error false_contacts',
     'resilience': 'healthy_rad one_isolated_rad two_isolated_rad proposed_one_isolated_rad '
