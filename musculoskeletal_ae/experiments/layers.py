@@ -8,10 +8,9 @@ Here. Networks of preset `paper` with other hidden layers are trained on the geo
 then learn from the messages of the default preset’s exploration of one individual. Only the first
 individual is measured. "Model" is the mean error of θ, T and l on states of the geometric model
 that are not used for training, after initial training. "Before" and "after" are the errors of the
-estimate on the held-out motion, before and after online learning. "Trainings" repeat initial
-training and learning with other random seeds; the spread of the printed layout over them shows
-which differences are noise. A network whose initial training is so inaccurate that checkpoint
-validation rejects it does not learn.
+estimate on the held-out motion, before and after online learning. "Trainings" is the number of
+random seeds over which the errors are means. A network whose initial training is so inaccurate that
+checkpoint validation rejects it does not learn.
 """
 
 from functools import partial
@@ -46,7 +45,7 @@ HIDDEN = {
     'fewer units: 50, 20': (50, 20),
     'fewer units: 20, 10': (20, 10),
 }
-TRAININGS = 2  # random seeds
+TRAININGS = 1  # random seeds
 QUICK_STEPS = 600  # of initial training
 
 
