@@ -54,7 +54,7 @@ def measure(study: Study, seed: int) -> Measured:
     if seed != study.seeds[0]:
         return Measured({}, {})
     layouts = [name for name in HIDDEN if not study.quick or name in list(HIDDEN)[:2]]
-    trainings = range(1 if study.quick else TRAININGS)
+    trainings = range(TRAININGS)
     every = {
         name: [
             study.remember(
@@ -109,9 +109,11 @@ def layers(_: Study, rows: Rows) -> Plot:
     figure, (panel,) = plots.new_figure(9.0, 0.62 * len(results) + 1.3)
     title = f'individual {seed}, preset {AS_PRINTED} with other hidden layers of the encoder'
     plots.bars(panel, list(results), groups, 'mean error [rad], held-out motion', title)
+    count = row.numbers['trainings']
+    repeated = 'one training each' if count == 1 else f'means over {count} trainings'
     return figure, (
         'Error of the estimate on the held-out motion with other hidden layers of the encoder, '
-        f'means over {row.numbers["trainings"]} trainings.'
+        f'{repeated}.'
     )
 
 

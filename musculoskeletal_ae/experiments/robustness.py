@@ -111,7 +111,7 @@ def _numbers(study: Study, seed: int) -> dict[str, Any]:
 
 
 def _informed_oracle_error(arm: Any, recording: Recording) -> float:
-    """Return the error of least squares that knows an arm's sensor errors and friction [rad]."""
+    """Return the error [rad] of least squares with the arm's true sensor errors and friction."""
     body, part = arm.individual, recording.part(EVERY)
     if (tendons := getattr(arm, 'tendons', None)) is None:
         tension = np.maximum(part.tension - body.tension_bias, 0.0) / body.tension_gain

@@ -26,8 +26,9 @@ EVERY = 1.0  # [s] between two updates
 LONGEST = 10.0  # [s] that one update may cover
 JUMP = 5.0  # [°C]; no housing changes by more between two updates, so a sensor or other heat did
 NOISE = 0.1  # [°C] σ of the mean of c₂ over EVERY
-RATIO = 0.4  # r, chosen: typical of small motors, with large variation
-# Initial estimates, chosen: the housing settles RISE [°C] above the air if T_limit is held.
+RATIO = 0.4  # r, assumed: typical of small motors, which vary widely
+# Assumed before anything is measured: while T_limit is held, the housing settles RISE [°C] above
+# the air.
 RISE, WINDING_TIME, HOUSING_TIME, AIR = 80.0, 30.0, 800.0, 25.0
 # Standard deviations of c₁ − c₂, c₂ [°C], log κ, log τ₁, log τ₂, c_a [°C].
 SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])  # initial

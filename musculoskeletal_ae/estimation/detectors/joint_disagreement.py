@@ -68,7 +68,7 @@ class JointDisagreement(Detector):
         #: θ, T_end and l of healthy messages, from which g_usual of any network follows
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
         self._usual: Array | None = None  # g_usual [m], (M,)
-        self._healthy_time = 0.0  # [s] since the last of these messages
+        self._healthy_time = 0.0  # [s] since a message was last added to `_healthy`
         self.reset()
 
     def use(self, mae: Mae) -> None:
