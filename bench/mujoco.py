@@ -45,7 +45,7 @@ from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser, seeds
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 HEAD = (
@@ -101,7 +101,7 @@ def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
     held_out = record(study.arm(seed), study.network(None), 0xB0 + seed, study.held_out_time)
     cells = [name, str(seed), str(robot.joint_count), str(robot.muscle_count)]
     cells.append(f'{estimation_error(study.network(None), held_out):.4f}')
-    for preset in (AS_PRINTED, study.preset):
+    for preset in (PAPER_PRESET, study.preset):
         learner, loop = online_learning.new_learner_and_loop(study, study.arm(seed), seed, preset)
         online_learning.teach(learner, online_learning.explore(loop, learner, 60.0 * study.minutes))
         checkpoint.save(learner.mae, study.network_file(preset, seed))
@@ -152,7 +152,7 @@ def model_rows(
     start = time.process_time()
     online_learning.train_initial(study, study.preset)
     training = time.process_time() - start
-    online_learning.train_initial(study, AS_PRINTED)
+    online_learning.train_initial(study, PAPER_PRESET)
     for seed in args.seeds:
         yield table_row(study, name, seed, training)
 

@@ -39,7 +39,7 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.robot.tension import holding_tension
 
 #: colours of the methods; a suffix names the preset whose network a method uses
@@ -48,9 +48,9 @@ METHODS = {
     'first': '#E69F00',
     'second': '#009E73',
     'proposed': '#0072B2',
-    f'first_{AS_PRINTED}': '#F5D999',
-    f'second_{AS_PRINTED}': '#99D8C7',
-    f'proposed_{AS_PRINTED}': '#CC79A7',
+    f'first_{PAPER_PRESET}': '#F5D999',
+    f'second_{PAPER_PRESET}': '#99D8C7',
+    f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
 APPROACHES = 5  # number of θ_eval, and of starts for each
 # `second` ends after 5 s + 2 s. All methods are read at the same time.
@@ -113,7 +113,7 @@ def _bound(arm: Arm) -> float:
 
 def measure(study: Study, seed: int) -> Measured:
     """Return the results and traces of one individual."""
-    networks = {'default': study.network(seed), AS_PRINTED: study.network(seed, AS_PRINTED)}
+    networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
     ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
     numbers: dict[str, Any] = {

@@ -34,7 +34,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.training import OUTPUTS, completed, pair_errors
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.paper import PaperPreset
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
 #: units of the encoder's hidden layers; the decoder's are the reverse, the latent layer is D + M
 HIDDEN = {
@@ -79,7 +79,7 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
     robot, preset = study.robot, PaperPreset(hidden)
     steps = QUICK_STEPS if study.quick else preset.initial_steps(robot.groups)
     network = preset.train_initial(robot, training, steps, None)
-    initial = completed(robot, network, AS_PRINTED, training).mae
+    initial = completed(robot, network, PAPER_PRESET, training).mae
     test = preset.training_states(robot, TEST_STATES, np.random.default_rng([0, 2]))
     norms = np.reshape([error.norm for error in pair_errors(initial, test)], (len(Mask), -1))
     keys = [f'model_{name}_{unit}'.lower() for name, unit, _ in OUTPUTS]
@@ -87,7 +87,7 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
     held_out = study.stream(seed, 'held_out')
     numbers['before_rad'] = estimation_error(initial, held_out)
     try:
-        learner = Learner(robot, initial, AS_PRINTED, training)
+        learner = Learner(robot, initial, PAPER_PRESET, training)
     except GateError:  # a network this inaccurate is not accepted as a start
         return numbers | {'after_rad': None}
     teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
@@ -107,7 +107,7 @@ def layers(_: Study, rows: Rows) -> Plot:
         for when, colour in plots.WHEN.items()
     }
     figure, (panel,) = plots.new_figure(9.0, 0.62 * len(results) + 1.3)
-    title = f'individual {seed}, preset {AS_PRINTED} with other hidden layers of the encoder'
+    title = f'individual {seed}, preset {PAPER_PRESET} with other hidden layers of the encoder'
     plots.bars(panel, list(results), groups, 'mean error [rad], held-out motion', title)
     count = row.numbers['trainings']
     repeated = 'one training each' if count == 1 else f'means over {count} trainings'

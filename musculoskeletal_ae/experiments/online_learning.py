@@ -56,7 +56,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.presets.registry import AS_PRINTED, PRESETS, preset_named
+from musculoskeletal_ae.presets.registry import PAPER_PRESET, PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
@@ -66,7 +66,7 @@ PRINTED = (0.324, 0.154)  # [rad] the printed fit at the start and after ten min
 QUICK_STEPS = 600  # of initial training; with fewer, a network of preset `paper` is rejected
 NOTE_EVERY = 25  # mini-batches between two records of the training errors
 TEST_STATES = 1000  # number of test states
-COLOURS = {AS_PRINTED: plots.AS_PRINTED, 'default': plots.AFTER}
+COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
 #: maps the learner, the number of a message, true θ and joint-sensor readings [rad] (D,) to the θ
 #: that the learner receives, or None
@@ -178,9 +178,9 @@ def measure(study: Study, seed: int) -> Measured:
         values = _numbers(curve, learner, initial, held_out) | {'stops': float(loop.stops)}
         numbers |= study.with_prefix(preset, values)
         traces[preset] = curve, values
-    learner = new_learner(study, seed, AS_PRINTED)
+    learner = new_learner(study, seed, PAPER_PRESET)
     teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
-    numbers[f'{AS_PRINTED}_same_stream_after_rad'] = estimation_error(learner.mae, held_out)
+    numbers[f'{PAPER_PRESET}_same_stream_after_rad'] = estimation_error(learner.mae, held_out)
     study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 

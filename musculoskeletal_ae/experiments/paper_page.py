@@ -21,7 +21,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import PAPER
 from musculoskeletal_ae.experiments.results import NOTHING, Results, Row, flat, individuals, read
 from musculoskeletal_ae.files import read_table, write_whole
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
 TEMPLATE = 'paper.md.jinja'  # beside this file
 #: rows of the tables, by the name that the template uses; they name no experiment twice
@@ -120,7 +120,7 @@ def rows(results: Results, name: str, table: str = '') -> str:
     if name not in results:
         return ''
     result = results[name]
-    heading = f'preset `{AS_PRINTED}` | preset `{result["about"]["preset"]}`'
+    heading = f'preset `{PAPER_PRESET}` | preset `{result["about"]["preset"]}`'
     lines = [f'| {_who(result)} | paper, on Musashi | {heading} |', '|---|---|---|---|']
     for row in TABLES[table or name]:
         cells = row.cells(result)

@@ -20,7 +20,7 @@ from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions, end_tension
 
 PAID_OUT = 0.1  # [m] beyond its command, at which a muscle is slack in any posture
@@ -161,7 +161,7 @@ def record(
     # The first ramp starts at the present lengths, so that the command does not jump.
     robot, read = arm.robot, arm.sense()
     command = read.length
-    for step in Exploration(robot, stream, AS_PRINTED) if isinstance(stream, int) else stream:
+    for step in Exploration(robot, stream, PAPER_PRESET) if isinstance(stream, int) else stream:
         if planned >= duration - 1e-9:
             break
         start, goal = command, first_command(robot, mae, step.theta, step.tension)

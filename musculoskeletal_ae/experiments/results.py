@@ -30,7 +30,7 @@ from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, round_numbers
 from musculoskeletal_ae.files import read_table, write_whole
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
@@ -210,7 +210,7 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             result[key] = _mean(values)
         elif isinstance(first, str):
             result[key] = first if len(set(values)) == 1 else sorted(set(values))
-        elif key.removeprefix(f'{AS_PRINTED}_') in TOTALS:
+        elif key.removeprefix(f'{PAPER_PRESET}_') in TOTALS:
             result[key] = sum(values)
         else:
             result[key] = np.mean(values, axis=0).tolist()
@@ -253,7 +253,7 @@ class Row(Strict, frozen=True):
 
     def cells(self, result: Mapping[str, Any]) -> Cells:
         """Return the row for a result.json."""
-        as_printed_key = self.as_printed.format(preset=AS_PRINTED)
+        as_printed_key = self.as_printed.format(preset=PAPER_PRESET)
         numbers = [self.number(result, key) for key in (as_printed_key, self.default, self.bound)]
         as_printed, default, bound = (
             NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers
@@ -298,7 +298,7 @@ def readme_table(results: Results) -> str:
         'squares with the true routes and elastic constants. The reference of control is the '
         'least ‖T‖ with which the true body can hold the posture in which the arm came to rest. '
         'The reference of the simulator is a simulation of the true body without friction.\n\n'
-        f'| | paper, on Musashi | preset `{AS_PRINTED}` | preset `default` | reference | goal |\n'
+        f'| | paper, on Musashi | preset `{PAPER_PRESET}` | preset `default` | reference | goal |\n'
         '|---|---|---|---|---|---|'
     )
     for name in filter(ROWS.get, results):

@@ -36,7 +36,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
-from musculoskeletal_ae.presets.registry import AS_PRINTED, PRESETS
+from musculoskeletal_ae.presets.registry import PAPER_PRESET, PRESETS
 
 REALITIES = KIN, FOREIGN
 #: effects that the ablation removes, by group
@@ -99,7 +99,7 @@ def _numbers(study: Study, seed: int) -> dict[str, Any]:
     keys = (
         'before_rad',
         'after_rad',
-        *(f'{AS_PRINTED}_{key}' for key in ('before_rad', 'after_rad')),
+        *(f'{PAPER_PRESET}_{key}' for key in ('before_rad', 'after_rad')),
         'oracle_rad',
         'samples_to_halve',
     )
@@ -156,7 +156,7 @@ def _error_with_effects(
 ESTIMATES = {
     'before_rad': ('before learning', plots.BEFORE),
     'least_squares_rad': ('least squares, geometric model', plots.MARK),
-    f'{AS_PRINTED}_after_rad': (f'preset {AS_PRINTED}, learned', plots.AS_PRINTED),
+    f'{PAPER_PRESET}_after_rad': (f'preset {PAPER_PRESET}, learned', plots.AS_PRINTED),
     'after_rad': ('preset default, learned', plots.AFTER),
     'joint_sensors_rad': ('joint sensors used for learning', plots.MARK),
 }

@@ -27,7 +27,7 @@ from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.files import write_whole
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 DIGITS = 6  # significant digits of results; further digits are noise
@@ -68,7 +68,7 @@ class Study:
     @property
     def presets(self) -> tuple[str, ...]:
         """Preset `paper`, and the preset of the run if that is another one."""
-        return tuple(dict.fromkeys((AS_PRINTED, self.preset)))
+        return tuple(dict.fromkeys((PAPER_PRESET, self.preset)))
 
     @property
     def held_out_time(self) -> float:
@@ -121,8 +121,8 @@ class Study:
         prefixed = dict[str, Any]()
         if preset == self.preset:
             prefixed |= numbers
-        if preset == AS_PRINTED:
-            prefixed |= {f'{AS_PRINTED}_{key}': value for key, value in numbers.items()}
+        if preset == PAPER_PRESET:
+            prefixed |= {f'{PAPER_PRESET}_{key}': value for key, value in numbers.items()}
         return prefixed
 
 

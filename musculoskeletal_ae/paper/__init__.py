@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The method exactly as the paper describes it, for comparison with the printed text.
+"""The method exactly as the paper describes it, arranged by the paper's sections.
 
 K. Kawaharazuka et al., "Musculoskeletal AutoEncoder: A Unified Online Acquisition Method of
 Intersensory Networks for State Estimation, Control, and Simulation of Musculoskeletal Humanoids",
@@ -8,15 +8,16 @@ IEEE Robotics and Automation Letters, 2020. Equation numbers are those of the pa
     §III-A          network.py            layers, units, masks
     §III-B  (2, 3)  initial_training.py   random states of the geometric model, L_initial, Adam
     §III-C          online_learning.py    the batches, and when the network is updated
-    §III-D  (4)     state_estimation.py   the estimate, and the anomaly detector by A
+    §III-D  (4)     state_estimation.py   the estimate, and the anomaly detector that uses A
     §III-E  (5–8)   control.py            muscle stiffness control; geometric, first, second
     §III-E  (9–12)  control.py            the proposed control
     §III-E  (10,11) latent_descent.py     the descent in the latent space
     §III-F  (13,14) simulation.py         both simulations
     §IV-A           exploration.py        the three steps of random motion
 
-`constants.py` holds the printed numbers, and the values that this project chose where the paper
-gives none. Preset `paper` runs the code of this folder; outside it, only `presets/` imports it.
+`constants.py` holds the numbers of the paper, and the values that this project chose where the
+paper gives none. Preset `paper` runs the code of this folder. Of the other folders, only `presets/`
+imports it.
 Parts that both presets share (the network's arithmetic, Adam, the geometric model) are imported
 from elsewhere.
 """

@@ -17,8 +17,8 @@ The muscle modules compute (5). The paper does not state the following, which we
 read once, when a method starts, and is limited to the highest permitted tension. τ in (9) is in
 N·mm and T in the network's units. G is a forward difference with Δθ = 0.01 rad.
 
-Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command. T
-is T_const or T_current.
+Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command.
+There T is T_const or T_current, as the method's equation states.
 """
 
 import numpy as np

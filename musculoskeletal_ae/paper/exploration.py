@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random motion that collects data (§IV-A): three steps, repeated.
 
-1. 5 s: `first` (7) with a random θ_target and T_const = T_bias, 2. 2 s: `second` (8) with the same
-θ_target and the current tension, 3. 3 s: `first` (7) again with a random T_const in [T_bias,
-T_limit].
+1. For 5 s, `first` (7) with a random θ_target and T_const = T_bias.
+2. For 2 s, `second` (8) with the same θ_target and the current tension.
+3. For 3 s, `first` (7) with the same θ_target and a random T_const in [T_bias, T_limit].
 
 The paper does not state the following, which we chose. Targets are drawn from the postures that the
 arm can hold with tensions in [T_bias, T_limit]. Each step ramps the command and then holds it,
@@ -36,7 +36,7 @@ def three_steps(
     posture: Callable[[Robot, np.random.Generator], Array] = random_posture,
     constant_tension: Callable[[Robot, Array, np.random.Generator], Array] = random_tension,
 ) -> tuple[Step, Step, Step]:
-    """Return the three steps at one random posture.
+    """Draw a random holdable posture; return the three steps of exploration there.
 
     Args:
         robot: The body; its isolated muscles carry no tension.

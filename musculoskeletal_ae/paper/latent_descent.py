@@ -20,8 +20,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-# A norm has no gradient at zero. This summand keeps the divisions by norms finite.
-TINY = 1e-12
+TINY = 1e-12  # added to every norm before a division by it, because a norm may be zero
 
 
 class Term(NamedTuple):
@@ -41,7 +40,7 @@ class StepSearch(NamedTuple):
 
 
 class Loss:
-    """L of several terms as one affine map: one large product is faster than many small ones."""
+    """The loss L. It evaluates all terms by one matrix product, which is faster than several."""
 
     def __init__(self, terms: Sequence[Term]) -> None:
         """Stack the rows of all terms."""
@@ -71,7 +70,7 @@ class Loss:
 
 
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
-    """Return z (D+M,) after the descent from an initial z (D+M,)."""
+    """Minimise the loss of `terms` from an initial z (D+M,), and return the final z (D+M,)."""
     loss = Loss(terms)
     steps = search.largest_step * np.arange(search.candidates)[:, None] / search.candidates
     for _ in range(search.epochs):

@@ -43,7 +43,7 @@ def draw_batch(values: Array, rng: np.random.Generator) -> Array:
 
     Args:
         values: Stored samples, scaled (θ, T, l), the newest last, (N, D+2M).
-        rng: Draws C_data of them.
+        rng: Random generator that draws C_data of the stored samples.
     """
     stored = rng.choice(len(values) - 1, DATA, replace=False)
     nothing = np.zeros(values.shape[1])

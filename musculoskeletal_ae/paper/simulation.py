@@ -44,13 +44,13 @@ SEARCH = StepSearch(SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_E
 
 
 class LatentSimulation:
-    """Simulates arms of one robot; arguments are those of `QuasiStatics`."""
+    """Simulates arms of one robot, with the same interface as `QuasiStatics`."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Use a network, and the robot with the muscles that are now isolated."""
+        """Use this network, and this robot, which states the isolated muscles."""
         self._mae, self._robot = mae, robot.with_elasticity(mae.elasticity)
         self._load = Load(self._robot.kinematics)
 
@@ -62,10 +62,10 @@ class LatentSimulation:
         wrench: Array,
         fixed: Array,
     ) -> ArmState:
-        """Return the arms after one descent each."""
+        """Return the state of all arms after one descent for each of them."""
         load, _ = self._load(state.theta, wrench)
         length = np.where(command == PAID_OUT, state.length, command)
-        # A bound beyond any reasonable command: no muscle is wound in by its whole length.
+        # Limit commands to the whole length of the muscle, which exceeds every reasonable command.
         whole_length = self._robot.routes.length_at_zero
         length = np.clip(length, -whole_length, whole_length)
         arms = zip(state.theta, state.tension, length, load, fixed, strict=True)
@@ -75,7 +75,7 @@ class LatentSimulation:
     def _descend(
         self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array
     ) -> tuple[Array, Array, Array]:
-        """Return θ, T and l of one arm."""
+        """Return θ, T and l of one arm after a descent."""
         robot, mae = self._robot, self._mae
         joints, muscles = robot.joint_count, robot.muscle_count
         row = np.eye(joints + 2 * muscles)

@@ -24,7 +24,7 @@ def estimate(mae: Mae, tension: Array, length: Array) -> State:
 
 
 class AnomalyNorm(ResidualDistance):
-    """Detector that decides by A alone."""
+    """Detector that compares A alone with a threshold."""
 
     symbol, threshold_name = 'A', NORM
 

@@ -33,7 +33,7 @@ class DefaultPreset:
     simulates_on_devices = True
 
     def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return a number of mini-batches that grows with the size of the body."""
+        """Return a number of mini-batches that grows with the number of joints and muscles."""
         from musculoskeletal_ae.mae.default_training import default_steps
 
         return default_steps(groups)
@@ -61,7 +61,7 @@ class DefaultPreset:
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detector by d, and detectors by the physics of tendons and modules."""
+        """Return the detector that uses d, and those for slack tendons and jammed modules."""
         from musculoskeletal_ae.estimation.detectors.jammed_module import JammedModule
         from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
         from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon

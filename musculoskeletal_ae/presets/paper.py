@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preset `paper`: the methods of the folder `paper/`, as printed."""
+"""Preset `paper`: the methods exactly as the paper describes them, from the folder `paper/`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 class PaperPreset:
     """The methods of the paper; see `Preset` for the meaning of each part.
 
-    `hidden` replaces the printed units of the encoder's hidden layers (`experiments/layers.py`).
+    `hidden` is the number of units of each hidden layer of the encoder. By default it is that of
+    the paper; `experiments/layers.py` varies it.
     """
 
     name = 'paper'

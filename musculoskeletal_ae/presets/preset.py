@@ -32,7 +32,7 @@ class Preset(Protocol):
 
     Attributes:
         name: Name by which users select the preset.
-        least_samples: Number of samples from which on a network is updated online.
+        least_samples: Smallest number of samples with which a network is updated online.
         validates_updates: Whether the learner validates an update before it publishes it
             (`estimation/checkpoint_validation.py`).
         simulates_on_devices: Whether the simulator can run on a torch device.
@@ -46,10 +46,10 @@ class Preset(Protocol):
     # -- network and initial training -----------------------------------------------------------
 
     def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return the number of mini-batches of initial training for a robot's muscle groups."""
+        """Return the number of mini-batches of initial training for a body with these groups."""
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
-        """Return random states of the geometric model with the distribution of initial training."""
+        """Return `count` random states of the geometric model, drawn as for initial training."""
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
@@ -59,7 +59,7 @@ class Preset(Protocol):
     # -- online learning ------------------------------------------------------------------------
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
-        """Return the online updater, which starts from a network."""
+        """Return the online updater, which starts from the network `mae`."""
 
     # -- anomalies ------------------------------------------------------------------------------
 
@@ -74,15 +74,15 @@ class Preset(Protocol):
     # -- control --------------------------------------------------------------------------------
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return the control methods that ramp to one length command, by name.
+        """Return, by name, the control methods that ramp to a single length command.
 
         All other methods follow trajectories or command tensions.
         """
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return a function that draws the next steps of exploration."""
+        """Return a function of the robot and a random generator that draws the next steps."""
 
     # -- simulation -----------------------------------------------------------------------------
 
     def make_simulator(self, robot: Robot) -> SimulatedBody:
-        """Return a simulator of arms of a robot."""
+        """Return a simulator for any number of arms of this robot."""

@@ -10,14 +10,14 @@ from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.preset import Preset
 
 DEFAULT = DefaultPreset.name
-#: the preset that follows the paper exactly; experiments compare it with the one they measure
-AS_PRINTED = PaperPreset.name
+#: name of the preset that follows the paper exactly, with which experiments compare other presets
+PAPER_PRESET = PaperPreset.name
 
 PRESETS: dict[str, Preset] = {preset.name: preset for preset in (DefaultPreset(), PaperPreset())}
 
 
 def preset_named(name: str) -> Preset:
-    """Return the preset with a name.
+    """Return the preset of this name.
 
     Raises:
         MusculoskeletalError: If no preset has this name.

@@ -17,7 +17,7 @@ from musculoskeletal_ae.experiments.results import (
 )
 from musculoskeletal_ae.experiments.results import ROWS as TABLE
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
-from musculoskeletal_ae.presets.registry import AS_PRINTED
+from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = REPOSITORY / 'doc' / 'results' / 'paper.md'
@@ -70,7 +70,7 @@ def test_a_page_without_results_is_refused(tmp_path):
 @pytest.mark.parametrize(('name', 'row'), ROWS, ids=[row.quantity for _, row in ROWS])
 def test_every_row_is_filled_from_the_committed_results(name, row):
     result = read(REPOSITORY / KEPT)[name]
-    for key in filter(None, (row.as_printed.format(preset=AS_PRINTED), row.default, row.bound)):
+    for key in filter(None, (row.as_printed.format(preset=PAPER_PRESET), row.default, row.bound)):
         assert row.number(result, key) is not None, key
 
 
