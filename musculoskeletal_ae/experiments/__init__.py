@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The experiments of the paper on emulated arms: protocols, plots and reports."""
 
-#: names of the experiments in the order of the report; the others need the results of the first
+#: names of the experiments in the order of the report; all others need the results of the first
 NAMES = (
     'online_learning',
     'estimation',
@@ -15,5 +15,5 @@ NAMES = (
     'robustness',
     'sensors',
 )
-#: those that repeat an experiment or a statement of the paper
+#: the experiments that repeat an experiment of the paper or test one of its statements
 PAPER = NAMES[:7]

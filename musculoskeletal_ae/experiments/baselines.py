@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Earlier estimators of joint angles, evaluated on the same data as the autoencoder.
 
-They learn from the rest samples of the autoencoder. So few postures cannot fill a table for table
-search; both estimators are therefore also evaluated after learning the whole stream at 10 Hz.
+They learn from the rest samples of the autoencoder. These are too few postures for a table search.
+Therefore both estimators are also evaluated after learning from the whole stream at 10 Hz.
 """
 
 from __future__ import annotations
@@ -70,10 +70,11 @@ class PolynomialFilter:
     name = 'polynomial mapping, EKF'
     DEGREE = 3
     MODEL_SAMPLES = 20_000
-    PRIOR_ROWS = 20.0  # weight of the prior, in samples
+    PRIOR_ROWS = 20.0  # weight of the prior, as a number of samples
     TENSION_SCALE = 1.0 / 200.0  # gives a_m the magnitude of the other coefficients
-    WALK = 0.5  # random walk of a joint [rad/√s]; with 0.2 the error differs by about 1 %
-    LEAST_NOISE = 5e-4  # [m]
+    #: standard deviation of a joint's random walk [rad/√s]; 0.2 changes the error by about 1 %
+    WALK = 0.5
+    LEAST_NOISE = 5e-4  # lower bound of the standard deviation of a length [m]
 
     def __init__(self, robot: Robot) -> None:
         """Fit the mapping to the geometric model."""

@@ -7,17 +7,19 @@ from linear to strongly curved, which the paper attributes to wear of #2’s ela
 friction in #6.
 
 Here. The figures show l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0.
-They compare ① of both presets' networks before and after learning with the true body. All other
+They compare ① of both presets' networks, before and after learning, with the true body. All other
 joints are at θ = 0, even where this lies outside a joint’s limits (by 5° at the elbow). The
-shoulder's lower limit is −70°, so that networks extrapolate from there to −120°. "Change" is the
-largest difference of a muscle's curve before and after learning; a "relative" change compares l −
-l(0), because the printed curves pass the origin. "True change" is the difference between the true
-body and its model, which a perfect learner would find. "Model error" is the error of the initial
-network on its own model. "Excursion" is the range of a muscle's length over the joint's limits.
-"Nonlinearity" is the largest distance of l(T) from its chord, relative to its span. "Shape" is the
-error of a curve after subtracting its mean difference from the true curve. "Worn" is the first
-individual with a worn series elastic element at #2 and high tendon friction at #6, which explores
-and learns again.
+shoulder's lower limit is −70°, so the networks extrapolate from there to −120°.
+
+- change: largest difference of a muscle's curve before and after learning
+- relative change: the same for l − l(0), because the curves of the paper pass the origin
+- true change: difference between the true body and its model, which a perfect learner would find
+- model error: error of the initial network on its own model
+- excursion: range of a muscle's length over the joint's limits
+- nonlinearity: largest distance of l(T) from its chord, relative to its span
+- shape: error of a curve after subtracting its mean difference from the true curve
+- worn: the first individual with a worn series elastic element at #2 and high tendon friction at
+  #6, which explores and learns again
 """
 
 from collections.abc import Mapping
@@ -41,12 +43,12 @@ from musculoskeletal_ae.experiments.study import (
 )
 from musculoskeletal_ae.robot.robot import Robot
 
-SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))  # [rad]
-POINTS = 101  # points of the tension curves
-COLUMNS = 5  # of plots
-WORN = 0.5  # factor of the stiffening rate of the worn element
+SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))  # angles of the shoulder [rad]
+POINTS = 101  # number of points of a tension curve
+COLUMNS = 5  # number of panels in a row of a plot
+WORN = 0.5  # stiffening rate of the worn element, relative to that of the others
 WORN_FRICTION = 0.4  # capstan exponent of the tendon with high friction (mean of others: 0.1)
-SMALL = 1e-9  # [m]
+SMALL = 1e-9  # avoids a division by zero [m]
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -84,7 +86,7 @@ def measure(study: Study, seed: int) -> Measured:
     model = robot.muscle_lengths(swept, no_tension)
     deviation = true.muscle_lengths(swept, no_tension) - model
     deviation -= deviation[np.abs(SWEEP).argmin()]
-    # What a perfect learner would change, and how far each muscle moves at all.
+    # The change that a perfect learner would make, and the excursion of each muscle.
     numbers['angle_true_change_mm'] = _by_muscle(robot, deviation[inside])
     numbers['angle_true_change_all_mm'] = _by_muscle(robot, deviation)
     excursion = 1e3 * np.ptp(model[inside], axis=0)
@@ -110,9 +112,9 @@ def _changes(
 ) -> dict[str, Any]:
     """Return the numbers of the curves (points, M) of one sweep [m], named `angle` or `tension`.
 
-    A change is the largest one of each curve; "relative" is that of l − l(origin), because the
-    printed curves pass the origin. "All" takes the printed range, and otherwise the trained range
-    counts.
+    The change of a curve is its largest difference. "Relative" is the change of l − l(origin),
+    because the curves in the paper pass the origin. "All" refers to the range of the paper's
+    figure, the other numbers to the range of the training.
     """
     change = curves['after'] - curves['before']
     relative = change - change[origin]

@@ -20,16 +20,18 @@ from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CONTACT_STREAM = 7000
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
-TRIES_PER_COLLISION = 20  # at most, because a collision needs a moving arm
-HEALTHY = 3600.0  # [s] over all individuals
-LEAST, MOST = 10.0, 50.0  # [N] external forces
-LIGHT, FIRM = 15.0, 20.0  # [N] forces that guide an arm under gravity compensation
-MOVE = 4.0  # [s] to a posture
-PUSH, EVALUATED = 1.5, 0.5  # [s] duration of a push, and its last part that is evaluated
-APART = 3.0  # [s] longest time between collisions
-FLOATING, MOVED = 30.0, 1.0  # [s] duration of the drift test, and of a collision or hand guiding
-SOON = 0.1  # [s] within which a collision should be detected
-INSIDE = 0.1  # distance of postures from the joint limits, share of the joint ranges
+TRIES_PER_COLLISION = 20  # largest number of tries, because a collision needs a moving arm
+HEALTHY = 3600.0  # duration of healthy exploration, shared by the individuals [s]
+LEAST, MOST = 10.0, 50.0  # range of the external forces [N]
+LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide an arm in method `float` [N]
+MOVE = 4.0  # duration of the motion to a posture [s]
+PUSH = 1.5  # duration of a push at rest [s]
+EVALUATED = 0.5  # duration of its last part, over which estimates are averaged [s]
+APART = 3.0  # longest time between collisions [s]
+FLOATING = 30.0  # duration of the drift test [s]
+MOVED = 1.0  # duration of a collision, and of guiding the hand [s]
+SOON = 0.1  # a collision should be detected within this time [s]
+INSIDE = 0.1  # distance of postures from the joint limits, relative to the joint ranges
 
 
 class ContactLoop(ClosedLoop):

@@ -7,14 +7,17 @@ than `geometric`. `proposed` is as accurate as `second`, with less tension than 
 `second`.
 
 Here. The protocol is the same, in closed loop with the estimator and the controller of the nodes.
-Targets are postures that the true body can hold within [T_bias, T_limit]. Results are read 8 s
-after the command. Before each approach, `proposed` on the learned network moves the arm to the
-start. `geometric` uses the geometric model, and the other methods use the learned network. Methods
-with the suffix of a preset use the network of preset `paper`. QP bound: the least ‖T‖ with which
-the true body holds θ_eval. "Bound reached": the same at the posture where the arm came to rest,
-because an arm that sags needs less. The mean offset over all starts of a target is the error of the
-model; the scatter about it is hysteresis. If the controller stops, the arm’s position at that time
-counts, and so does the stop.
+Targets are postures that the true body can hold within [T_bias, T_limit]. `proposed` on the learned
+network moves the arm to each start. `geometric` uses the geometric model, and the other methods use
+the learned network. Methods with the suffix of a preset use the network of preset `paper`. Results
+are read 8 s after the command. If the controller stops, the arm’s position at that time counts, and
+so does the stop.
+
+- model error and hysteresis: the mean offset over all starts of a target is the error of the model;
+  the scatter about this mean is hysteresis
+- QP bound: the least ‖T‖ with which the true body holds θ_eval
+- bound reached: the least ‖T‖ with which the true body holds the posture in which the arm came to
+  rest. An arm that sags needs less than θ_eval does.
 """
 
 from collections.abc import Mapping
@@ -52,19 +55,19 @@ METHODS = {
     f'second_{PAPER_PRESET}': '#99D8C7',
     f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
-APPROACHES = 5  # number of θ_eval, and of starts for each
-# `second` ends after 5 s + 2 s. All methods are read at the same time.
-DURATION = 8.0  # [s]
-STARTING = 5.0  # [s] for the motion to a start
+APPROACHES = 5  # number of θ_eval, and number of starts for each of them
+# Time from the command until the results are read [s]. `second` ends after 5 s + 2 s.
+DURATION = 8.0
+STARTING = 5.0  # duration of the motion to a start [s]
 
 
 class Approaches(NamedTuple):
-    """Final states of an arm for P targets from S starts each; dictionaries are by method."""
+    """Final states of an arm after approaching P targets from S starts each, by method."""
 
     target: Array  # θ_eval [rad], (P, D)
-    bound: Array  # least ‖T‖ with which the true body holds each [N], (P,)
-    offset: dict[str, Array]  # θ − θ_eval at the end [rad], (P, S, D)
-    tension: dict[str, Array]  # ‖T‖ there [N], (P, S)
+    bound: Array  # least ‖T‖ with which the true body holds each target [N], (P,)
+    offset: dict[str, Array]  # θ − θ_eval at the end of each approach [rad], (P, S, D)
+    tension: dict[str, Array]  # ‖T‖ at the end of each approach [N], (P, S)
     #: least ‖T‖ that holds the final posture [N], (P, S); NaN if no tensions do, for example if
     #: the arm rests against a joint stop or by friction
     bound_there: dict[str, Array]
@@ -74,7 +77,7 @@ class Approaches(NamedTuple):
 def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
     """Approach `count` random targets from as many random starts each, by every method.
 
-    `seed` determines targets and starts; `networks` are by preset.
+    `seed` determines targets and starts. `networks` maps presets to their networks.
     """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
     postures = robot.random_postures(TRIES, rng)
@@ -125,7 +128,7 @@ def measure(study: Study, seed: int) -> Measured:
         common, held = offset.mean(axis=1, keepdims=True), np.isfinite(there)
         numbers[name] = {
             'error_rad': float(errors[name].mean()),
-            # About the mean of each θ_eval: the scatter by hysteresis (paper, §IV-C).
+            # Distance from the mean of each θ_eval: the scatter by hysteresis (paper, §IV-C).
             'error_var': float(errors[name].var(axis=1).mean()),
             # The mean offset of all starts is the model's error; the scatter is hysteresis.
             'common_rad': float(np.linalg.norm(common, axis=-1).mean()),
@@ -146,8 +149,8 @@ def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
     """Return what `proposed` plans, and its result on the same body without friction.
 
     The ratio of the planned ‖T‖ to the bound shows the error of the learned body. The additional
-    ‖T‖ of the frictionless arm arises because tensions are commanded as lengths. The remainder on
-    the arm with friction is friction.
+    ‖T‖ of the frictionless arm arises because tensions are commanded as lengths. What the arm with
+    friction adds to this is due to friction.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:
@@ -173,7 +176,7 @@ CAPTION = (
 
 
 def control(_: Study, rows: Rows) -> Plot:
-    """Draw the first individual, with a group of bars for each θ_eval."""
+    """Draw errors and tensions of the first individual, with a group of bars for each θ_eval."""
     seed, row = first_individual(rows)
     labels = [f'θ_eval {p + 1}' for p in range(len(row.traces['bound']))]
     figure = _bars(row.traces, labels, f'individual {seed}')

@@ -22,15 +22,18 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
-PAYLOAD = 3.6  # [kg], the printed dumbbell
-GRASPING = 60.0  # [s] from grasp to release and from release to grasp
-#: a muscle carries tension if T exceeds T_bias by this much, far beyond the sensor's noise
-CARRYING = 10.0  # [N]
-SLOT = 20.0  # [s] for each muscle: wait until it carries tension, rupture, mend, recover
-LATEST_RUPTURE, RUPTURE_TIME = 14.0, 3.0  # [s] in the slot; [s] until the muscle is repaired
-SLACKENING = 0.1  # [s] after a rupture until no tension is left
-RECOVERY = 2.0  # [s] after mending, while the arm swings back
-LONGEST_WAIT = 5.0  # [s] of the random wait, for ruptures both in motion and at rest
+PAYLOAD = 3.6  # mass of the dumbbell in the paper (§IV-B) [kg]
+GRASPING = 60.0  # time from grasp to release, and from release to grasp [s]
+#: a muscle carries tension if T exceeds T_bias by this much [N], far beyond the sensor's noise
+CARRYING = 10.0
+#: time for each muscle [s]: wait until it carries tension, rupture, repair, recover
+SLOT = 20.0
+LATEST_RUPTURE = 14.0  # latest time of the rupture, from the beginning of the slot [s]
+RUPTURE_TIME = 3.0  # time from the rupture until the muscle is repaired [s]
+SLACKENING = 0.1  # time after a rupture until no tension is left [s]
+RECOVERY = 2.0  # time after a repair in which the arm swings back [s]
+#: longest random wait before a rupture [s], so that muscles rupture both in motion and at rest
+LONGEST_WAIT = 5.0
 
 
 class GraspAndRupture:
@@ -47,19 +50,21 @@ class GraspAndRupture:
         """Plan a motion of `duration` [s], and the ruptures that follow it."""
         count, self._switched_off = robot.muscle_count, switched_off
         self.grasp, self._motion = 0.5 * duration, duration  # [s]
-        self.duration = duration + SLOT * count  # of the whole script [s]
-        # Messages of the motion without payload, and with it before the first rupture.
+        self.duration = duration + SLOT * count  # duration of the whole script [s]
+        # Messages of the motion without payload, and of that with payload before the first rupture.
         self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
         # Start with the second muscle, which the paper deactivates.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))]
         self.rupture = np.full(count, np.nan)  # time of each muscle's rupture [s], (M,)
-        self.carried: Bools = np.zeros(count, dtype=bool)  # whether it carried tension then, (M,)
+        self.carried: Bools = np.zeros(
+            count, dtype=bool
+        )  # whether each muscle carried tension when it ruptured, (M,)
         self._robot = robot
         self._wait = np.random.default_rng([seed, 0xC7]).uniform(0.0, LONGEST_WAIT, count)
 
     @property
     def counted(self) -> Ints:
-        """Muscles that carried tension when they ruptured; all if none did."""
+        """The muscles that carried tension when they ruptured, or all muscles if none did."""
         return np.flatnonzero(self.carried if self.carried.any() else ~self.carried)
 
     def while_ruptured(self, muscle: int) -> slice:
@@ -108,8 +113,8 @@ class DetectorOutput(NamedTuple):
     """The detector's outputs for N messages."""
 
     theta: Array  # estimated [rad], (N, D)
-    anomaly: Array  # A, scaled units, (N,)
-    distance: Array  # d, in healthy standard deviations, (N,)
+    anomaly: Array  # A in scaled units, (N,)
+    distance: Array  # d in healthy standard deviations, (N,)
     suspect: Ints  # the most suspect muscle, (N,)
     alarm: Bools  # whether the message completes a detection, (N,)
 

@@ -5,21 +5,24 @@ Paper (§IV-B). The same motions are estimated before and after learning: 0.414 
 error hardly rose when a 3.6 kg dumbbell was grasped. When muscle #2 was deactivated, A rose after
 learning but hardly before.
 
-Here. The networks of both presets before and after learning process one recording: the held-out
-motion, with 3.6 kg in the hand from its middle on. Then, with the payload, every muscle in turn
-ruptures for 3 s and is repaired. A muscle ruptures when it carries more than 10 N above T_bias,
-after at most 14 s. A muscle that never does ruptures at the end of the wait; it is shown in grey
-and not counted. Messages pass one by one through the detector of the estimator node. A rupture is
-detected by the first alarm that starts after it; an undetected rupture counts with 3 s. It is named
-correctly if the muscle is the suspect in that message. In a second recording, with 20 s of motion
-before and 20 s after the grasp, every muscle in turn is switched off instead, as in the paper
-("switched off"): its module is commanded zero tension for 3 s, and its tendon stays intact. Healthy
-messages are those of the held-out motion and of another motion in which the payload is grasped and
-released every minute, one hour in total over all individuals. False alarms are alarms that start in
-the latter. AUROC compares d of healthy messages with d of messages from 0.1 s after a rupture on.
-"Threshold" is the detector’s threshold of d. A and d "ruptured min" are the smallest median, over
-muscles, during a rupture. Preset `paper` decides by A instead of d; the detectors of the node that
-do not use the network (frozen sensors, heat) find nothing in these recordings.
+Here. The networks of both presets, before and after learning, process the same recordings. Messages
+pass one by one through the detector of the estimator node. The first recording is the held-out
+motion, with 3.6 kg in the hand from its middle on. Then every muscle in turn ruptures for 3 s and
+is repaired, still with the payload. A muscle ruptures as soon as it carries more than 10 N above
+T_bias. A muscle that has not done so after 14 s ruptures then; plots show it in grey, and it is not
+counted. In the second recording, every muscle in turn is switched off for 3 s instead, as in the
+paper: its module is commanded zero tension, and its tendon stays intact. Healthy messages are those
+of the held-out motion, and of one hour of motion (shared by the individuals) in which the payload
+is grasped and released every minute. Preset `paper` decides by A instead of d. The detectors of the
+node that do not use the network (frozen sensors, heat) find nothing in these recordings.
+
+- detected: an alarm starts during the fault; if none does, the delay counts as 3 s
+- named: the muscle is the most suspect one in the message that completes the detection
+- false alarms: alarms that start during the hour of healthy motion
+- AUROC: of d, for healthy messages against messages from 0.1 s after a rupture until the repair
+- threshold: the detector’s threshold of d
+- ruptured min: smallest level of A or d that a ruptured muscle caused (median over its rupture)
+- switched off: the same measures for the second recording
 """
 
 from collections.abc import Mapping
@@ -61,14 +64,19 @@ from musculoskeletal_ae.experiments.study import (
 )
 
 HEALTHY_STREAM = 9500
-HEALTHY_TIME = 3600.0  # [s] of motion for false alarms, over all individuals
-PLOT_START = 60.0  # [s] of the plots before the grasp
-PLOT_TAIL = 3.0  # [s] of the plots after mending
-OFF_TIME = 40.0  # [s] of motion before muscles are switched off
-#: moments of the pictures [s]: ends of the motion's cycles, without and with the payload
+#: duration of the healthy motion in which alarms are false, shared by the individuals [s]
+HEALTHY_TIME = 3600.0
+PLOT_START = 60.0  # time that plots show before the grasp [s]
+PLOT_TAIL = 3.0  # time that plots show after the repair [s]
+OFF_TIME = 40.0  # duration of the motion before muscles are switched off [s]
+#: times of the pictures [s], at ends of the motion's cycles without and with the payload
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
 OFF = 'switched_off'
-OFF_KEYS = ('detection_s', 'detected_share', 'named_share')  # reported for switched-off muscles
+OFF_KEYS = (
+    'detection_s',
+    'detected_share',
+    'named_share',
+)  # keys reported for switched-off muscles
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -124,13 +132,13 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 class Recordings(NamedTuple):
-    """What the networks of both presets process."""
+    """The recordings that the networks of both presets process."""
 
     plan: GraspAndRupture
-    faulty: Recording  # of `plan`
+    faulty: Recording  # recording of the ruptures that `plan` describes
     healthy: Recording
     plan_off: GraspAndRupture
-    switched_off: Recording  # of `plan_off`
+    switched_off: Recording  # recording of the switched-off muscles of `plan_off`
 
 
 def _preset(
@@ -138,7 +146,7 @@ def _preset(
 ) -> tuple[dict[str, Any], dict[str, DetectorOutput], dict[str, DetectorOutput]]:
     """Return a preset's numbers, and its outputs for the ruptures and for the switched-off muscles.
 
-    Outputs are by `before` and `after` learning.
+    The keys of the outputs are `before` and `after` (learning).
     """
     robot, networks = study.robot, study.networks(seed, preset)
     plan, faulty, healthy, plan_off, switched_off = recordings
@@ -285,7 +293,7 @@ def tracking(study: Study, rows: Rows) -> Plot:
 
 
 def cuts(study: Study, rows: Rows) -> Plot:
-    """Draw level and detection delay of every muscle's rupture."""
+    """Draw the level and the detection delay of the rupture of every muscle."""
     robot, numbers = study.robot, [row.numbers for row in rows.values()]
     figure, panels = plots.new_figure(12.0, 0.42 * robot.muscle_count + 1.9, 1, 3, sharey=True)
     place = np.arange(robot.muscle_count)

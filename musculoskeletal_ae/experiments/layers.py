@@ -6,11 +6,13 @@ affects the accuracy, but fewer units lower it.
 
 Here. Networks of preset `paper` with other hidden layers are trained on the geometric model, and
 then learn from the messages of the default preset’s exploration of one individual. Only the first
-individual is measured. "Model" is the mean error of θ, T and l on states of the geometric model
-that are not used for training, after initial training. "Before" and "after" are the errors of the
-estimate on the held-out motion, before and after online learning. "Trainings" is the number of
-random seeds over which the errors are means. A network whose initial training is so inaccurate that
-checkpoint validation rejects it does not learn.
+individual is measured. A network does not learn if checkpoint validation rejects it, because its
+initial training was too inaccurate.
+
+- model: mean error of θ, T and l after initial training, on states of the geometric model that were
+  not used for training
+- before, after: error of the estimate on the held-out motion, before and after online learning
+- trainings: number of random seeds over which the errors are means
 """
 
 from functools import partial
@@ -36,9 +38,9 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
-#: units of the encoder's hidden layers; the decoder's are the reverse, the latent layer is D + M
+#: units of the encoder's hidden layers. The decoder has the reverse, the latent layer D + M units.
 HIDDEN = {
-    'as printed: 200, 30': (200, 30),
+    'as in the paper: 200, 30': (200, 30),
     'fewer layers: 200': (200,),
     'more layers: 200, 100, 30': (200, 100, 30),
     'fewer units: 100, 30': (100, 30),
@@ -46,7 +48,7 @@ HIDDEN = {
     'fewer units: 20, 10': (20, 10),
 }
 TRAININGS = 1  # random seeds
-QUICK_STEPS = 600  # of initial training
+QUICK_STEPS = 600  # number of steps of a shortened initial training
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -88,7 +90,7 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
     numbers['before_rad'] = estimation_error(initial, held_out)
     try:
         learner = Learner(robot, initial, PAPER_PRESET, training)
-    except GateError:  # a network this inaccurate is not accepted as a start
+    except GateError:  # checkpoint validation rejects a network that is this inaccurate
         return numbers | {'after_rad': None}
     teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
     numbers['after_rad'] = estimation_error(learner.mae, held_out)

@@ -3,10 +3,10 @@
 
     min_θ Σ_m (l_m − l_m(θ, T))² / (σ_l² + (∂L_e/∂T)² (σ_T² + (μ_m T_m)²))
 
-On the true routes and elastic constants this is the oracle: a reference that estimators without
+With the true routes and elastic constants, this is the oracle: a reference that estimators without
 further knowledge can hardly beat. It takes friction as zero and does not know the sensors' offsets.
-On the geometric model it is the classical estimator without learning. On the calibrated body of a
-learner it separates the error of the body from that of the network.
+With the geometric model, it is the classical estimator without learning. With the calibrated body
+of a learner, it separates the error of the body from that of the network.
 """
 
 from collections.abc import Callable
@@ -23,9 +23,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 ITERATIONS = 30
-DAMPING = 1e-3  # of the normal matrix's diagonal
+DAMPING = 1e-3  # damping, relative to the diagonal of the normal matrix
 EVERY = np.s_[::10]  # every tenth message of a recording, because least squares is slow
-DIFFERENCE = 1e-4  # [rad] step of finite differences
+DIFFERENCE = 1e-4  # step of finite differences [rad]
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,13 @@ class LeastSquares:
     """Levenberg–Marquardt on a body model for many samples at once, within the joint limits."""
 
     robot: Robot
-    lengths: Callable[[Array, Array], Array]  # l [m] (N, M) of θ (N, D) and T [N] (N, M)
-    muscle_jacobian: Callable[[Array], Array]  # G [m/rad] (N, M, D) of θ (N, D)
+    lengths: Callable[[Array, Array], Array]  # maps θ (N, D) and T [N] (N, M) to l [m] (N, M)
+    muscle_jacobian: Callable[[Array], Array]  # maps θ (N, D) to G [m/rad] (N, M, D)
     length_at_zero: Array  # l_abs(0) [m], (M,)
     elastic: SeriesElastic
-    tension_noise: float = TENSION_NOISE  # [N]; with 0 all muscles have the same weight
-    friction: Array | float = 0.0  # tendon friction μ (M,), if it is known
+    #: standard deviation of a measured tension [N]; with 0, all muscles have the same weight
+    tension_noise: float = TENSION_NOISE
+    friction: Array | float = 0.0  # tendon friction μ (M,); 0 if it is unknown
 
     def estimate(self, tension: Array, length: Array) -> Array:
         """Return θ [rad] (N, D) for T [N] (N, M) and l [m] (N, M), starting at mid-range."""

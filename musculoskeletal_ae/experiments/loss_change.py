@@ -39,8 +39,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.02  # [s]
-FORCED = 30.0  # [deg]
+STEP = 0.02  # time step of the simulation [s]
+FORCED = 30.0  # angle to which the shoulder is forced [deg]
 
 
 class Phase(NamedTuple):
@@ -48,7 +48,7 @@ class Phase(NamedTuple):
 
     name: str
     duration: float  # [s]
-    force: tuple[float, float, float] = (0.0, 0.0, 0.0)  # on the hand [N]
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0)  # external force on the hand [N]
     forced: bool = False  # whether the shoulder is forced to `FORCED`
 
 
@@ -59,9 +59,11 @@ PHASES = (
     Phase('shoulder forced', 3.0, forced=True),
     Phase('released', 3.0),
 )
-SETTLING = Phase('settling', 5.0)  # of the emulated arm
+SETTLING = Phase('settling', 5.0)  # the emulated arm comes to rest before the experiment
 SHARED = PHASES[:3]  # phases that the emulated arm goes through as well
-ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1  # steps
+ENDS = (
+    np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1
+)  # index of the last step of each phase
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -115,7 +117,7 @@ def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
 
 
 def _command(robot: Robot, mae: Mae, theta: Array, preset: str) -> Array:
-    """Return the lengths with which a preset's `proposed` holds a posture, by a network."""
+    """Return the lengths that a preset's `proposed` commands to hold a posture, with a network."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
         return robot.muscle_lengths(theta, np.full(robot.muscle_count, robot.tension.bias))

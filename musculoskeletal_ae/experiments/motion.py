@@ -3,25 +3,26 @@
 
 Paper (§IV-C). Postures are approached in 5 s. The paper shows no fast motion.
 
-Here. After learning, the arm follows minimum-jerk trajectories between random postures that the
-true body can hold, in 1 s and in 2 s, each followed by 0.6 s of rest. Inverse dynamics computes the
-commands. "Tracking" is the mean of ‖θ_desired − θ_true‖ over the motion; "settled" is its value 0.5
-s after the end. The other methods have the same time: `proposed`, `first` and `second` receive the
-target with ramps as long as the motion, and `tension` receives the desired posture in every
-message. Where winches cannot follow, a trajectory is slowed; errors refer to the slowed trajectory,
-and "slowed" is its factor. The controller may use the full speed of the emulated winches. "Tension"
-is the ratio of the mean ‖T‖ to that of the least T ≥ T_bias that moves the true body along the
-path, by inverse dynamics. "Attainable" is the same ratio with the drag of the winches and the
-friction of tendons and joints included in the least T. "Settle" is the time from a target under
-`proposed` until the arm stays within 0.05 rad of it. The circles have a diameter of 10 cm and are
-random reachable ones; those of a planar arm lie in its plane. The position of the hand is sent by
-target_pose 50 times a second, at 0.1 m/s. Contact: forces of 10 to 50 N in random directions act on
-the hand, at rest in random holdable postures and during exploration. `wrench_error` is |‖F_est‖ −
-‖F‖| / ‖F‖ after a second. Forces that push joints against their stops, which then carry a part of
-the load, are included. Every contact in one hour of healthy exploration, divided among the
-individuals, is false. In method `float` the arm is first left alone and then pushed with 15 to 20
-N. There is no number if one of the other methods stops, or if no reachable circle exists. If the
-controller stops on a trajectory, the individual fails.
+Here. After learning, the arm follows minimum-jerk trajectories in 1 s and in 2 s between random
+postures that the true body can hold, and rests for 0.6 s after each. Inverse dynamics computes the
+commands. Three other methods approach the same postures in the same time with ramps (`proposed`,
+`first`, `second`), and `tension` receives the desired posture in every message. The controller may
+use the full speed of the emulated winches. Where they cannot follow, a trajectory is slowed, and
+errors refer to the slowed trajectory. Afterwards, `target_pose` moves the hand along circles of 10
+cm diameter at 0.1 m/s, with 50 poses a second; a planar arm draws them in its plane. Then forces of
+10 to 50 N in random directions act on the hand of the resting arm for 1.5 s, and of the exploring
+arm. At rest, a joint stop may carry a part of the force. In method `float` the arm is first left
+alone, and then guided with 15 to 20 N. If the controller stops on a trajectory, the individual
+fails. If another method stops, or if no circle is reachable, the number is missing.
+
+- tracking: mean of ‖θ_desired − θ_true‖ over the motion
+- settled: the same distance 0.5 s after the end of the motion
+- slowed: factor by which the duration of the trajectory was extended
+- tension: mean ‖T‖ relative to the least T ≥ T_bias that moves the true body along the same path
+- attainable: the same ratio if the least T also overcomes winch drag and friction
+- settle: time from a target of `proposed` until the arm stays within 0.05 rad of it
+- wrench_error: |‖F_est‖ − ‖F‖| / ‖F‖ in the last half second of a push
+- false contacts: contacts found in one hour of healthy exploration (shared by the individuals)
 """
 
 from collections.abc import Callable
@@ -59,10 +60,11 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-DURATIONS = (1.0, 2.0)  # [s]
+DURATIONS = (1.0, 2.0)  # durations of the motions [s]
 MOTIONS, CIRCLES = 6, 3
-STARTING = 3.0  # [s] to the first posture
-REST, SETTLED = 0.6, 0.5  # [s] of rest after a motion, and when the settled error is read
+STARTING = 3.0  # duration of the motion to the first posture [s]
+REST = 0.6  # duration of the rest after a motion [s]
+SETTLED = 0.5  # time in this rest at which the settled error is read [s]
 OURS = 'trajectory'
 METHODS = {
     OURS: plots.AFTER,
@@ -71,20 +73,21 @@ METHODS = {
     'first': '#E69F00',
     'second': '#009E73',
 }
-RADIUS, SPEED = 0.05, 0.1  # [m], [m/s]
-EVERY = 2  # messages between two poses
-NEAR = 0.002  # [m] largest distance at which a pose counts as reachable
-#: desired pose of the hand at a time [s]
+RADIUS, SPEED = 0.05, 0.1  # radius of a circle [m], and speed of the hand along it [m/s]
+EVERY = 2  # number of messages from one pose to the next
+NEAR = 0.002  # largest distance at which a pose counts as reachable [m]
+#: maps a time [s] to the desired pose of the hand
 Place = Callable[[float], pin.SE3]
-SETTLING_TIME, WITHIN = 4.0, 0.05  # [s] longest settling time, [rad] distance when settled
-LAP = 2.0 * np.pi * RADIUS / SPEED  # [s]
+SETTLING_TIME = 4.0  # longest settling time [s]
+WITHIN = 0.05  # distance from the target within which the arm has settled [rad]
+LAP = 2.0 * np.pi * RADIUS / SPEED  # duration of a circle [s]
 
 
 class TrackedMotion(NamedTuple):
-    """The N messages of one motion."""
+    """One motion of N messages: desired and true posture, and tension."""
 
-    desired: Array  # θ [rad], (N, D)
-    theta: Array  # true [rad], (N, D)
+    desired: Array  # desired θ [rad], (N, D)
+    theta: Array  # true θ [rad], (N, D)
     tension: Array  # true ‖T‖ during the motion itself [N], (N',)
     bound: Array  # the bounds of ‖T‖ during the motion, see `bounds` [N], (…, N')
     slowed: float  # factor by which the trajectory was slowed
@@ -156,8 +159,9 @@ def settling(loop: ClosedLoop, goal: Array) -> float:
 def bounds(arm: Arm, motion: Setpoint) -> Array:
     """Return the least ‖T‖ [N] that moves the true, exactly known body along a path.
 
-    The rows use inverse dynamics alone; also the drag of the winches; and also the friction of
-    tendons and joints. The last row exists only for emulator model `kin`: (3, N), otherwise (2, N).
+    Returns:
+        Three rows (3, N): by inverse dynamics alone; also with the drag of the winches; and also
+        with the friction of tendons and joints. The third exists only for emulator model `kin`.
     """
     robot, limits, true = arm.robot, arm.robot.tension, arm.individual
     jacobian, bias = true.muscle_jacobian(motion.theta), limits.bias

@@ -60,25 +60,26 @@ from musculoskeletal_ae.presets.registry import PAPER_PRESET, PRESETS, preset_na
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
-FIRST_ERRORS = 10.0  # [s] over which the mean error is the start of the exponential fit
-PRINTED_MINUTES = 10.0
-PRINTED = (0.324, 0.154)  # [rad] the printed fit at the start and after ten minutes
-QUICK_STEPS = 600  # of initial training; with fewer, a network of preset `paper` is rejected
+FIRST_ERRORS = 10.0  # the mean error of this time [s] is the start of the exponential fit
+PUBLISHED_MINUTES = 10.0
+PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
+#: number of steps of a shortened initial training; with fewer, preset `paper` is rejected
+QUICK_STEPS = 600
 NOTE_EVERY = 25  # mini-batches between two records of the training errors
 TEST_STATES = 1000  # number of test states
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
-#: maps the learner, the number of a message, true θ and joint-sensor readings [rad] (D,) to the θ
-#: that the learner receives, or None
+#: returns the θ [rad] (D,) that the learner receives, or None. Arguments: the learner, the index of
+#: the message, the true θ, and the joint-sensor readings
 JointView = Callable[[Learner, int, Array, Array], Array | None]
 
 
 class Curve(NamedTuple):
     """The course of learning over one stream of N messages."""
 
-    samples: list[int]  # number of samples before learning and after each update
-    errors: list[float]  # held-out errors at the same times [rad]
-    running: Array  # ‖θ_est − θ_sensor‖ of each message by the network at the time [rad], (N,)
+    samples: list[int]  # number of samples, before learning and after each update
+    errors: list[float]  # held-out error, before learning and after each update [rad]
+    running: Array  # ‖θ_est − θ_sensor‖ of each message, with the network of that time [rad], (N,)
 
 
 def teach(
@@ -145,7 +146,7 @@ def train_initial(study: Study, preset: str) -> None:
 
 
 def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
-    """Return a learner that starts with the initial network; `source` is its source of θ."""
+    """Return a learner that starts with the initial network and learns from θ of a `source`."""
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
 
@@ -209,13 +210,13 @@ def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) 
 
 
 def samples_to_halve(curve: Curve) -> int | None:
-    """Return the number of samples after which the error stays halved; None if it never does."""
+    """Return the number of samples after which the error stays halved, or None if it never does."""
     above = [i for i, error in enumerate(curve.errors) if error > 0.5 * curve.errors[0]]
     return None if above[-1] + 1 >= len(curve.errors) else curve.samples[above[-1] + 1]
 
 
 def exponential_fit(time: Array, error: Array) -> Array:
-    """Fit a + b e^{−t/c} to errors [rad] at times [s] (paper, §IV-A); return its values there."""
+    """Fit a + b e^{−t/c} to errors [rad] at times [s] (paper, §IV-A); return the fitted values."""
 
     def model(t: Array, a: float, b: float, c: float) -> Array:
         values: Array = a + b * np.exp(-t / c)
@@ -271,10 +272,10 @@ def online_learning(study: Study, rows: Rows) -> Plot:
         for curve in curves:
             right.plot(curve.samples, curve.errors, color=colour, lw=1.2, alpha=0.7, label=label)
             label = ''
-    if study.minutes >= PRINTED_MINUTES:
-        label = f'printed, on Musashi, 10 min: {PRINTED[0]} → {PRINTED[1]} rad'
-        at = 0.0, PRINTED_MINUTES
-        left.plot(at, PRINTED, 'o', color=plots.MARK, clip_on=False, label=label)
+    if study.minutes >= PUBLISHED_MINUTES:
+        label = f'paper, on Musashi, 10 min: {PUBLISHED[0]} → {PUBLISHED[1]} rad'
+        at = 0.0, PUBLISHED_MINUTES
+        left.plot(at, PUBLISHED, 'o', color=plots.MARK, clip_on=False, label=label)
     oracle = float(np.mean([row.numbers['oracle_rad'] for row in rows.values()]))
     right.axhline(oracle, color=plots.MARK, ls=':', label=f'oracle {oracle:.3f} rad')
     xlabel, ylabel = 'exploration time [min]', '‖θ_est − θ_sensor‖ [rad]'

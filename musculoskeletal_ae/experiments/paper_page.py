@@ -23,10 +23,10 @@ from musculoskeletal_ae.experiments.results import NOTHING, Results, Row, flat, 
 from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
-TEMPLATE = 'paper.md.jinja'  # beside this file
-#: rows of the tables, by the name that the template uses; they name no experiment twice
+TEMPLATE = 'paper.md.jinja'  # a file in the folder of this module
+#: rows of the tables, by the table's name in the template; each experiment is named once
 TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[Row, ...]])
-#: pictures of the page: name, and the plot of an experiment
+#: pictures of the page: file name, and the plot of an experiment that it shows
 PICTURES = {
     'figure_5': ('online_learning', 'online_learning'),
     'figure_6': ('body_change', 'length_against_angle'),
@@ -41,9 +41,10 @@ PICTURES = {
     'figure_13_motion': ('loss_change', 'loss_change'),
     'layers': ('layers', 'layers'),
 }
-LARGEST = 60_000  # [bytes] of a picture
-WIDEST, COLOURS = 1000, 128  # [pixels]; a small palette makes small files
-SMALLER = 0.9  # factor of the width until a picture is small enough
+LARGEST = 60_000  # largest size of a picture [bytes]
+WIDEST = 1000  # largest width of a picture [pixels]
+COLOURS = 128  # number of colours; a small palette makes small files
+SMALLER = 0.9  # a picture that is too large is repeatedly reduced by this factor
 
 
 def update_page(page: Path, measured: Path | None = None) -> list[Path]:
@@ -51,7 +52,8 @@ def update_page(page: Path, measured: Path | None = None) -> list[Path]:
 
     Args:
         page: File of the page; results and pictures are in the folder of the same name beside it.
-        measured: Output folder of `experiment`, from which both are first copied; or None.
+        measured: Output folder of `experiment`, from which results and pictures are first copied,
+            or None if they are already there.
     """
     folder, files = page.with_suffix(''), list[Path]()
     if measured is not None:
@@ -115,7 +117,7 @@ def rows(results: Results, name: str, table: str = '') -> str:
     Args:
         results: All results.
         name: Name of the experiment.
-        table: Name of the table in paper.yaml, if it is not that of the experiment.
+        table: Name of the table in paper.yaml, by default that of the experiment.
     """
     if name not in results:
         return ''
@@ -124,9 +126,7 @@ def rows(results: Results, name: str, table: str = '') -> str:
     lines = [f'| {_who(result)} | paper, on Musashi | {heading} |', '|---|---|---|---|']
     for row in TABLES[table or name]:
         cells = row.cells(result)
-        lines.append(
-            f'| {cells.quantity} | {cells.printed} | {cells.as_printed} | {cells.default} |'
-        )
+        lines.append(f'| {cells.quantity} | {cells.published} | {cells.paper} | {cells.default} |')
     return '\n'.join(lines)
 
 

@@ -16,10 +16,10 @@ from musculoskeletal_ae.robot.robot import Robot
 # Distinguishable with colour-vision deficiency and in grey.
 # The web page draws the estimated arm in the colour of AFTER.
 BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
-#: before and after learning
+#: colours of results before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110
-POINTS = 1500  # largest number of points of a line
+POINTS = 1500  # largest number of points of a drawn line
 
 #: positions of legends that never hide data
 LEGENDS: dict[str, dict[str, Any]] = {
@@ -27,9 +27,9 @@ LEGENDS: dict[str, dict[str, Any]] = {
     'above': {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncols': 4, 'frameon': False},
     'below': {'loc': 'upper center', 'bbox_to_anchor': (0.5, -0.16), 'ncols': 2},
 }
-MARGIN = 0.03  # [m] round an arm
-HEADER = 0.9  # [inch] height of the titles
-VIEW = (12.0, -35.0)  # [deg] elevation, azimuth: mainly from the front
+MARGIN = 0.03  # free space around an arm [m]
+HEADER = 0.9  # height of the titles [inch]
+VIEW = (12.0, -35.0)  # elevation and azimuth of the camera [deg]: mainly from the front
 STYLES: dict[str, dict[str, Any]] = {
     'bones': {'linewidth': 6.0, 'solid_capstyle': 'round', 'zorder': 1},
     'muscles': {'linewidth': 2.0, 'zorder': 2},
@@ -93,7 +93,7 @@ def ranked_bars(
 ) -> None:
     """Draw one bar per name: the mean over individuals, a dot for each, and the mean in a column.
 
-    `values` are by name; None stands for no value.
+    `values` maps names to the individuals' values; None stands for no value.
     """
     place = np.arange(len(values))
     numbers = {name: np.array(each, dtype=float) for name, each in values.items()}

@@ -23,8 +23,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions, end_tension
 
-PAID_OUT = 0.1  # [m] beyond its command, at which a muscle is slack in any posture
-SAMPLE_TIME = 0.01  # [s], 100 Hz as the modules report
+PAID_OUT = 0.1  # a muscle this much longer than its command is slack in any posture [m]
+SAMPLE_TIME = 0.01  # time between two messages [s]; the modules report at 100 Hz
 #: random seeds of the exploration (plus the individual's seed) and of the held-out motion
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
@@ -38,8 +38,8 @@ class Recording(NamedTuple):
 
     theta: Array  # true joint angles [rad], (N, D)
     theta_sensor: Array  # joint-sensor readings [rad], (N, D)
-    length: Array  # measured [m], (N, M)
-    tension: Array  # measured [N], (N, M)
+    length: Array  # measured lengths [m], (N, M)
+    tension: Array  # measured tensions [N], (N, M)
     command: Array  # l_target [m], (N, M)
 
     def part(self, rows: slice) -> Recording:
@@ -50,8 +50,8 @@ class Recording(NamedTuple):
 class Motion(NamedTuple):
     """N steps of an arm or of its simulator."""
 
-    theta: Array  # [rad], (N, D)
-    tension: Array  # [N], (N, M)
+    theta: Array  # joint angles θ [rad], (N, D)
+    tension: Array  # muscle tensions T [N], (N, M)
 
 
 class ClosedLoop:
@@ -61,7 +61,7 @@ class ClosedLoop:
     """
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
-        """Connect an arm in its present posture; `seed` is that of the exploration."""
+        """Connect an arm in its present posture. `seed` determines the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self._direction = FrictionDirection()
         self._read, self._now = arm.sense(), 0.0

@@ -4,18 +4,23 @@
 Paper (§III-D). A switched-off muscle is detected, but the estimate continues to use it. The
 successor of the method (arXiv 2409.14951) continues without a ruptured muscle.
 
-Here. The held-out motion is estimated with every muscle isolated in turn, with every pair isolated,
-and with all muscles. Then estimator and controller, connected as in the nodes with `on_anomaly:
-isolate`, control the exploring arm. Every muscle ruptures in turn; the isolation is correct if
-exactly this muscle is isolated as broken within 10 s. After that `proposed` moves, for at most a
-minute, to random postures that the true body can hold without the muscle. "Held" is the share of
-all holdable postures that remain holdable without it; if there are none, the muscle has no targets
-but counts otherwise. "Known" is the share of these targets that the learned body considers
-holdable; the others are refused. "Trapped" counts the targets at which the arm lay on a stop where
-the remaining muscles cannot hold it. Every length and tension sensor fails in turn (it reads 0).
-The error counts from the isolation on, or from the fault if nothing is isolated. Healthy
-exploration lasts five hours over all individuals. 3.6 kg are grasped or released each minute, and a
-force of 10 to 30 N acts for a second every ten seconds. Every isolation there is wrong.
+Here. The held-out motion is estimated with all muscles, without each muscle and without each pair
+of muscles. Then the arm explores in closed loop through estimator and controller, with `on_anomaly:
+isolate`, until a muscle ruptures. An isolation is correct if exactly this muscle is isolated as
+broken within 10 s. Afterwards, `proposed` moves the arm to random postures that the true body can
+hold without the muscle, for at most a minute each. Every muscle is ruptured in turn. In the same
+way, every length sensor and every tension sensor fails in turn: it reads 0. The error of the
+estimate is averaged from the isolation on, or from the fault if nothing is isolated. Finally,
+healthy arms explore for five hours, shared by the individuals. They grasp or release 3.6 kg each
+minute, and a force of 10 to 30 N acts on the hand for one of every ten seconds. Every isolation of
+these hours is wrong.
+
+- held: share of the holdable postures that remain holdable without the muscle; if there are none,
+  the muscle has no targets, but its other numbers count
+- known: share of the targets that the learned body considers holdable; the controller refuses
+  others
+- trapped: number of targets whose motion ended at a joint stop, in a posture that the remaining
+  muscles can neither hold nor leave
 """
 
 from itertools import combinations
@@ -40,17 +45,18 @@ from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Row
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.tension import holding_tension
 
-EVERY = 10  # messages of the held-out motion
+EVERY = 10  # every tenth message of the held-out motion is evaluated
 TARGETS = 2
-MOVING = 12.0  # [s] before a fault
-LATEST_VERDICT = 10  # [s] until the fault is isolated
-AFTERWARDS = 6.0  # [s] after the isolation
-#: [s] to a target at most; winches slow the motion, and a fallen arm is sent again
+MOVING = 12.0  # duration of healthy motion before a fault [s]
+LATEST_VERDICT = 10  # longest time from a fault to its isolation [s]
+AFTERWARDS = 6.0  # duration of the motion after an isolation [s]
+#: longest time to a target [s]; winches slow the motion, and a fallen arm is sent again
 LONGEST_APPROACH = 60
-SETTLING = 4  # [s] at rest until the arm has arrived
-STILL = 0.02  # [rad] change of a joint in a second below which the arm rests
-HEALTHY_TIME = 18_000.0  # [s] over all individuals
-PUSH_EVERY, PUSH = 10.0, (10.0, 30.0)  # [s], [N]
+SETTLING = 4  # after this time at rest, the arm has arrived [s]
+STILL = 0.02  # the arm rests if no joint moves more than this in a second [rad]
+HEALTHY_TIME = 18_000.0  # duration of healthy exploration, shared by the individuals [s]
+PUSH_EVERY = 10.0  # time from one push to the next [s]
+PUSH = (10.0, 30.0)  # range of the forces of pushes [N]
 
 
 class IsolatingLoop(ClosedLoop):
@@ -63,7 +69,7 @@ class IsolatingLoop(ClosedLoop):
         self._latched, self.isolated = False, tuple[int, ...]()
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
-        self.error = np.nan  # ‖θ_est − θ‖ of the last message [rad]
+        self.error = np.nan  # ‖θ_est − θ‖ at the last message [rad]
         super().__init__(arm, mae, Settings(), seed)
 
     def use(self, mae: Mae) -> None:
@@ -141,7 +147,8 @@ class Reach(NamedTuple):
 
     Attributes:
         share: Share of the holdable postures of the true body that remain holdable.
-        distances: Final distance of `proposed` from some of them [rad]; None if it refused.
+        distances: Final distance of `proposed` from each target [rad], or None if it refused the
+            target.
         trapped: Those distances of an arm that fell to a posture on a stop where the remaining
             muscles can neither hold nor lift it.
     """
@@ -195,7 +202,7 @@ def measure_reach(loop: IsolatingLoop, muscle: int, rng: np.random.Generator) ->
 def isolations_of_healthy_arm(
     arm: Arm, mae: Mae, seed: int, duration: float
 ) -> list[tuple[int, ...]]:
-    """Return the muscles that each verification isolated on a healthy arm; () if none."""
+    """Return the muscles that each verification isolated on a healthy arm, or () without any."""
     loop, rng = IsolatingLoop(arm, mae, seed), np.random.default_rng([seed, 0x4EA])
     loop.run(1.0)
     every, wrench = round(PUSH_EVERY / SAMPLE_TIME), np.zeros(6)

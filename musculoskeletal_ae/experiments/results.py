@@ -37,14 +37,15 @@ from musculoskeletal_ae.schema import Strict, convert
 #: result.json of every experiment that was run, by its name
 Results = Mapping[str, Mapping[str, Any]]
 
-#: sums over individuals instead of means, because the healthy time is divided among the individuals
+#: quantities of which the sum over individuals is reported instead of the mean, because the
+#: individuals share the healthy time
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
 TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
-BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers of the results table
+BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers around the results table
 KEPT = Path('doc/results')
 BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
-TEMPLATE = 'report.html.jinja'  # beside this file
+TEMPLATE = 'report.html.jinja'  # a file in the folder of this module
 NOTHING = '–'
 
 
@@ -161,9 +162,9 @@ class Result(Struct, frozen=True):
     """Contents that all result.json files share, beside the numbers of their experiment."""
 
     about: About
-    seeds: dict[str, dict[str, Any]]  # numbers by individual
+    seeds: dict[str, dict[str, Any]]  # numbers of each individual, by its seed
     plots: tuple[Plot, ...] = ()
-    failed: dict[str, str] = {}  # reason by individual
+    failed: dict[str, str] = {}  # reason of each failure, by the individual's seed
 
 
 def read(folder: Path) -> Results:
@@ -218,25 +219,25 @@ def _mean(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 class Cells(NamedTuple):
-    """One row of the table as text."""
+    """The cells of one row of the results table, as text."""
 
     quantity: str
-    printed: str
-    as_printed: str
+    published: str
+    paper: str
     default: str
     bound: str
     aim: str
-    verdict: str  # 'met', by how much the aim is missed, or '' without aim or number
+    verdict: str  # 'met', or by how much the goal is missed; '' without a goal or a number
 
 
 class Row(Strict, frozen=True):
     """One quantity of an experiment; keys are dotted paths in its result.json."""
 
-    quantity: str  # with its unit
+    quantity: str  # name of the quantity, with its unit
     default: str  # key of the value with the preset of the run
-    printed: str = NOTHING  # value that the paper prints for Musashi
-    as_printed: str = ''  # key of the value with preset `paper`, whose name replaces {preset}
-    bound: str = ''  # key of the reference
+    published: str = NOTHING  # value that the paper reports for Musashi
+    paper: str = ''  # key of the value of preset `paper`; its name replaces {preset}
+    bound: str = ''  # key of the reference value
     aim: float | None = None  # goal: the highest value, or the lowest if `more_is_better`
     digits: int = 3
     more_is_better: bool = False
@@ -253,18 +254,16 @@ class Row(Strict, frozen=True):
 
     def cells(self, result: Mapping[str, Any]) -> Cells:
         """Return the row for a result.json."""
-        as_printed_key = self.as_printed.format(preset=PAPER_PRESET)
-        numbers = [self.number(result, key) for key in (as_printed_key, self.default, self.bound)]
-        as_printed, default, bound = (
-            NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers
-        )
+        paper_key = self.paper.format(preset=PAPER_PRESET)
+        numbers = [self.number(result, key) for key in (paper_key, self.default, self.bound)]
+        paper, default, bound = (NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers)
         number, aim, verdict = numbers[1], NOTHING, ''
         if self.aim is not None:
             aim = f'{"≥" if self.more_is_better else "≤"} {self.aim:g}' if self.aim else '0'
             if number is not None:
                 missed = self.aim - number if self.more_is_better else number - self.aim
                 verdict = 'met' if missed <= 0.0 else f'missed by {missed:.{self.digits}f}'
-        return Cells(self.quantity, self.printed, as_printed, default, bound, aim, verdict)
+        return Cells(self.quantity, self.published, paper, default, bound, aim, verdict)
 
 
 #: rows of the results table, by experiment
@@ -304,9 +303,7 @@ def readme_table(results: Results) -> str:
     for name in filter(ROWS.get, results):
         text += f'\n| **`experiment {name}`** | | | | | |'
         for each in table({name: results[name]}):
-            text += (
-                f'\n| {each.quantity} | {each.printed} | {each.as_printed} | **{each.default}** | '
-            )
+            text += f'\n| {each.quantity} | {each.published} | {each.paper} | **{each.default}** | '
             text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
     return ''.join([text, *(f'\n\nFailed: {line}' for line in failures(results)), '\n\n'])
 

@@ -4,15 +4,18 @@
 Paper (§IV-A). The learned body is a physical robot, whose deviations from the geometric model are
 unknown.
 
-Here. The default network and preset `paper` explore individuals of both emulator models, as in
-online learning. The body of `kin` differs from its geometric model only in ways that the learner
-can fit; `foreign` also has mechanics that the learner does not model. Oracle: least squares on one
-message with the true routes and elastic constants. The informed oracle also knows the errors of the
-tension and length sensors, and the friction of each tendon. Neither knows what a single message
-does not contain: the sliding direction of a tendon, hysteresis, creep and drift. The results
-include the error of the joint sensors, because the network learns from them. The ablation removes
-one group of effects of `foreign` and keeps the rest of the individual. "Links" adds an effect:
-errors of link lengths, axes and masses, which the paper assumes to be exact.
+Here. The default network and that of preset `paper` explore individuals of both emulator models, as
+in online learning. The body of `kin` differs from its geometric model only in ways that the learner
+can fit; `foreign` also has mechanics that the learner does not model. The results include the error
+of the joint sensors, because the networks learn from them. The ablation removes one group of
+effects of `foreign`, and keeps the rest of the individual.
+
+- oracle: least squares on one message with the true routes and elastic constants
+- informed oracle: the same with the true errors of the tension and length sensors, and the true
+  friction of each tendon. Neither oracle knows what one message does not show: the sliding
+  direction of a tendon, hysteresis, creep and drift.
+- links: an additional effect, errors of link lengths, axes and masses. The paper assumes that these
+  are exact.
 """
 
 import json
@@ -39,7 +42,7 @@ from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Row
 from musculoskeletal_ae.presets.registry import PAPER_PRESET, PRESETS
 
 REALITIES = KIN, FOREIGN
-#: effects that the ablation removes, by group
+#: groups of effects of which the ablation removes one at a time
 ABLATED = {
     'route points': ('attachment',),
     'kinks, slip-over': ('kinks', 'slip_over'),
@@ -55,8 +58,9 @@ ABLATED = {
 }
 QUICK = ('friction',)
 ABLATION_INDIVIDUALS = 3
-REPEATED = 'nothing: another run'  # the difference between runs that explore other postures
-OTHER_RUN = 1000  # offset of the seed of exploration and training of that run
+#: nothing is removed: another exploration shows the difference between runs
+REPEATED = 'nothing: another run'
+OTHER_RUN = 1000  # added to the seed of exploration and training for the other run
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -136,7 +140,7 @@ def _error_with_effects(
 ) -> float:
     """Return the error after learning on an individual with some effects changed [rad].
 
-    `run` is the seed of exploration and training, by default that of the individual.
+    `run` is the seed of exploration and training, by default the seed of the individual.
     """
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -152,7 +156,7 @@ def _error_with_effects(
     return estimation_error(learner.mae, held_out)
 
 
-#: labels and colours of the errors that the charts compare, by key
+#: label and colour of each error that the charts compare, by its key
 ESTIMATES = {
     'before_rad': ('before learning', plots.BEFORE),
     'least_squares_rad': ('least squares, geometric model', plots.MARK),

@@ -12,19 +12,22 @@ ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
 
 
 def elbow(robot: Robot) -> int:
-    """Return the joint to flex: elbow_pitch, else an elbow, else the last revolute joint."""
+    """Return the joint to flex: elbow_pitch, or else an elbow, or else the last revolute joint."""
     return _named(robot, ELBOW, -1)
 
 
 def elbows(robot: Robot) -> Bools:
-    """Return which joints are elbows, (D,): those so named, else the joint to flex."""
+    """Return a mask of the elbow joints, (D,).
+
+    These are all joints with "elbow" in their names. Without any, it is the joint of `elbow`.
+    """
     named = np.array([ELBOW[-1] in name for name in robot.joints])
     named[elbow(robot)] |= not named.any()
     return named
 
 
 def shoulder(robot: Robot) -> int:
-    """Return the joint to sweep: shoulder_pitch, else a shoulder, else the first revolute joint."""
+    """Return the joint to sweep: shoulder_pitch, or a shoulder, or the first revolute joint."""
     return _named(robot, SHOULDER, 0)
 
 

@@ -27,8 +27,8 @@ EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES
 }
 LEARNING = 'online_learning'
-POLL = 0.5  # [s] between two reports
-Part = tuple[str, int]  # an experiment and a seed; or a preset to train
+POLL = 0.5  # time between two reports [s]
+Part = tuple[str, int]  # an experiment and a seed, or a preset to train and -1
 
 # Threads of the numeric libraries would compete with the processes for the cores.
 SINGLE = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL', 'NUMBA')}

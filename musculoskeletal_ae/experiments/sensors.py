@@ -5,11 +5,16 @@ Paper (§II-A). Musashi has joint sensors at few joints, and a marker on the han
 others. The paper does not measure the error with fewer or no joint sensors.
 
 Here. Learners with fewer sensors learn from the messages of the default network’s exploration,
-which used all joint sensors. The sensors are: all joint sensors; only those of the elbows (joints
-so named, else the last revolute joint); none; none, but a marker on the hand in one of ten samples,
-by the estimator’s inverse kinematics; none, but an accelerometer on the hand’s link. All are
-evaluated on the held-out motion. "In the ellipsoid" is the share of its messages whose true joint
-angles lie within the network’s 95 % confidence ellipsoid, with all joint sensors and with none.
+which used all joint sensors. All are evaluated on the held-out motion.
+
+- all: all joint sensors
+- elbow: only the joint sensors of the elbows (joints so named, or else the last revolute joint)
+- none: no joint sensors
+- marker: no joint sensors, but a marker on the hand in one of ten samples, from which the estimator
+  computes θ by inverse kinematics
+- accelerometer: no joint sensors, but an accelerometer on the hand’s link
+- in the ellipsoid: share of the messages whose true joint angles lie within the network’s 95 %
+  confidence ellipsoid, with all joint sensors and with none
 """
 
 import numpy as np
@@ -32,8 +37,8 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
-CAMERA = 10  # messages per picture of the camera, or per message of the accelerometer
-SIGHTED = 10  # samples per sample in which the camera detects the marker
+CAMERA = 10  # number of muscle messages for each message of the camera or the accelerometer
+SIGHTED = 10  # the camera detects the marker in one of this many samples
 
 
 def measure(study: Study, seed: int) -> Measured:

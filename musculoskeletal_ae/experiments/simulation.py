@@ -29,8 +29,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-PRINTED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
-CYCLE = 10.0  # [s] duration of the exploration's three steps
+PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
+CYCLE = 10.0  # duration of the exploration's three steps [s]
 MOMENTS = 5
 
 
@@ -82,7 +82,7 @@ def simulation_pictures(study: Study, rows: Rows) -> Plot:
     """Draw arm and simulators at several moments."""
     seed, (_, traces) = first_individual(rows)
     arm = traces[study.preset]['arm']
-    # Moments near the ends of cycles, where the arm rests at the random tensions of the third step.
+    # Times near the ends of cycles, where the arm rests at the random tensions of the third step.
     cycles = np.arange(len(arm.theta) * SAMPLE_TIME // CYCLE)
     chosen = np.linspace(0, len(cycles) - 1, min(MOMENTS, len(cycles))).round().astype(int)
     steps = ((cycles[chosen] * CYCLE + 9.9) / SAMPLE_TIME).astype(int)
@@ -107,14 +107,14 @@ def simulation_errors(_: Study, rows: Rows) -> Plot:
     for column, (preset, motions) in enumerate(traces.items()):
         distances = {when: _distances(motions[when], motions['arm']) for when in plots.WHEN}
         both = panels[column :: len(traces)]
-        for panel, key, unit, symbol in zip(both, PRINTED, ('rad', 'N'), 'θT', strict=True):
+        for panel, key, unit, symbol in zip(both, PUBLISHED, ('rad', 'N'), 'θT', strict=True):
             for when, colour in plots.WHEN.items():
                 values = distances[when][key]
                 label = f'{when} learning: {values.mean():.3g} {unit}'
                 time = times(len(values))
                 plots.line(panel, time, values, 25, color=colour, lw=0.9, label=label)
-            before, after = PRINTED[key]
-            label = f'printed: {before:g} → {after:g} {unit}'
+            before, after = PUBLISHED[key]
+            label = f'paper: {before:g} → {after:g} {unit}'
             panel.axhline(after, color=plots.MARK, ls=':', lw=1, label=label)
             panel.set_ylim(bottom=0.0)
             ylabel = f'‖{symbol}_sim − {symbol}‖ [{unit}]' if column == 0 else ''

@@ -36,9 +36,9 @@ DIGITS = 6  # significant digits of results; further digits are noise
 class RestSamples(NamedTuple):
     """The N rest samples that a learner stored."""
 
-    theta: Array  # [rad], (N, D)
-    tension: Array  # [N], (N, M)
-    length: Array  # [m], (N, M)
+    theta: Array  # joint angles θ [rad], (N, D)
+    tension: Array  # muscle tensions T [N], (N, M)
+    length: Array  # muscle lengths l [m], (N, M)
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Study:
     """Options of one run, and access to the files that its experiments share."""
 
     robot: Robot
-    preset: str  # of the networks that plots show as `before` and `after`
-    seeds: tuple[int, ...]  # of the individuals
-    minutes: float  # duration of the exploration
+    preset: str  # preset of the networks that plots show as `before` and `after`
+    seeds: tuple[int, ...]  # seeds of the individuals
+    minutes: float  # duration of the exploration [min]
     quick: bool  # whether to shorten everything, for a trial run
-    folder: Path  # of streams and networks
+    folder: Path  # folder of the recorded streams and the networks
     reality: str = 'kin'  # emulator model of the individuals, see `make_arm`
 
     def remember(self, part: str, measure: Callable[[], Any]) -> Any:
@@ -129,8 +129,10 @@ class Study:
 class Measured(NamedTuple):
     """The results of an experiment for one individual."""
 
-    numbers: dict[str, Any]  # for result.json: nested dictionaries of finite numbers, text or lists
-    traces: dict[str, Any]  # for the plots
+    numbers: dict[
+        str, Any
+    ]  # contents of result.json: nested dictionaries of finite numbers, text or lists
+    traces: dict[str, Any]  # data of the plots
 
 
 def round_numbers(value: Any) -> Any:
@@ -162,7 +164,8 @@ def first_individual(rows: Rows) -> tuple[int, Measured]:
 class Experiment(NamedTuple):
     """One experiment: its description, its measurement on an individual, and its plots."""
 
-    #: the module's docstring in three paragraphs: heading; "Paper (section). …"; "Here. …"
+    #: the module's docstring: a heading, "Paper (section). …", "Here. …", and possibly a list of
+    #: terms (lines that start with "- "), with an empty line between them
     text: str | None
     measure: Callable[[Study, int], Measured]  # measures the individual of a seed
     #: each draws the plot with its name, or returns None if a kept part has no data for it

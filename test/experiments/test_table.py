@@ -70,7 +70,7 @@ def test_a_page_without_results_is_refused(tmp_path):
 @pytest.mark.parametrize(('name', 'row'), ROWS, ids=[row.quantity for _, row in ROWS])
 def test_every_row_is_filled_from_the_committed_results(name, row):
     result = read(REPOSITORY / KEPT)[name]
-    for key in filter(None, (row.as_printed.format(preset=PAPER_PRESET), row.default, row.bound)):
+    for key in filter(None, (row.paper.format(preset=PAPER_PRESET), row.default, row.bound)):
         assert row.number(result, key) is not None, key
 
 
