@@ -24,7 +24,7 @@ from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.jumps import REDRAWN, jumping
+from musculoskeletal_ae.robot.jumps import MOST_DRAWS, jumping
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -99,7 +99,7 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
         return jumping(ForeignBody(robot, model, draw).absolute_lengths, robot)
 
     smooth = ~slipping(mjcf.from_directory(robot, Draw(0, NONE), again).compile())
-    while again.max() < REDRAWN and (wrong := slipping(model) & smooth).any():
+    while again.max() < MOST_DRAWS and (wrong := slipping(model) & smooth).any():
         again += wrong
         model = mjcf.from_directory(robot, draw, again).compile()
     return model
@@ -109,7 +109,7 @@ def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
     """Make the body of a file an individual; its tendons jump only where those of the file do."""
     smooth = ~jumping(ForeignBody(robot, copy.copy(model), draw).absolute_lengths, robot)
     attachments = deviation.Attachments(robot, model, draw)
-    for _ in range(REDRAWN):
+    for _ in range(MOST_DRAWS):
         body = ForeignBody(robot, copy.copy(model), draw)
         if not (wrong := smooth & jumping(body.absolute_lengths, robot)).any():
             break

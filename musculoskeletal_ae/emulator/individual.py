@@ -12,7 +12,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import Placed, Tree, WrappedRoutes, wrapped_lengths
-from musculoskeletal_ae.robot.jumps import REDRAWN, jumping
+from musculoskeletal_ae.robot.jumps import MOST_DRAWS, jumping
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
@@ -75,7 +75,7 @@ class Individual:
         self.routes = routes(off)
         if nominal.objects is not None:
             again = np.random.default_rng([seed, 0x1A7])
-            redrawn = again.normal(0.0, spread.attachment, (REDRAWN, *off.shape))
+            redrawn = again.normal(0.0, spread.attachment, (MOST_DRAWS, *off.shape))
             self._redraw_jumping_routes(robot, off, redrawn, routes)
         factor = np.exp(rng.normal(0.0, spread.elastic, (3, muscles)))
         constants = zip(vars(robot.series_elastic).values(), factor, strict=True)

@@ -36,21 +36,29 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
 
-REQUIRED_SHARE = 0.95  # of the postures that must be held, and that must be stiff
-# The required stiffness is the smaller of REQUIRED_STIFFNESS [N·m/rad] and REQUIRED_BY_LOAD [1/rad]
-# times the largest load of a joint. With the latter, a change of that load by a tenth moves no
-# joint by more than 0.05 rad.
-REQUIRED_STIFFNESS, REQUIRED_BY_LOAD = 5.0, 2.0
-LEAST_INERTIA = 1e-12  # [kg·m²]; smaller values are rounding errors
-SLACK_MARGIN = 1e-3  # [N] above T_bias, because the solver meets a bound only to rounding
-# A moment arm counts if it is longer than the smaller of MATTERS [m] (which makes 1 N·m of 300 N)
-# and MATTERS_SHARE of the longest one at its joint, but at least MATTERS_LEAST [m].
-MATTERS, MATTERS_SHARE, MATTERS_LEAST = 0.003, 0.1, 1e-4
-SHORT = 0.015  # [m]; in emulated individuals, shorter moment arms deviate by half or more
-TOLERATED_SHARE = 0.05  # of the postures, in which a sign or a direction may be missing
-TOUCHED = 1e-6  # [m] added by wrapping; less is a rounding error
-LONGEST_ARM = 1.0  # [m]; a longer moment arm is taken to be in millimetres
-WIDEST = 4.0 * np.pi, 10.0  # wider joint limits are taken to be degrees [rad], millimetres [m]
+#: smallest share of postures that a sound arm holds, and in which it is stiff
+REQUIRED_SHARE = 0.95
+# The required stiffness is the smaller of REQUIRED_STIFFNESS and STIFFNESS_PER_LOAD times the
+# largest load of a joint. With the latter, a change of that load by a tenth moves no joint by more
+# than 0.05 rad.
+REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
+STIFFNESS_PER_LOAD = 2.0  # [1/rad]
+LEAST_INERTIA = 1e-12  # inertia of a joint below which the value is a rounding error [kg·m²]
+#: tension above T_bias up to which a muscle counts as slack [N], because the solver rounds
+SLACK_MARGIN = 1e-3
+# A moment arm counts if it is longer than the smaller of COUNTED_ARM and COUNTED_ARM_SHARE of the
+# longest one at its joint, but at least LEAST_COUNTED_ARM.
+COUNTED_ARM = 0.003  # moment arm with which a tension of 300 N produces about 1 N·m [m]
+COUNTED_ARM_SHARE = 0.1
+LEAST_COUNTED_ARM = 1e-4  # [m]
+#: length below which a moment arm of an emulated individual deviates by half or more [m]
+SHORT_ARM = 0.015
+TOLERATED_SHARE = 0.05  # share of postures in which a sign or a direction may be missing
+LEAST_DETOUR = 1e-6  # length added by wrapping below which the value is a rounding error [m]
+LONGEST_ARM = 1.0  # moment arm above which the points are assumed to be in millimetres [m]
+#: ranges above which joint limits are assumed to be in degrees (revolute, [rad]) or in millimetres
+#: (prismatic, [m])
+WIDEST_RANGES = 4.0 * np.pi, 10.0
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
 
@@ -62,7 +70,7 @@ class FindingTexts(Strict, frozen=True, array_like=True):
     remedy: str
 
 
-#: texts by kind; the part after a comma distinguishes variants of a kind
+#: texts by kind of finding; the part of a key after a comma distinguishes variants of a kind
 FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
 
 
@@ -108,9 +116,9 @@ class RobotCheck:
     setting: Setting
     moment_arms: Array  # r [m], (N, M, D)
     tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
-    missing_torque: Array  # torque lacking where a posture is not held [N·m], (N, D)
+    missing_torque: Array  # torque that the muscles lack to hold a posture [N·m], (N, D)
     stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
-    one_sided: Array  # the same with muscles at the bias tension slack, (N,)
+    one_sided: Array  # like `stiffness`, with muscles at the bias tension counted as slack, (N,)
     required: float  # required stiffness [N·m/rad]
     matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
     faults: tuple[Finding, ...]  # reasons why the arm is not sound; empty if it is
@@ -128,7 +136,7 @@ class RobotCheck:
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
-    """Check a robot in random postures, and its description.
+    """Check the muscles of a robot in random postures, and look for suspicious descriptions.
 
     Args:
         robot: The robot.
@@ -152,14 +160,18 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 
 
 def judge(setting: Setting) -> RobotCheck:
-    """Check the muscles of a robot in the postures of a setting; errors as for `check_robot`."""
+    """Check the muscles of a robot in the postures of a setting.
+
+    Raises:
+        RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
+    """
     robot, theta, jacobian, hessian, torque, *_ = setting
     bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
     load = float(robot.joint_load(setting.weight, jacobian).max())
-    required = min(REQUIRED_STIFFNESS, REQUIRED_BY_LOAD * load)
+    required = min(REQUIRED_STIFFNESS, STIFFNESS_PER_LOAD * load)
     longest = np.abs(arms).max(axis=(0, 1))
-    matters = np.clip(MATTERS_SHARE * longest, MATTERS_LEAST, MATTERS)
+    matters = np.clip(COUNTED_ARM_SHARE * longest, LEAST_COUNTED_ARM, COUNTED_ARM)
     for n, (at, weight) in enumerate(zip(jacobian, torque, strict=True)):
         exertion = least_tension(at, weight, bias, limit, DESIRED_SHARE * limit)
         missing[n] = exertion.missing_torque
@@ -191,17 +203,17 @@ def judge(setting: Setting) -> RobotCheck:
 class ArmTerms(NamedTuple):
     """Unit and wording for moment arms at a joint.
 
-    At a prismatic joint they are given as the share of the tension that acts along its axis.
+    At a prismatic joint, a moment arm is shown as the share of the tension along the joint's axis.
     """
 
-    scale: float  # [1/m]
-    unit: str
+    scale: float  # factor from a moment arm in metres to the shown number [1/m]
+    unit: str  # unit of the shown number
     name: str
     other: str  # where to route a muscle that must act in the other direction
     better: str  # where to route a muscle for a larger moment arm
 
     def decimals(self, longest: float) -> int:
-        """Return the number of decimals for moment arms, the longest of which is given [m]."""
+        """Return the number of decimals for moment arms of at most `longest` [m]."""
         return int(self.scale * longest < 10.0)
 
 
@@ -227,10 +239,10 @@ def rounded_text(value: float, least: int = 1, largest: float | None = None) -> 
     Args:
         value: The value.
         least: Smallest number of decimals.
-        largest: The largest value that is shown beside it; None: the value itself.
+        largest: The largest value that is shown beside it; by default the value itself.
 
     Returns:
-        The number; without a sign if it rounds to zero.
+        The number as text, without a sign if it rounds to zero.
     """
     size = abs(value if largest is None else largest)
     decimals = max(least, 1 - int(np.floor(np.log10(size)))) if size else least
@@ -253,7 +265,8 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     for line, text, cells in read_csv(file, COLUMNS, refusal):
         where = f'{file}: line {line}'
         if len(cells) != len(COLUMNS):
-            raise RobotDescriptionError(f'{where}: expected 3 values, got {text.strip()!r}')
+            expected = ','.join(COLUMNS)
+            raise RobotDescriptionError(f'{where}: expected {expected}, got {text.strip()!r}')
         row = [*cells[:2], cells[2].replace('−', '-')]
         for column, cell, names in zip(COLUMNS, row, legal, strict=True):
             if cell not in names:
@@ -262,7 +275,8 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
                 )
         muscle, joint, sign = (names.index(cell) for cell, names in zip(row, legal, strict=True))
         if (muscle, joint) in actions:
-            raise RobotDescriptionError(f'{where}: {row[0]} at {row[1]} is declared twice')
+            problem = f'the sign of {row[0]} at {row[1]} is declared twice; remove one line'
+            raise RobotDescriptionError(f'{where}: {problem}')
         actions[muscle, joint] = 1 - 2 * sign
     return actions
 
@@ -328,7 +342,7 @@ def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterat
 
 
 def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
-    """Return the joint on which each muscle acts most, and how often it acts in reverse there.
+    """Return the joint on which each muscle acts most, and how often its sign there is reversed.
 
     Args:
         moment_arms: r [m] in N postures, (N, M, D).
@@ -359,7 +373,7 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
         yield _finding('other_units, arm', **names, arm=longest[m, j])
     for j, (low, high) in enumerate(zip(robot.lower, robot.upper)):
-        if high - low > WIDEST[int(slides[j])]:
+        if high - low > WIDEST_RANGES[int(slides[j])]:
             wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
             limits = {'low': low, 'high': high, 'unit': robot.units[j].theta}
             yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
@@ -369,7 +383,7 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Yield joints whose moment arms are short compared with the emulated and learned errors."""
     # A joint without muscles is reported as a one-way joint.
     longest = np.abs(moment_arms).max(axis=(0, 1))
-    small = np.flatnonzero((longest > MATTERS_LEAST) & (longest < SHORT)).tolist()
+    small = np.flatnonzero((longest > LEAST_COUNTED_ARM) & (longest < SHORT_ARM)).tolist()
     if small:
         each = ', '.join(f'{robot.joints[j]} ({1e3 * longest[j]:.1f} mm)' for j in small)
         yield _finding('small_joints', joints=each)
@@ -392,7 +406,7 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
         for item in route
         if isinstance(item, Wrap)
     ]
-    touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > TOUCHED
+    touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > LEAST_DETOUR
     if idle := [text for text, touches in zip(described, touched, strict=True) if not touches]:
         yield _finding('idle_object', objects=', '.join(idle))
 
@@ -409,7 +423,7 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
 def _holding_faults(
     robot: Robot, stiffness: Array, least: float, softest: Ints, missing: Array
 ) -> Iterator[Finding]:
-    """Yield the faults that too few postures are held, or stiff.
+    """Yield a fault if too few postures are held, and one if too few are stiff.
 
     Args:
         robot: The robot.
@@ -427,7 +441,7 @@ def _holding_faults(
         own, units = lack / robot.kinematics.radian, robot.units
         each = {k: rounded_text(own[most == k, k].max(), 2) for k, _ in counts}
         where = ', '.join(
-            f'{robot.joints[k]} in {count} (up to {each[k]} {units[k].torque})'
+            f'{robot.joints[k]} (in {count}, up to {each[k]} {units[k].torque})'
             for k, count in counts
         )
         worst = counts[0][0]

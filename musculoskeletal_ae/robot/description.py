@@ -36,21 +36,23 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
 from musculoskeletal_ae.schema import Strict, convert
 
-#: returns the error for a problem in muscles.yaml
+#: function that returns the error for a problem in muscles.yaml
 Fail = Callable[[str], RobotDescriptionError]
 
 #: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
-#: smallest eigenvalue of a stiffness matrix, as a share of its largest; less is not rounding
-INDEFINITE = -1e-9
+#: smallest legal eigenvalue of a stiffness matrix, relative to the largest one; rounding may make
+#: an eigenvalue slightly negative
+LEAST_EIGENVALUE = -1e-9
 
-TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # [N]
-STIFFNESS_DEFAULT = 10000.0  # [N/m]
-SPEED_DEFAULT = 0.1  # [m/s]
+TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
+STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
+SPEED_DEFAULT = 0.1  # speed of a module that follows positions [m/s]
 NO_TENSION = (
-    'the tension is unknown; there is no contact, tension control, torque balance, tension limit, '
-    'limit by heat, or slack or ruptured tendon by tension'
+    'the tension is unknown, so these are not available: contact estimation, tension control, the '
+    'torque balance, tension and heat limits, and the detection of slack and ruptured tendons by '
+    'tension'
 )
 
 
@@ -63,14 +65,18 @@ class RoutePoint(NamedTuple):
 
 
 class Wrap(NamedTuple):
-    """A body around which the tendon wraps between two points; vectors in the link's frame."""
+    """A sphere, cylinder or ring around which the tendon wraps between two points.
+
+    Vectors are in the frame of the link.
+    """
 
     link: str
     xyz: Array  # centre [m]
     radius: float  # [m]
-    axis: Array | None  # unit vector of a cylinder; None: a sphere
-    side: Array | None  # a point on the side that the tendon takes [m]; inside: a ring
-    side_link: str | None = None  # link of `side`; None: the link of the wrap
+    axis: Array | None  # unit vector of a cylinder; None for a sphere
+    #: point on the side where the tendon passes [m]; a point inside the object makes it a ring
+    side: Array | None
+    side_link: str | None = None  # link in whose frame `side` is; None for `link`
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:
@@ -82,7 +88,7 @@ def written(item: RoutePoint | Wrap) -> dict[str, Any]:
     return entry
 
 
-#: points, connected by straight lines or around the wrap between them
+#: route of a tendon: points that are connected by straight lines, or around the wrap between them
 Route = tuple[RoutePoint | Wrap, ...]
 
 
@@ -151,14 +157,14 @@ class RobotDescription:
         if self.follows_position:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
         if not self.knows_tension:
-            lines.append(f'tension_source: none: {NO_TENSION}')
+            lines.append(f'tension_source is none: {NO_TENSION}')
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines
 
     @property
     def spring_notes(self) -> list[str]:
-        """Lines that state the spring of each joint that has one."""
+        """One line for each joint with a spring, which states its stiffness and rest position."""
         springs, lines = self.joint_elasticity, list[str]()
         for i, joint in enumerate(self.joints):
             kind = self.model.joints[self.model.getJointId(joint)].shortname()
@@ -241,7 +247,7 @@ def _with_muscle_name(problem: str, document: Any) -> str:
 
 
 def _entries(entry: Strict | None) -> dict[str, float]:
-    """Return the values that an entry of the file sets, without omitted keys."""
+    """Return the values of the keys that an entry of the file contains."""
     entries: dict[str, float] = {} if entry is None else to_builtins(entry)
     return entries
 
@@ -278,7 +284,7 @@ def _joint_problem(name: str, model: pin.Model) -> str:
         return ''
     kind = OTHER_JOINTS.get(joint.nv, joint.shortname())
     legal = 'revolute or prismatic joints with one degree of freedom and limits'
-    return f'joint {name!r} is {kind}; legal: {legal} (continuous has none)'
+    return f'joint {name!r} is {kind}; legal: {legal} (a continuous joint has no limits)'
 
 
 def _read_couplings(
@@ -316,7 +322,7 @@ def _read_couplings(
         )
         if slave in listed or not is_elsewhere:
             raise refused(slave, problem)
-        del couplings[slave]  # a wheel, for example; like all unlisted joints, it is held fixed
+        del couplings[slave]  # for example a wheel; it is held fixed like all unlisted joints
     return couplings
 
 
@@ -346,23 +352,23 @@ def _read_joint_elasticity(
                 problem = f'{other!r} is the joint itself; give its own stiffness as stiffness'
                 raise fail(f'{place}.coupled: {problem}')
             if stiffness[i, j]:
-                problem = f'the term of {entry.joint!r} and {other!r} is given twice; give it once'
+                problem = f'{entry.joint!r} and {other!r} are coupled twice; remove one entry'
                 raise fail(f'{place}.coupled: {problem}')
             stiffness[i, j] = stiffness[j, i] = value
     for i, j in np.argwhere(np.triu(stiffness, 1)).tolist():
         most = math.sqrt(stiffness[i, i] * stiffness[j, j])
-        if abs(stiffness[i, j]) > most * (1.0 - INDEFINITE):
+        if abs(stiffness[i, j]) > most * (1.0 - LEAST_EIGENVALUE):
             size, limit = distinct(abs(stiffness[i, j]), most)
             pair = f'{joints[i]!r} and {joints[j]!r}'
             legal = f'at most {limit}, the geometric mean of their own stiffnesses'
             raise fail(
-                f'$.joint_elasticity: the term of {pair} has the size {size}; legal: {legal}, as '
-                'springs only store energy'
+                f'$.joint_elasticity: the coupling of {pair} has the size {size}; legal: {legal}, '
+                'because springs only store energy'
             )
-    if joints and (values := np.linalg.eigvalsh(stiffness))[0] < INDEFINITE * values[-1]:
+    if joints and (values := np.linalg.eigvalsh(stiffness))[0] < LEAST_EIGENVALUE * values[-1]:
         raise fail(
             f'$.joint_elasticity: the stiffness matrix has the eigenvalue {values[0]:.3g}; legal: '
-            'none below 0, as springs only store energy; make the terms under coupled smaller'
+            'none below 0, because springs only store energy; make the terms under coupled smaller'
         )
     return JointElasticity(stiffness, stiffness @ rest, damping)
 
@@ -395,8 +401,8 @@ def _read_route(
         is_same = last and last.link == point.link and np.array_equal(last.xyz, point.xyz)
         if is_same and not point.divisor:
             warnings.append(
-                f'muscle {muscle.name!r}: route[{i}] is the same point as the one before it, '
-                'and left out'
+                f'muscle {muscle.name!r}: route[{i}] is the same point as the one before it and '
+                'was left out'
             )
             continue
         route.append(point)

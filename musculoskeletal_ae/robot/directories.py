@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find robot directories: shipped ones by name, others by path.
+"""Find robot directories: shipped robots by name, others by path.
 
-This module imports nothing heavy, because the help of a command lists the robots.
+This module imports nothing slow, because the help texts of commands list the shipped robots.
 """
 
 from pathlib import Path
@@ -23,10 +23,13 @@ def shipped_robots() -> dict[str, Path]:
 
 
 def find_robot(robot: str | Path) -> Path:
-    """Return the directory of a robot, named by a shipped name or a path.
+    """Return the directory of a robot.
+
+    Args:
+        robot: The name of a shipped robot, or the path of a robot directory.
 
     Raises:
-        RobotDescriptionError: If it is neither.
+        RobotDescriptionError: If `robot` is neither.
     """
     shipped = shipped_robots()
     if str(robot) in shipped:

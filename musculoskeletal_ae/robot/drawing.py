@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw an arm: bones and muscles as lines, and pictures of them without a display.
+"""Draw the bones and muscles of an arm as lines, and save pictures of them without a display.
 
 A muscle is green at T_bias and turns red towards T_limit (paper, §IV-D).
 """
@@ -14,10 +14,11 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.options import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
-SHORTEST_BONE = 1e-3  # [m]; shorter ones connect two joints in the same place
+#: length below which a bone is not drawn, because it connects two joints in the same place [m]
+SHORTEST_BONE = 1e-3
 BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
-BONE_COLOUR = (0.8, 0.8, 0.75)
-BALL = 1.7  # diameter of a ball divided by the width of its line
+BONE_COLOUR = (0.8, 0.8, 0.75)  # red, green, blue
+BALL_SIZE = 1.7  # diameter of a ball, divided by the width of its line
 
 
 class Line(NamedTuple):
@@ -27,11 +28,11 @@ class Line(NamedTuple):
     points: Array  # [m], (N, 3)
     width: float  # [m]
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
-    name: str = ''  # of the muscle; only the first branch of its tendon has it
+    name: str = ''  # name of the muscle; only the first branch of its tendon has one
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:
-    """Return (T − T_bias) / (T_limit − T_bias) of T [N] (M,), within [0, 1]; 0 for NaN."""
+    """Return (T − T_bias) / (T_limit − T_bias), clipped to [0, 1], for T [N] (M,); 0 for NaN."""
     limits = robot.tension
     known = np.nan_to_num(tension)
     return np.clip((known - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
@@ -44,7 +45,7 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
         robot: The geometric model.
         theta: θ [rad], (D,).
         tension: T [N], (M,), which determines the colours.
-        points: Route points [m], (P, 3); None: those of the geometric model.
+        points: Route points [m], (P, 3); by default those of the geometric model.
 
     Returns:
         One line for each bone and for each branch of a tendon.
@@ -70,7 +71,7 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
 
 def _within(line: Line, middle: Array, reach: float) -> Line:
-    """Return the part of a bone inside a cube; other lines are returned unchanged."""
+    """Return the part of a bone inside the cube `middle` ± `reach` [m]; muscles are unchanged."""
     if line.kind != 'bones':
         return line
     start, end = line.points[[0, -1]]
@@ -85,8 +86,8 @@ def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool
     Args:
         lines: The lines.
         path: The file of the picture.
-        title: Title of the picture; '' for the default.
-        whole: Whether to show all lines; if false, show the region of the muscles only.
+        title: Title of the picture; if empty, one that explains the colours.
+        whole: Whether to show all lines; if false, the picture shows the region of the muscles.
 
     Raises:
         MusculoskeletalError: If the file cannot be written.
@@ -104,7 +105,7 @@ def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool
         for line in lines:
             width = 400.0 * line.width
             # Balls mark joints and via points.
-            axes.plot(*line.points.T, color=line.colour, lw=width, ms=BALL * width, **balls)
+            axes.plot(*line.points.T, color=line.colour, lw=width, ms=BALL_SIZE * width, **balls)
         axes.set(title=name, xlabel='x [m]', ylabel='y [m]', zlabel='z [m]')
         axes.set(**{f'{x}lim': (m - reach, m + reach) for x, m in zip('xyz', middle)})
         axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.05)

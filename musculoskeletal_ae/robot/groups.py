@@ -11,7 +11,7 @@ from musculoskeletal_ae.arrays import Bools, Ints
 
 
 class Group(NamedTuple):
-    """Joints and muscles, such as those of a limb, that are independent of all others."""
+    """Joints and muscles that are independent of all others, such as a limb."""
 
     joints: tuple[int, ...]  # indices in θ
     muscles: tuple[int, ...]  # indices in T and l
@@ -28,10 +28,13 @@ class Group(NamedTuple):
 
 
 def groups(crossed: Bools) -> tuple[Group, ...]:
-    """Return the connected components of muscles and the joints that they cross, (M, D).
+    """Return the groups: connected components of the graph of muscles and joints.
 
-    A muscle that crosses no joint joins the first joint; a joint without muscles joins the first
-    group.
+    A muscle that crosses no joint is assigned to the first joint. A joint without muscles is
+    assigned to the first group.
+
+    Args:
+        crossed: Whether each muscle crosses each joint, (M, D).
     """
     of_joint = np.arange(crossed.shape[1])
     for own in crossed[crossed.any(axis=1)]:

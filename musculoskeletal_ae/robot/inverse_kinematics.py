@@ -17,21 +17,24 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-# Standard deviations of a marker's pose from a typical camera: σ_p [m], σ_R [rad].
+#: standard deviations of a marker's pose from a typical camera, σ_p [m] and σ_R [rad], (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
-POSITION_ONLY = np.repeat([0.002, 100.0], 3)  # leaves the orientation free
-ITERATIONS = 30
-LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6  # shares of JᵀJ
-STEP_SPREAD = 0.1  # [rad] σ of each step's damping, for joints that the pose does not determine
-LEAST_GAIN = 1.0  # a smaller decrease of the sum above ends the search
+#: standard deviations that leave the orientation free
+POSITION_ONLY = np.repeat([0.002, 100.0], 3)
+ITERATIONS = 30  # largest number of steps
+LEAST_DAMPING = 1e-6  # relative to the diagonal of JᵀJ
+MOST_DAMPING = 1e6  # relative to the diagonal of JᵀJ
+#: prior standard deviation of a step, which damps joints that the pose does not determine [rad]
+STEP_SPREAD = 0.1
+LEAST_GAIN = 1.0  # decrease of the minimised sum below which the search ends
 
 
 class Posture(NamedTuple):
-    """A solution with its remaining errors of position and orientation."""
+    """A solution of the inverse kinematics, with its remaining errors."""
 
     theta: Array  # θ [rad], (D,)
-    distance: float  # [m]
-    angle: float  # [rad]
+    distance: float  # remaining error of the position [m]
+    angle: float  # remaining error of the orientation [rad]
     observed_theta: Array  # θ, with NaN for joints that do not move the end effector, (D,)
 
 

@@ -54,12 +54,12 @@ class JointElasticity:
         return torque
 
     def deviating(self, factor: Array, shift: Array) -> JointElasticity:
-        """Return springs with stiffness times `factor` (D,) and rest plus `shift` [rad] (D,)."""
+        """Return springs with stiffness times `factor` (D,) and `rest` plus `shift` [rad] (D,)."""
         scale = np.sqrt(factor)
         stiffness = scale[:, None] * self.stiffness * scale
         return JointElasticity(stiffness, stiffness @ (self.rest + shift), self.damping)
 
     def of_joints(self, joints: Ints) -> JointElasticity:
-        """Return the elasticity of some joints while all others are at 0."""
+        """Return the elasticity of the joints in `joints`, while all others are held at 0."""
         rows = np.ix_(joints, joints)
         return JointElasticity(self.stiffness[rows], self.preload[joints], self.damping[joints])

@@ -35,7 +35,8 @@ class JointPoses(NamedTuple):
     axis: Array  # (N, J, 3); zero at index 0
 
 
-# Coefficients of a coupling's polynomial: degree 16, as two chained couplings of degree 4 need.
+#: largest number of coefficients of a coupling's polynomial; two chained couplings of degree 4 have
+#: degree 16
 MOST_TERMS = 17
 
 
@@ -49,7 +50,7 @@ class Coupling(NamedTuple):
 
     @classmethod
     def of_terms(cls, master: str, terms: Sequence[float]) -> Coupling:
-        """Return the coupling with these coefficients of all powers, the constant first."""
+        """Return the coupling whose polynomial has these coefficients, the constant first."""
         offset, ratio, *higher = [*map(float, terms), 0.0, 0.0][: max(2, len(terms))]
         while higher and higher[-1] == 0.0:
             higher.pop()
@@ -127,8 +128,9 @@ class JointTree:
         prismatic: Whether each joint is prismatic, (J,).
         local_axis: Axis in the joint's own frame, (J, 3).
         placements: Fixed placement in the parent, homogeneous, (J, 4, 4).
-        first: The pose in the parent is placement + a(θ) · first + b(θ) · second, (J, 4, 4).
-        second: See `first`.
+        first: The pose in the parent is placement + a · first + b · second, with a = sin θ and
+            b = 1 − cos θ for revolute joints, a = θ and b = 0 for prismatic ones, (J, 4, 4).
+        second: See `first`, (J, 4, 4).
         theta_index: Index in θ of the entry that moves each joint, -1 for the root link, (J,).
         terms: Coefficients of q = Σ terms_k θᵏ, the constant first, (J, K).
         is_coupled: Whether there are coupled joints.
@@ -220,7 +222,7 @@ class JointTree:
         return self.ratios(theta)[:, None] * self.moved_by
 
     def of_theta(self, values: Array, theta: Array) -> Array:
-        """Return torques or derivatives with respect to θ, of those with respect to q.
+        """Convert torques, or derivatives with respect to q, of all joints of the tree to θ.
 
         At θ (*N, D), values of shape (*N, ..., J−1) are mapped to (*N, ..., D).
         """
@@ -229,7 +231,7 @@ class JointTree:
             return of_joints
         ratios = self.ratios(theta)
         between = (1,) * (values.ndim - ratios.ndim)
-        ratios = ratios.reshape(*ratios.shape[:-1], *between, ratios.shape[-1])  # also of no rows
+        ratios = ratios.reshape(*ratios.shape[:-1], *between, ratios.shape[-1])
         return (values * ratios) @ self.moved_by
 
     def of_both(self, matrix: Array, theta: Array) -> Array:

@@ -12,11 +12,15 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.robot import Robot
 
-LINES, STEPS = 60, 400  # lines between random postures, and steps along each
-JUMP = 0.001  # [m] second difference per step; smooth lengths stay a hundred times below it
-LEAST_RANGE = 0.3  # share of its range that a joint must keep if a limit is to avoid jumps
-RANGE_MARGIN = 0.03  # share of the range between such a limit and the jumps
-REDRAWN = 50  # attempts to draw points of an emulated individual that make no tendon jump
+LINES = 60  # number of straight lines between random postures along which lengths are examined
+STEPS = 400  # number of postures along each line
+#: smallest second difference of a length along a line that counts as a jump [m]; the differences of
+#: smooth lengths are a hundred times smaller
+JUMP = 0.001
+LEAST_RANGE = 0.3  # smallest share of a joint's range that a suggested limit may leave
+RANGE_MARGIN = 0.03  # distance between a suggested limit and the jumps, as a share of the range
+#: largest number of times that the points of an emulated individual are drawn until no tendon jumps
+MOST_DRAWS = 50
 
 
 def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -27,11 +31,13 @@ def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tupl
         lower: Lower joint limits [rad], (D,).
         upper: Upper joint limits [rad], (D,).
     """
-    bends, theta = _followed(lengths, lower, upper)
+    bends, theta = _second_differences(lengths, lower, upper)
     return bends.max(axis=0), theta[bends.argmax(axis=0)]
 
 
-def _followed(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
+def _second_differences(
+    lengths: Callable[[Array], Array], lower: Array, upper: Array
+) -> tuple[Array, Array]:
     """Return second differences of lengths along lines [m] (N, M), and their θ [rad] (N, D)."""
     joints = len(lower)
     ends = np.random.default_rng(0).uniform(lower, upper, (2, LINES, 1, joints))
@@ -42,7 +48,7 @@ def _followed(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> 
 
 
 def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
-    """Return which of M lengths, a function of θ, jump within a robot's joint limits, (M,)."""
+    """Return which of the M lengths that `lengths` computes from θ jump within the limits, (M,)."""
     return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 
@@ -69,25 +75,29 @@ def jump_choices(robot: Robot) -> list[str]:
     """Return lines that name jumping muscles and their postures, and the possible remedies."""
     if robot.routes.objects is None:
         return []
-    bends, theta = _followed(robot.routes.absolute_lengths, robot.lower, robot.upper)
+    bends, theta = _second_differences(robot.routes.absolute_lengths, robot.lower, robot.upper)
     lines, jumping_names = [], []
     for m in np.flatnonzero(bends.max(axis=0) > JUMP).tolist():
         there = theta[bends[:, m] > JUMP]
         crossed = np.flatnonzero(robot.routes.crossed[m])
         place = ', '.join(
-            f'{robot.joints[j]} {there[:, j].min():.2f} to {there[:, j].max():.2f}' for j in crossed
+            f'{robot.joints[j]} in [{there[:, j].min():.2f}, {there[:, j].max():.2f}] '
+            f'{robot.units[j].theta}'
+            for j in crossed
         )
         size, name = 1e3 * bends[:, m].max(), robot.muscles[m]
         jumping_names.append(name)
-        lines.append(f'jumps: muscle {name} by up to {size:.0f} mm, at {place}')
+        lines.append(
+            f'length jump: the length of muscle {name} jumps by up to {size:.0f} mm for {place}'
+        )
         if limit := _limit_without_jumps(robot, there, crossed):
-            lines.append(f'    limiting {limit} avoids it')
+            lines.append(f'    limiting {limit} excludes this jump')
     if lines:
         together = ','.join(jumping_names)
         lines.append(
             'no network can represent lengths that jump. Limit a joint (in the source, or in '
             f'robot.urdf), leave the muscles out (--without {together}), or accept that estimates '
-            'are wrong near these postures and that nodes may reject the network'
+            'are wrong near the postures of a jump and that nodes may reject the network'
         )
     return lines
 

@@ -19,8 +19,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import Coupling, JointTree
 
-#: [m] travel of a prismatic joint that counts as one radian of a revolute joint, wherever both are
-#: treated alike: the radius of an assumed rack's pinion
+#: travel of a prismatic joint that counts as one radian of a revolute joint [m], wherever both are
+#: treated alike: the radius of the pinion of an assumed rack
 RACK = 0.06
 
 
@@ -47,7 +47,7 @@ def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
 
 
 def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
-    """Return a copy of the model with these joints locked at a configuration q.
+    """Return a copy of the model in which the joints in `locked` are fixed at a configuration q.
 
     A link may have the name of a joint, or be called 'universe'. `buildReducedModel` looks frames
     up by name and would reject or confuse such frames, so all frames get unique names meanwhile.
@@ -91,7 +91,7 @@ class Kinematics:
             joints: The D joints of θ, in order.
             end_effector: Link for poses and external wrenches.
             couplings: Coupling of each coupled joint.
-            elasticity: Springs and dampers of the joints; None for none.
+            elasticity: Springs and dampers of the joints; None if there are none.
         """
         #: springs and dampers of the joints
         self.elasticity = elasticity or JointElasticity.none(len(joints))
@@ -111,10 +111,11 @@ class Kinematics:
         self._end_effector = end_effector
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
         self.tree = JointTree(self.model, joints, {name: couplings[name] for name in followers})
-        #: for each joint of θ, (D,): whether it is prismatic, the travel that counts as one radian
-        #: ([rad] or [m]), and its units
+        #: whether each joint of θ is prismatic, (D,)
         self.slides = self.tree.prismatic[ids]
+        #: displacement of each joint of θ that counts as one radian [rad or m], (D,)
         self.radian: Array = np.where(self.slides, RACK, 1.0)
+        #: units of each joint of θ
         self.units = tuple(SLIDES if slides else TURNS for slides in self.slides)
         #: unit of a distance between postures, for messages
         self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
@@ -156,7 +157,7 @@ class Kinematics:
         return np.array(pin.computeGeneralizedGravity(self.model, self.data, q))
 
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
-        """Return the joint torque of a motion, with that of springs and dampers.
+        """Return the joint torque of a motion, including the torque of springs and dampers.
 
         M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇    [N·m], shape (D,)
         """
@@ -182,7 +183,11 @@ class Kinematics:
         return result + self.elasticity.stiffness
 
     def joint_inertia(self, theta: Array) -> Array:
-        """Return the inertia at each joint with the others held [kg·m² or kg], (D,), at θ (D,)."""
+        """Return the inertia at each joint while all others are held [kg·m² or kg], (D,).
+
+        Args:
+            theta: θ [rad], (D,).
+        """
         inertia = joint_space_inertia(self.model, self.data, self.tree.angles(theta))
         return np.diag(self.tree.of_both(inertia, theta))
 

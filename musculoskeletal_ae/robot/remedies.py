@@ -20,9 +20,9 @@ from musculoskeletal_ae.robot import checks
 from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
 from musculoskeletal_ae.robot.description import shown
 
-HELPS = 0.01  # share of postures that a change must gain to be suggested
-#: factors of each change, the smallest step first; the costliest change comes first
-TRIED = {
+LEAST_GAIN = 0.01  # smallest gain of a suggested change, in the share of held or stiff postures
+#: changes that are tried, the costliest first, each with its factors, the smallest step first
+CHANGES = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),
     'mass': (0.75, 0.5, 0.25),
@@ -42,23 +42,23 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
     def attempt(*steps: int) -> tuple[float, str]:
         """Return the share of postures with these steps of the changes (0: none), and a text."""
         setting, texts = check.setting, list[str]()
-        for (what, factors), step in zip(TRIED.items(), steps, strict=True):
+        for (what, factors), step in zip(CHANGES.items(), steps, strict=True):
             if step:
                 setting, text = changed(setting, what, factors[step - 1], fault.joint)
                 texts.insert(0, text)
         share = float(getattr(judge(setting), kind).mean())
         return share, f'{", ".join(texts)} → {100 * share:.3g} % {kind}'
 
-    nothing, steps = [0] * len(TRIED), [len(factors) for factors in TRIED.values()]
+    nothing, steps = [0] * len(CHANGES), [len(factors) for factors in CHANGES.values()]
     (before, _), alone = attempt(*nothing), list[tuple[float, str]]()
     for i, most in enumerate(steps):
         ways = [attempt(*nothing[:i], step, *nothing[i + 1 :]) for step in range(1, most + 1)]
         best, _ = max(ways)
-        wanted = REQUIRED_SHARE if best >= REQUIRED_SHARE else best - HELPS
+        wanted = REQUIRED_SHARE if best >= REQUIRED_SHARE else best - LEAST_GAIN
         alone.insert(0, next(way for way in ways if way[0] >= wanted))
     if enough := [text for share, text in alone if share >= REQUIRED_SHARE]:
         return enough
-    texts = [f'{text}, not enough alone' for share, text in alone if share >= before + HELPS]
+    texts = [f'{text}, not enough alone' for share, text in alone if share >= before + LEAST_GAIN]
     for pick in (-1, 0):
         for i, most in enumerate(steps):
             ways = [attempt(*steps[:i], step, *steps[i + 1 :]) for step in range(most + 1)]
@@ -69,7 +69,7 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
         return [*texts, f'together: {text}']
     if share > max(alone)[0]:
         texts.append(f'not enough even together: {text}')
-    texts = texts or [f'none of these helps: {", ".join(TRIED)}']
+    texts = texts or [f'none of these helps: {", ".join(CHANGES)}']
     return [*texts, 'other routes may help: see --suggest']
 
 

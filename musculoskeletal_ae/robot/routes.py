@@ -31,10 +31,10 @@ from musculoskeletal_ae.robot.kinematics import Kinematics
 if TYPE_CHECKING:
     from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-ARC = 9  # points drawn along the arc of a wrapped tendon
-# Rows of one batched evaluation; limits its memory to a few tens of megabytes.
+ARC = 9  # number of points drawn along the arc of a wrapped tendon
+#: number of rows of one batched evaluation, which limits its memory to a few tens of megabytes
 CHUNK = 4096
-THREADED = 4  # chunks above which two threads evaluate them
+MOST_SERIAL_CHUNKS = 4  # largest number of chunks that a single thread evaluates; two share more
 
 
 def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Array], Array]:
@@ -44,7 +44,7 @@ def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Ar
     def chunked(self: Routes, theta: Array) -> Array:
         rows = theta.reshape(-1, theta.shape[-1])
         parts = [rows[i : i + CHUNK] for i in range(0, max(len(rows), 1), CHUNK)]
-        if len(parts) > THREADED:
+        if len(parts) > MOST_SERIAL_CHUNKS:
             with ThreadPoolExecutor(2) as pool:  # numba and numpy release the GIL
                 values = np.concatenate(list(pool.map(partial(method, self), parts)))
         else:
@@ -55,7 +55,10 @@ def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Ar
 
 
 class Routes:
-    """The routes of M muscles over D joints as functions of θ: P points, S segments."""
+    """Lengths and muscle Jacobian of M muscles over D joints as functions of θ.
+
+    The routes consist of P points and S segments, of which W may wrap around an object.
+    """
 
     def __init__(self, kinematics: Kinematics, routes: Sequence[Route]) -> None:
         """Attach the routes of a description to the joints of the tree."""
@@ -92,14 +95,14 @@ class Routes:
         # one force at each end of a segment that may wrap.
         ends = self.first[self.wrapping], self.second[self.wrapping]
         #: point at which each force acts, (Q,)
-        self._pulled = np.concatenate([self.first, *ends])
+        self._force_point = np.concatenate([self.first, *ends])
         #: ±1 where a joint of the tree lengthens or shortens the force's segment, (Q, J−1)
         carried, moved = 1.0 * kinematics.tree.descends_from[:, 1:], self.joint
         self._share = carried[moved[self.second]] - carried[moved[self.first]]
         if self.objects is not None:
             apart = [carried[self.objects.joint] - carried[moved[end]] for end in ends]
             self._share = np.concatenate([self._share, *apart])
-        #: sums the forces of each muscle, (M, Q)
+        #: weight of each force in the sum of each muscle, (M, Q)
         own = self._sum[:, self.wrapping]
         self._gather = np.concatenate([self._sum, own, own], axis=1)
         self.length_at_zero = self.absolute_lengths(np.zeros(len(kinematics.lower)))
@@ -134,7 +137,7 @@ class Routes:
 
         Args:
             theta: θ [rad], (D,).
-            points: Route points in the root link's frame [m], (P, 3); None: those at θ.
+            points: Route points in the root link's frame [m], (P, 3); by default those at θ.
 
         Returns:
             One polyline for each entry of `drawn_muscle`.
@@ -183,7 +186,7 @@ class Routes:
 
         Args:
             poses: Poses of the joints in N postures.
-            point: Points in the frames of their joints [m], (P, 3); None: those of the routes.
+            point: Points in the frames of their joints [m], (P, 3); by default those of the routes.
         """
         rotation, translation = poses.rotation[:, self.joint], poses.translation[:, self.joint]
         point = self.point if point is None else point
@@ -230,7 +233,7 @@ class Routes:
         line = points[:, self.second] - points[:, self.first]
         norm = np.linalg.norm(line, axis=-1, keepdims=True)
         pull = np.divide(line, norm, out=np.zeros_like(line), where=norm > 0.0)
-        at = points[:, self._pulled]
+        at = points[:, self._force_point]
         if self.objects is not None:
             _, leave, arrive = self._wrapped(poses, points)
             pull[:, self.wrapping] = 0.0

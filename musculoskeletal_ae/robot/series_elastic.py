@@ -16,7 +16,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}
+DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}  # [N], [1/m] and [1/N]
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,12 @@ from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 
-FORGIVEN = 0.02  # share of postures that may fail; the check, in other postures, tolerates 0.05
-PENALTY = 10.0  # weight of the requirements; the mean relative change is below 1
-START = 0.2  # initial standard deviation of x
-TRIES = 40  # evaluations for each coordinate of a via point
-RESOLUTION = 1e-4  # [m] to which via points are rounded
+#: share of postures that may fail; the check uses other postures and tolerates a share of 0.05
+FAILING_SHARE = 0.02
+PENALTY = 10.0  # weight of failed requirements in the cost; the first term of the cost is below 1
+START_SPREAD = 0.2  # initial standard deviation of x
+TRIES = 40  # number of evaluations for each coordinate of a via point
+RESOLUTION = 1e-4  # step to which displacements of via points are rounded [m]
 THIN = 0.003  # width of a muscle in the picture [m]
 
 
@@ -54,7 +55,7 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
     def check(change: Array) -> checks.RobotCheck:
         return checks.judge(checks.Setting.of(moved(robot, change), theta))
 
-    flips = np.maximum(checks.main_actions(check(unchanged).moment_arms)[1], FORGIVEN)
+    flips = np.maximum(checks.main_actions(check(unchanged).moment_arms)[1], FAILING_SHARE)
 
     def lacks(change: Array) -> float:
         result = check(change)
@@ -74,7 +75,7 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
         return float(size + (1.0 + PENALTY * missing) * (missing > 0.0))
 
     options = {'seed': seed % 2**32 + 1, 'verbose': -9, 'tolfun': 1e-3}
-    search = cma.CMAEvolutionStrategy(unchanged.ravel(), START, options)
+    search = cma.CMAEvolutionStrategy(unchanged.ravel(), START_SPREAD, options)
     for _ in tqdm(range(TRIES * unchanged.size // search.popsize), disable=None):
         if not search.stop():
             candidates = search.ask()
@@ -118,7 +119,8 @@ def lacking(check: checks.RobotCheck) -> float:
     rows = np.sort(np.column_stack([weak, np.maximum(np.hstack(short), 0.0)]), axis=0)
     missing = (least + RESOLUTION - np.abs(arms).max(axis=0)) / least
     useless = np.maximum(missing.min(axis=1), 0.0)
-    return float(rows[: len(rows) - int(FORGIVEN * len(rows))].mean(axis=0).sum() + useless.sum())
+    counted = rows[: len(rows) - int(FAILING_SHARE * len(rows))]
+    return float(counted.mean(axis=0).sum() + useless.sum())
 
 
 def write(robot: Robot, change: Array, out: Path) -> None:

@@ -18,10 +18,11 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot.robot import Robot
 
-# [N] gap between the limits of a muscle that is fixed at one tension (hot, ruptured). Without it,
-# rounding makes the problem infeasible for quadprog.
-ROOM = 1e-8
-SOFT_WEIGHT = 1e-7  # ε [N·m/N]², for torques of some N·m and tensions of some hundred N
+#: smallest gap between the limits of a muscle [N]; without it, rounding would make the problem
+#: infeasible for quadprog if a muscle is fixed at one tension (hot, ruptured)
+LEAST_GAP = 1e-8
+#: ε [(N·m/N)²], which is small for torques of some N·m and tensions of some hundred N
+SOFT_WEIGHT = 1e-7
 
 
 class Exertion(NamedTuple):
@@ -54,7 +55,7 @@ class TensionProgramme:
         self._constraints = np.concatenate([-muscle_jacobian, limits], axis=1)
         least = np.empty(self._count)
         least[:] = low
-        self._bounds = np.concatenate([torque, least, -np.maximum(high, least + ROOM)])
+        self._bounds = np.concatenate([torque, least, -np.maximum(high, least + LEAST_GAP)])
         _require_finite(self._constraints, self._bounds)
 
     def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
@@ -97,7 +98,7 @@ def holding_tension(
         robot: The robot.
         theta: θ [rad], (D,).
         desired: Of all such tensions, the one nearest to this is returned [N], scalar or (M,).
-        jacobian: G [m/rad], (M, D); None: that of the geometric model.
+        jacobian: G [m/rad], (M, D); by default that of the geometric model.
 
     Raises:
         InfeasibleError: If no such tension exists, or if an entry is not finite.
@@ -114,9 +115,9 @@ def least_tension(
     high: Array | float,
     desired: Array | float = 0.0,
 ) -> Exertion:
-    """Return the tensions of the hard form, or those of the soft form if it is infeasible.
+    """Solve the hard form, or the soft form if the hard one is infeasible.
 
-    The arguments are those of `TensionProgramme` and its `nearest`.
+    For the arguments see `TensionProgramme`, and for `desired` its method `nearest`.
 
     Raises:
         InfeasibleError: If an entry is not finite.

@@ -18,16 +18,17 @@ import pinocchio as pin
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
 from musculoskeletal_ae.robot.joint_tree import Coupling
 
-# Recursive parsers overflow their stack at thousands of links; the parser of MuJoCo and pinocchio
-# descends at most 500 levels.
-MOST_PARTS, DEEPEST = 2000, 500  # links and joints; levels of elements
+#: largest number of links and joints; recursive parsers overflow their stack at thousands of links
+MOST_PARTS = 2000
+#: largest depth of nested elements, which the parser of MuJoCo and pinocchio does not exceed either
+DEEPEST = 500
 #: elements below <robot> that only a preprocessor understands, besides those of xacro's namespace
 PREPROCESSED = 'include', 'macro', 'property'
-LARGEST = 1e6  # [SI units] of any number; efforts and velocities are not limited
+LARGEST = 1e6  # largest size of any number except efforts and velocities [SI units]
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
-ONE_AXIS = *LIMITED, 'continuous'
-KINDS = *ONE_AXIS, 'fixed', 'floating', 'planar'
+ONE_AXIS = *LIMITED, 'continuous'  # types of joints with one axis
+KINDS = *ONE_AXIS, 'fixed', 'floating', 'planar'  # all types of joints
 
 #: number of values in each attribute, by element
 NUMBERS = {
@@ -58,13 +59,17 @@ def read_urdf(file: Path, text: str) -> pin.Model:
     _check_expanded(file, root)
     parts = [part for part in root if part.tag in ('link', 'joint')]
     if len(parts) > MOST_PARTS:
-        raise RobotDescriptionError(f'{file}: more than {MOST_PARTS} links and joints')
+        raise RobotDescriptionError(
+            f'{file}: {len(parts)} links and joints; legal: at most {MOST_PARTS}'
+        )
     for part in parts:
         where = f'{file}: {part.tag} {part.get("name")!r}'
         if printable(name := part.get('name', '')) != name:
             raise RobotDescriptionError(f'{where}: expected printable characters only')
         if part.tag == 'joint' and name == 'universe':
-            raise RobotDescriptionError(f'{where}: expected another name, pinocchio uses this one')
+            raise RobotDescriptionError(
+                f'{where}: pinocchio reserves this name for the world; rename the joint'
+            )
         for element in part.iter():
             _check(where, element)
     if parts:
@@ -87,13 +92,13 @@ def parse_xml(file: Path, text: str) -> ET.Element:
     """
     try:
         if '<!DOCTYPE' in text or '<!ENTITY' in text:
-            raise ValueError('no DOCTYPE is allowed here')
+            raise ValueError('no DOCTYPE is allowed here; remove it')
         root = ET.fromstring(text)  # noqa: S314 - without a DOCTYPE there are no entities
         level, depth = [root], 0
         while level:
             level, depth = [child for element in level for child in element], depth + 1
         if depth > DEEPEST:
-            raise ValueError(f'more than {DEEPEST} levels')
+            raise ValueError(f'elements are nested {depth} levels deep; legal: at most {DEEPEST}')
         # The URDF parser ignores a default namespace.
         if space := root.tag.rpartition('}')[0]:
             for element in root.iter():
@@ -115,7 +120,7 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 
 
 def _check_expanded(file: Path, root: ET.Element) -> None:
-    """Reject a file that still needs a preprocessor: the URDF parser would ignore the macros."""
+    """Reject a file that still needs a preprocessor, because the URDF parser ignores macros."""
     for problem in _preprocessor_parts(root):
         remedy = 'expand it first, by xacro FILE > robot.urdf'
         raise RobotDescriptionError(f'{file}: this is a xacro, not a URDF ({problem}): {remedy}')
@@ -175,13 +180,14 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
                 element = part.find(end)
                 link = '' if element is None else element.get('link', '')
                 if link not in links or (end == 'child' and link in held):
-                    got = f'{link!r} has a joint above it already' if link in held else repr(link)
-                    expected = 'expected a link of this file, each below one joint'
-                    raise RobotDescriptionError(f'{where}: {end}: {expected}, got {got}')
+                    got = f'{link!r}, the child of another joint' if link in held else repr(link)
+                    expected = 'expected a link of this file, which is the child of one joint only'
+                    raise RobotDescriptionError(f'{where}: {end}: {expected}; got {got}')
             held.add(link)
     if len(roots := sorted(map(str, links - held))) != 1:
         got = ', '.join(roots) or 'none'
-        raise RobotDescriptionError(f'{file}: expected one link that is below no joint, got {got}')
+        expected = 'expected exactly one root link, which is the child of no joint'
+        raise RobotDescriptionError(f'{file}: {expected}; got {got}')
 
 
 def _check_joint(where: str, joint: ET.Element) -> None:
@@ -190,11 +196,11 @@ def _check_joint(where: str, joint: ET.Element) -> None:
         legal = ', '.join(KINDS)
         raise RobotDescriptionError(f'{where}: type: expected one of {legal}, got {kind!r}')
     if kind in ONE_AXIS and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
-        raise RobotDescriptionError(f'{where}: axis: expected a direction, got 0 0 0')
+        raise RobotDescriptionError(f'{where}: axis: expected a nonzero vector, got 0 0 0')
     present = set() if limit is None else set(limit.keys())
     if kind in LIMITED and (missing := {'effort', 'velocity'} - present):
-        expected = f'{", ".join(sorted(missing))}, which a {kind} joint needs'
-        raise RobotDescriptionError(f'{where}: limit: expected {expected}')
+        expected = f'{" and ".join(sorted(missing))}, which a {kind} joint needs'
+        raise RobotDescriptionError(f'{where}: limit: expected {expected}; got none')
 
 
 def _check(part: str, element: ET.Element) -> None:
@@ -221,7 +227,7 @@ def _check(part: str, element: ET.Element) -> None:
             child = element.find(tag)
             present = set() if child is None else set(child.keys())
             if missing := NUMBERS[tag].keys() - present:
-                expected = f'{", ".join(sorted(missing))}; links without mass have no <inertial>'
+                expected = f'{", ".join(sorted(missing))}; remove <inertial> of a link without mass'
                 raise RobotDescriptionError(f'{part}: {tag}: expected {expected}')
     if element.tag == 'inertia':
         names = [['ixx', 'ixy', 'ixz'], ['ixy', 'iyy', 'iyz'], ['ixz', 'iyz', 'izz']]

@@ -33,8 +33,8 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
-TINY = 1e-12
-RIM = 1e-6  # share of the radius
+TINY = 1e-12  # smallest divisor
+RIM = 1e-6  # distance from the surface, divided by the radius, within which a point is outside
 Vector = tuple[float, float, float] | Array
 
 
@@ -67,7 +67,7 @@ def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
 
 @njit(cache=True)
 def _product(a: complex, b: complex) -> complex:
-    """Return a · b as the real part and a × b as the imaginary part."""
+    """Return a complex number with the real part a · b and the imaginary part a × b."""
     return a.conjugate() * b
 
 
@@ -114,7 +114,7 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
 
 @njit(cache=True)
 def _beyond_rim(distance: float, r: float) -> float:
-    """Return a distance from the centre, set to the radius for a point on the rim."""
+    """Return a distance from the centre; for a point on the rim, return the radius exactly."""
     return r if abs(distance - r) <= RIM * r else distance
 
 

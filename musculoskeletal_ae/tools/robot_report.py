@@ -8,7 +8,7 @@ import numpy as np
 
 from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.robot.checks import (
-    MATTERS,
+    COUNTED_ARM,
     REQUIRED_SHARE,
     RobotCheck,
     arm_terms,
@@ -121,14 +121,15 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     decimals = [arm_terms(robot, j).decimals(arm) for j, arm in enumerate(longest.tolist())]
     spread = np.stack([arms.min(axis=0), np.median(arms, axis=0), arms.max(axis=0)], axis=-1)
     sliders = ', '.join(np.array(robot.joints)[robot.kinematics.slides])
-    tenth = ', and below a tenth of the longest at that joint,' * bool((matters < MATTERS).any())
+    has_short_arms = bool((matters < COUNTED_ARM).any())
+    tenth = ', and below a tenth of the longest at that joint,' * has_short_arms
     lines = [
         '',
         'moment arms [mm]: min, median, max; + moves the joint in its positive direction',
-        f'"." = below {1e3 * MATTERS:g} mm{tenth} in every posture',
+        f'"." = below {1e3 * COUNTED_ARM:g} mm{tenth} in every posture',
     ]
     if sliders:
-        least = f'"." = below {100 * MATTERS / RACK:g} %'
+        least = f'"." = below {100 * COUNTED_ARM / RACK:g} %'
         lines.append(
             f'prismatic joints ({sliders}): share of the tension along the axis [%], {least}'
         )

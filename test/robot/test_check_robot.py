@@ -158,7 +158,7 @@ def test_prismatic_joints_are_reported_in_newtons_and_shares_of_the_tension(tmp_
     )
     status, printed, _ = verdict(capsys, directory, '--postures', '40')
     assert status == 1
-    assert re.search(r'wrist in \d+ \(up to [\d.]+ N\)', printed)
+    assert re.search(r'wrist \(in \d+, up to [\d.]+ N\)', printed)
     assert re.search(r"share of the wrong sign at joint 'wrist'.*\(median -\d+\.\d %\)", printed)
     assert re.search(r'act on it: .*slider_in \(-\d+ %\)', printed)
     assert 'prismatic joints (wrist): share of the tension along the axis [%]' in printed
@@ -343,7 +343,7 @@ def test_the_report_states_how_soft_or_weak_a_finger_is(tmp_path, capsys):
     assert '-0.0 N·m' not in printed
     tension = {'bias': 0.01, 'limit': 0.02, 'max': 0.02}
     _, printed, _ = verdict(capsys, finger(tmp_path / 'weak', tension=tension))
-    (most,) = re.findall(r'knuckle in \d+ \(up to (\S+) N·m\)', printed)
+    (most,) = re.findall(r'knuckle \(in \d+, up to (\S+) N·m\)', printed)
     assert 0.0 < float(most) < 0.001
 
 

@@ -38,9 +38,11 @@ def test_check_robot_warns_of_a_muscle_whose_length_jumps(tmp_path):
 def test_the_choices_that_a_jumping_length_leaves_are_named(tmp_path):
     robot = behind_a_drum(tmp_path, DRUM_ENDS['jumps'])
     jumps_at, limit, choices = jump_choices(robot)
-    assert jumps_at == 'jumps: muscle straightener by up to 173 mm, at bend -1.57 to -1.57'
+    jump = 'the length of muscle straightener jumps by up to 173 mm for bend in [-1.57, -1.57] rad'
+    assert jumps_at == f'length jump: {jump}'
     assert '(--without straightener), or accept' in choices
-    joint, low, high = re.search(r'limiting (\w+) to \[(.*), (.*)\] rad avoids it', limit).groups()
+    pattern = r'limiting (\w+) to \[(.*), (.*)\] rad excludes this jump'
+    joint, low, high = re.search(pattern, limit).groups()
     j = robot.joints.index(joint)
     robot.lower[j], robot.upper[j] = float(low), float(high)
     assert jump_choices(robot) == []
@@ -59,7 +61,7 @@ def test_lengths_of_emulated_individuals_jump_only_where_the_models_do(
 ):
     robot, odd = (behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items())
     m, laid = robot.muscles.index('straightener'), body(robot, seed)
-    monkeypatch.setattr(module, 'REDRAWN', 0)
+    monkeypatch.setattr(module, 'MOST_DRAWS', 0)
     assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # the premise
     assert not jumping(laid.absolute_lengths, robot).any()
     monkeypatch.undo()
