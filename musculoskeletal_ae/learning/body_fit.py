@@ -17,12 +17,12 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 PROBES = 200  # number of postures over which the mean length of each muscle is computed
-# A muscle has changed if its newest IN_A_ROW samples or more contradict the body by more than
-# LEAST_CHANGE and OUTLIER standard deviations, and at least LEAST_BEFORE samples came before them.
-IN_A_ROW = 4
-LEAST_CHANGE = 0.004  # [m]
-OUTLIER = 6.0  # [σ]
+# A muscle has changed if its newest LEAST_NEWEST samples or more contradict the body, all in the
+# same direction, and at least LEAST_BEFORE samples came before them.
+LEAST_NEWEST = 4
 LEAST_BEFORE = 8
+LEAST_CHANGE = 0.004  # smallest residual of a sample that contradicts the body [m]
+OUTLIER = 6.0  # smallest residual of a sample that contradicts the body, in standard deviations
 
 
 class BodyFit:
@@ -33,7 +33,7 @@ class BodyFit:
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, seed: int = 0) -> None:
-        """Begin with a body fitted to the network `mae`, or with the geometric model if None."""
+        """Begin with a body fitted to the network `mae`; without one, with the geometric model."""
         if mae is not None:
             robot = robot.with_elasticity(mae.elasticity)
         self.body = CalibratedBody(robot, seed=seed)
@@ -53,7 +53,7 @@ class BodyFit:
         The check runs once, as soon as there are enough samples; otherwise this returns False.
         """
         observed = observed.with_all_angles()
-        if self._prior_mean is None or self._is_prior_confirmed or len(observed) < IN_A_ROW:
+        if self._prior_mean is None or self._is_prior_confirmed or len(observed) < LEAST_NEWEST:
             return False
         self._is_prior_confirmed = True
         body = CalibratedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
@@ -99,6 +99,6 @@ def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, i
         same = odd & (np.sign(residual) == np.sign(residual[-1])) if len(residual) else odd
         fits = np.flatnonzero(~same)
         run = len(same) - 1 - fits[-1] if len(fits) else 0
-        if run >= IN_A_ROW and len(same) - run >= LEAST_BEFORE:
+        if run >= LEAST_NEWEST and len(same) - run >= LEAST_BEFORE:
             muscles.append((m, int(run)))
     return tuple(muscles)

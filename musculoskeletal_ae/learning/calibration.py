@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration of the anomaly detector from residuals of ② on messages of the healthy arm.
 
-    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold = margin · (1 + young/samples) · max d (of A: max A)
+    d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold of d = margin · (1 + n_few/samples) · max d
+                                   threshold of A = margin · (1 + n_few/samples) · max A
 
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
@@ -27,26 +28,26 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.signals.friction import end_tension
 
-CAPACITY = 4000  # messages
-SPACING = 0.1  # [s] between kept messages
-# A detector counts as calibrated after LEAST_TIME of healthy messages [s] that include
-# LEAST_SAMPLES distinct rests, and after as many samples were learned.
-LEAST_TIME, LEAST_SAMPLES = 60.0, 20
+CAPACITY = 4000  # default of the largest number of kept messages
+SPACING = 0.1  # time between kept messages [s]
+LEAST_TIME = 60.0  # duration of the healthy messages that calibrate a detector [s]
+#: number of distinct rests that these messages must include, and of samples that must be learned
+LEAST_SAMPLES = 20
 #: Threshold relative to the largest healthy d, once the body is well known. An unknown load of
 #: 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
 MARGIN = 3.5
-#: The threshold is larger by 1 + YOUNG / samples while few samples determine the body.
-YOUNG = 20.0
+#: n_few: number of samples with which the threshold is twice as large as with many samples, because
+#: few samples determine the body poorly
+FEW_SAMPLES = 20.0
 #: Share of Σ's own diagonal that is mixed into Σ. Otherwise combinations of muscles that did not
 #: occur in the messages would look impossible.
 DIAGONAL_SHARE = 0.1
-# At most the share GLITCHES of the messages is excluded, and only those whose distance is more than
-# GLITCH times that of all others.
-GLITCHES, GLITCH = 0.002, 3.0
+GLITCH_SHARE = 0.002  # largest share of the messages that is excluded as glitches
+GLITCH_RATIO = 3.0  # smallest distance of a glitch, relative to the largest of all other messages
 POSTURES = 200  # number of stored postures that show where the detector was calibrated
-# The network learns only from messages of the last RECENT seconds and RECENT_RESTS rests, because
-# tendons creep and bed in.
-RECENT, RECENT_RESTS = 3600.0, 200
+# Messages from which the network learns must be recent, because tendons creep and bed in.
+RECENT_TIME = 3600.0  # largest age of such a message [s]
+RECENT_RESTS = 200  # largest number of rests since such a message
 
 
 class Healthy(NamedTuple):
@@ -55,10 +56,9 @@ class Healthy(NamedTuple):
     messages: NDArray[np.float32]  # (T, l, s), (N, 3M)
     time: float  # healthy time from which they were drawn [s]
     rests: int  # number of distinct rests in that time
-    # Recent messages with all joint angles, from motion and rest: one half for training, the other
-    # half for validation.
+    #: half of the recent messages with all joint angles, from motion and rest, for training
     learned: Observations | None = None
-    judging: Observations | None = None
+    judging: Observations | None = None  # the other half of these messages, for validation
 
 
 class Reservoir:
@@ -77,7 +77,7 @@ class Reservoir:
         Args:
             muscles: Number of muscles.
             seed: Seed of the random selection.
-            settings: Which rests count as distinct.
+            settings: Thresholds by which rests count as distinct.
             capacity: Largest number of messages.
             radian: As for `SampleStore`.
         """
@@ -90,7 +90,10 @@ class Reservoir:
         self._rests = SampleStore(settings, radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
-        """Take a message, with θ where joint sensors measured it."""
+        """Offer a message, `dt` [s] after the previous one, with NaN for unmeasured θ.
+
+        At most one message every SPACING seconds is considered.
+        """
         self._since += dt
         if self._since < SPACING - 1e-9:
             return
@@ -112,7 +115,7 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Use messages with these muscles isolated; clear if messages lack any other muscle."""
+        """Set the isolated muscles; forget all messages if some lack a muscle now in use."""
         if self._missing - frozenset(isolated):
             self.clear()
 
@@ -136,7 +139,7 @@ class Reservoir:
         columns = np.split(rows.astype(float), [m, 2 * m, 3 * m, -2, -1], axis=1)
         tension, length, direction, theta, number, time = columns
         age = self._rests.accepted - number[:, 0]
-        recent = (time[:, 0] > self.time - RECENT) & (age < RECENT_RESTS)
+        recent = (time[:, 0] > self.time - RECENT_TIME) & (age < RECENT_RESTS)
         # A tension of 0 N means that the muscle was isolated or slack.
         whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
         known = np.ones(tension.shape, dtype=bool)
@@ -202,7 +205,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
         part.distances(error[sound & ~first]).max(initial=0.0),
         statistics.distances(error[sound]).max(),
     )
-    margin = MARGIN * (1.0 + YOUNG / max(known, 1))
+    margin = MARGIN * (1.0 + FEW_SAMPLES / max(known, 1))
     thresholds = {
         DISTANCE: float(margin * largest),
         NORM: float(margin * anomaly(error[sound]).max()),
@@ -224,7 +227,7 @@ def _spread_out(theta: Array, count: int) -> Array:
 
 
 def _glitches(error: Array) -> Bools:
-    few = int(GLITCHES * len(error))
+    few = int(GLITCH_SHARE * len(error))
     if few == 0:
         return np.zeros(len(error), dtype=bool)
     # Compute the statistics without the most extreme messages, ranked by robust deviation, so that
@@ -233,7 +236,7 @@ def _glitches(error: Array) -> Bools:
     spread = np.median(np.abs(error - middle), axis=0) + FLOOR
     order = np.argsort((np.abs(error - middle) / spread).max(axis=1))
     distance = _statistics(error[order[:-few]]).distances(error)
-    return np.greater(distance, GLITCH * np.sort(distance)[-few - 1])
+    return np.greater(distance, GLITCH_RATIO * np.sort(distance)[-few - 1])
 
 
 def _statistics(error: Array, calibrated: bool = False) -> AnomalyStatistics:

@@ -45,7 +45,7 @@ class SampleCollector:
         healthy: Messages of the healthy arm, from motion and rest.
         rejected: Number of messages and rests that were not used, by reason.
         used_at: Time of the last message that could be learned from [s]; −∞ before the first.
-        obstacle: Why the messages since then could not be learned from.
+        obstacle: Why no message since `used_at` could be learned from.
     """
 
     def __init__(
@@ -108,11 +108,14 @@ class SampleCollector:
     # -- messages -------------------------------------------------------------------------------
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take θ [rad] (D,) received at `time` [s]; NaN for joints that were not measured."""
+        """Record θ [rad] (D,) received at `time` [s], with NaN for unmeasured joints.
+
+        The next message of muscle_states is paired with it.
+        """
         self._measure(time, 0, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
-        """Take an accelerometer reading in the axes of a link [m/s²], (3,).
+        """Record an accelerometer reading in the axes of a link [m/s²], (3,).
 
         At rest the reading is opposite to gravity and therefore gives its direction. Readings
         during motion are not used.
@@ -127,7 +130,7 @@ class SampleCollector:
         self._pairing.joints(time, measured)
 
     def take(self, time: float, message: Any) -> Paired[MuscleSample] | None:
-        """Take a message of muscle_states received at `time` [s].
+        """Check a message of muscle_states received at `time` [s], and pair it with θ.
 
         Returns:
             The previous message with its θ, or None if there is none.
@@ -143,7 +146,7 @@ class SampleCollector:
         return self._paired(time, sample)
 
     def muscles(self, time: float, states: Array) -> Paired[MuscleSample] | None:
-        """Take raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s].
+        """Check raw l [m], T [N] and temperature [°C], (3, M), as `take` does for a message.
 
         Returns:
             The previous message with its θ, or None if there is none. An implausible message is
@@ -172,7 +175,7 @@ class SampleCollector:
         return self._pairing.muscles(time, sample)
 
     def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
-        """Take a message from the healthy arm; return the new samples that it completes."""
+        """Process a message of the healthy arm; return the new samples that it completes."""
         dt = min(paired.dt + self._skipped, self._longest_pause)
         measured = self._unmeasured if paired.theta is None else paired.theta
         theta, gravity = np.split(measured, [self._robot.joint_count])

@@ -11,21 +11,22 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.fit import Fit
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.synthetic import UNSURE
+from musculoskeletal_ae.learning.synthetic import UNKNOWN_FRICTION
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import TINY
 
-#: number of validation messages needed to scale the covariance
-MANY = 200
-#: Number of bodies drawn from the posterior, and of samples for each. There are many more bodies
-#: than joints, because a covariance of few draws underestimates the errors of other draws.
-BODIES, EACH = 100, 10
+#: number of validation messages that are enough to scale the covariance
+MANY_MESSAGES = 200
+#: Number of bodies drawn from the posterior. There are many more of them than joints, because a
+#: covariance of few draws underestimates the errors of other draws.
+BODIES = 100
+POSTURES_PER_BODY = 10  # number of postures at which errors of each body are drawn
 #: Factor of the covariance without validation messages. It stands for errors that are common to
-#: all samples and that no prior describes, such as those of tendons that wrap round bones. With it,
+#: all samples and that no prior describes, for example because tendons wrap round bones. With it,
 #: the ellipsoids of development individuals of both emulator models contain 95 % of their true
 #: angles (`python -m bench covariance`).
-UNSEEN = 1.7
-INSIDE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
+UNVALIDATED_FACTOR = 1.7
+CONTAINED_SHARE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
 
 
 def estimate_covariance(
@@ -38,11 +39,12 @@ def estimate_covariance(
 ) -> Array:
     """Return the expected covariance of a network's errors θ_est − θ [rad²], (D, D).
 
-    It is computed from errors drawn at random postures with tensions of the samples. An error
-    consists of that of the joint-sensor offset, which validation messages share and therefore do
-    not show, and of the rest. If there are at least MANY validation messages, the rest is scaled by
-    the ratio between their actual errors and errors drawn at their postures. Most of these postures
-    are near the samples. With fewer messages, the covariance is multiplied by UNSEEN.
+    It is computed from errors drawn at random postures with tensions of the samples. An error has
+    two parts. One comes from the error of the joint-sensor offset, which validation messages do not
+    show because they contain the same offset. If there are at least MANY_MESSAGES validation
+    messages, the other part is scaled by the ratio between their actual errors and errors drawn at
+    their postures. Most of these postures are near the samples. With fewer messages, the covariance
+    is multiplied by UNVALIDATED_FACTOR.
 
     Args:
         mae: The network.
@@ -58,10 +60,11 @@ def estimate_covariance(
         # Draw the same bodies and length errors in both calls, so that only the postures differ.
         return _drawn_errors(mae, body, fit, theta, tension, np.random.default_rng(seed))
 
-    error, offset = draw(body.robot.random_postures(BODIES * EACH, rng))
-    if judging is None or len(judging) < MANY:
-        return UNSEEN * _spread(error)
-    here, offset_here = draw(judging.theta[rng.integers(len(judging), size=BODIES * EACH)])
+    error, offset = draw(body.robot.random_postures(BODIES * POSTURES_PER_BODY, rng))
+    if judging is None or len(judging) < MANY_MESSAGES:
+        return UNVALIDATED_FACTOR * _spread(error)
+    rows = rng.integers(len(judging), size=BODIES * POSTURES_PER_BODY)
+    here, offset_here = draw(judging.theta[rows])
     actual = observed_theta(mae, judging) - judging.theta
     ratio = math.sqrt(_excess(_spread(here - offset_here), actual))
     return _spread(offset + ratio * (error - offset))
@@ -75,17 +78,18 @@ def _drawn_errors(
     tension: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Return errors at as many postures as errors, and their part that joint sensors do not show.
+    """Draw one error for each posture, and the part of it that joint sensors do not show.
 
     Bodies and joint-sensor offsets are drawn from the posterior of the fit (Laplace approximation,
     lengths linearised in the parameters). The network estimates θ from the lengths of each body.
 
     Returns:
-        θ_est − θ [rad], and the error of the joint-sensor offset [rad], (BODIES · EACH, D) each.
+        θ_est − θ [rad], and the error of the joint-sensor offset [rad], both of shape
+        (BODIES · POSTURES_PER_BODY, D).
     """
-    bodies = np.repeat(np.arange(BODIES), EACH)
+    bodies = np.repeat(np.arange(BODIES), POSTURES_PER_BODY)
     tension = tension[rng.integers(len(tension), size=len(bodies))]
-    direction = UNSURE * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
+    direction = UNKNOWN_FRICTION * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
     poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
     offset = np.zeros((BODIES, theta.shape[1]))
     for group, (muscles, root) in zip(body.robot.groups, fit.root, strict=True):
@@ -112,14 +116,14 @@ def _spread(error: Array) -> Array:
 
 
 def _excess(covariance: Array, error: Array) -> float:
-    """Return the factor for a covariance whose ellipsoid shall contain INSIDE of the errors."""
-    return float(np.quantile(ellipsoids(covariance, error), INSIDE))
+    """Return the factor with which a covariance's ellipsoid contains 95 % of the errors."""
+    return float(np.quantile(ellipsoids(covariance, error), CONTAINED_SHARE))
 
 
 def ellipsoids(covariance: Array, error: Array) -> Array:
-    """Return, for each error, the factor that puts the covariance's ellipsoid through it, (N,).
+    """Return, for each error, the factor of the covariance whose ellipsoid passes through it, (N,).
 
-    The ellipsoid contains the share INSIDE of a normal distribution.
+    The ellipsoid of a covariance contains the share CONTAINED_SHARE of its normal distribution.
 
     Args:
         covariance: [rad²], (D, D).
@@ -127,7 +131,7 @@ def ellipsoids(covariance: Array, error: Array) -> Array:
     """
     squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
     # Quantile of χ² with D degrees of freedom; importing scipy.stats for it would take 0.7 s.
-    bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], INSIDE))
+    bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], CONTAINED_SHARE))
     return bounded
 
 

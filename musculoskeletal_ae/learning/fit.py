@@ -32,10 +32,10 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 
 ROUNDS = 30  # largest number of Gauss–Newton iterations for one muscle
-ENOUGH = 1e-11  # the iterations end when the cost decreases by less than this for each length
+LEAST_DECREASE = 1e-11  # decrease of the cost per length below which the iterations end
 LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
-#: number of samples from before a muscle changed that are enough to derive its new prior from them
-LEAST_ANCHOR = 8
+#: smallest number of samples from before the change of a muscle from which its new prior is derived
+LEAST_BEFORE_CHANGE = 8
 
 
 class Fit(NamedTuple):
@@ -45,7 +45,7 @@ class Fit(NamedTuple):
     noise: Array  # σ of each muscle's length [m], (M,)
     weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
     theta: Array  # fitted postures [rad], (N, D)
-    #: for each group its muscles, and R; (RᵀR)⁻¹ is the covariance of their parameters
+    #: for each group, its muscles and R; the covariance of their parameters is (RᵀR)⁻¹
     root: list[tuple[Ints, Array]]
 
 
@@ -58,8 +58,8 @@ def fit_body(
     """Fit the parameters of a body in place, together with the samples' postures.
 
     The fit starts from the present parameters. A muscle counts as changed if some samples no
-    longer describe it although it was not isolated when they were taken. The prior of its new
-    parameters is then a fit to those samples.
+    longer describe it although it was not isolated when they were taken. In that case the body is
+    first fitted to these samples, and the result is the prior mean of the muscle's new parameters.
 
     Args:
         body: The body.
@@ -98,10 +98,10 @@ def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
 def _reopened(
     body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
 ) -> MusclePrior:
-    """Return a wide prior around the earlier parameters of a muscle if it was changed."""
+    """Return a wide prior around a muscle's earlier parameters if it was changed, else `prior`."""
     # A tension of 0 N means that the muscle was isolated.
     before = ~observed.known[:, m] & (observed.tension[:, m] > 0.0)
-    if before.sum() < LEAST_ANCHOR:
+    if before.sum() < LEAST_BEFORE_CHANGE:
         return prior
     poses = body.poses(observed.theta)
     problem = MuscleFit(body, poses, observed, before, prior, LEAST_NOISE, m)
@@ -148,7 +148,7 @@ class MuscleFit:
     def run(self) -> Array:
         """Return the fitted parameters, starting from the body's present ones."""
         start = self.point(self._body.parameters[self._m])
-        enough = ENOUGH * float(self._known.sum())
+        enough = LEAST_DECREASE * float(self._known.sum())
         return minimise(self, start, ROUNDS, enough).point.parameters
 
     def point(self, parameters: Array) -> MusclePoint:
@@ -200,7 +200,7 @@ NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
 
 
 def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
-    """Fit a body in place to the lengths that a network which has learned a real arm restores.
+    """Fit a body in place to the muscle lengths of a network that has learned a real arm.
 
     A checkpoint does not contain the samples from which it was learned (`train --from-bag`, another
     machine, a lost state). With this fit as prior, the first samples refine the learned body

@@ -203,7 +203,8 @@ class CheckpointKeeper:
         """
         if self._state is None:
             raise StateError(
-                "nothing can be saved because state_directory is ''; restart with a directory"
+                "nothing can be saved because state_directory is ''; restart the learner with the "
+                'path of a directory'
             )
         self._state.save(self._samples, self.publication.checkpoint)
         return self._state.directory

@@ -28,7 +28,7 @@ from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, un
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_check import OffsetCheck
-from musculoskeletal_ae.learning.offset_history import HELD, OffsetHistory
+from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
 from musculoskeletal_ae.learning.report import learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, UpdateScheduler
@@ -79,7 +79,8 @@ class Learner:
             steps: Training steps per update, for preset `default`.
             period: Period of the muscle modules' messages [s].
             settings: Thresholds for rest and for new samples.
-            joint_source: Source of θ: `SENSOR`, `MARKER` or `NONE` of `collector`.
+            joint_source: Source of θ, one of the constants `SENSOR`, `MARKER` and `NONE` of the
+                module `collector`.
             trainer: Creates the trainer.
             directory: State directory for samples and network; None to save nothing.
 
@@ -129,22 +130,22 @@ class Learner:
     # -- messages → samples ---------------------------------------------------------------------
 
     def step(self, time: float, theta: Array | None, tension: Array, length: Array) -> bytes | None:
-        """Take the measurements at `time` [s] and `poll`; θ is None if it was not measured."""
+        """Process the measurements at `time` [s], then `poll`; θ is None if it was not measured."""
         if theta is not None:
             self.joints(time, theta)
         self.muscles(np.array([length, tension, np.full(len(length), np.nan)]), time)
         return self.poll(time)
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take θ [rad] (D,) received at `time` [s]; NaN for joints that were not measured."""
+        """Record θ [rad] (D,) received at `time` [s], with NaN for unmeasured joints."""
         self.collector.joints(time, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
-        """Take an accelerometer reading in the axes of a link [m/s²] (3,) at `time` [s]."""
+        """Record an accelerometer reading in the axes of a link [m/s²] (3,) at `time` [s]."""
         self.collector.imu(time, link, acceleration)
 
     def take(self, message: Any, time: float) -> None:
-        """Take a message of muscle_states received at `time` [s].
+        """Learn from a message of muscle_states received at `time` [s].
 
         Raises:
             RejectionError: If the message cannot be used.
@@ -152,7 +153,7 @@ class Learner:
         self._learn_from(self.collector.take(time, message), time)
 
     def muscles(self, states: Array, time: float) -> None:
-        """Take raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s]."""
+        """Learn from raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s]."""
         self._learn_from(self.collector.muscles(time, states), time)
 
     def _learn_from(self, paired: Paired[MuscleSample] | None, time: float) -> None:
@@ -171,7 +172,10 @@ class Learner:
             self._note_new_samples()
 
     def _believes_offsets(self, paired: Paired[MuscleSample]) -> bool:
-        """Return whether the length offsets are plausible and no length has jumped."""
+        """Compare the length offsets with a message; return whether they are plausible.
+
+        They are not if a length has jumped since their calibration.
+        """
         check, measured = self.offset_check, paired.theta
         was_believed = check.is_believed
         theta = None if measured is None else measured[: self.robot.joint_count]
@@ -237,7 +241,7 @@ class Learner:
             if offsets.is_suspect:
                 # The samples held back stay on disk until the offsets have been calibrated again.
                 self.offset_history.revoke(self._time)
-                self.collector.healthy.forget_newest(HELD)
+                self.collector.healthy.forget_newest(HELD_TIME)
             elif self.offset_check.is_believed:
                 self._believe_offsets()
         self.keeper.isolate(body.isolated)
@@ -256,7 +260,7 @@ class Learner:
         anomaly.
         """
         self.collector.set_anomaly(detected)
-        # That network's detector may have been calibrated before a muscle was changed.
+        # The detector of the earlier network may have been calibrated before a muscle was changed.
         holds = self.scheduler.statistics_hold
         self.keeper.set_anomaly(detected, lambda mae: mae if holds else uncalibrated(mae))
         self._publish_isolation()

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 from musculoskeletal_ae.learning.samples import Sample
 
-MARGIN = 2.0  # [s] before a detection and after its reset
-#: most messages held back: more than MARGIN at 1 kHz; bounds the memory if the clock stands still
+#: time before the detection of an anomaly and after its reset in which messages are not used [s]
+MARGIN = 2.0
+#: Largest number of messages held back. At 1 kHz fewer arrive within MARGIN; the number bounds the
+#: memory if the clock stands still.
 MOST_WAITING = 5000
 
 

@@ -14,15 +14,15 @@ from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, one_thread
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 
-STEP_SIZE = 2e-3
-BATCH = 128
-#: The weights are averaged over this share of all steps so far, within these limits.
-AVERAGED_SHARE, LEAST_AVERAGED, MOST_AVERAGED = 0.1, 20.0, 2000.0
-#: The step size falls to a half after this number of steps …
-CALMING = 2000.0
-#: … and not below this share of its initial value: the average no longer drifts then, but the
-#: network still follows a slowly changing body.
-LEAST_CALM = 0.1
+STEP_SIZE = 2e-3  # initial step size
+BATCH = 128  # number of samples of a mini-batch
+AVERAGED_SHARE = 0.1  # share of all steps so far over which the weights are averaged
+LEAST_AVERAGED = 20.0  # smallest number of steps over which the weights are averaged
+MOST_AVERAGED = 2000.0  # largest number of steps over which the weights are averaged
+HALVING_STEPS = 2000.0  # number of steps after which the step size has fallen to a half
+#: Smallest step size, relative to the initial one. With it, the weight average no longer drifts,
+#: but the network still follows a slowly changing body.
+LEAST_STEP_SHARE = 0.1
 
 
 class NetworkTrainer:
@@ -53,7 +53,8 @@ class NetworkTrainer:
                 rows = torch.as_tensor(self._rng.integers(len(entered), size=BATCH))
                 value = _loss(self._raw, entered[rows], true[rows], mask)
                 value.backward()
-                self._optimiser.step(max(LEAST_CALM, 1.0 / (1.0 + self.steps / CALMING)))
+                share = 1.0 / (1.0 + self.steps / HALVING_STEPS)
+                self._optimiser.step(max(LEAST_STEP_SHARE, share))
                 self.steps += 1
                 self._average()
                 losses.append(value.item())
@@ -65,7 +66,7 @@ class NetworkTrainer:
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
-        """Return to large steps and a short average after the body has changed."""
+        """Return to large steps and a short weight average, because the body has changed."""
         self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
 
     def _average(self) -> None:

@@ -3,9 +3,9 @@
 
     e = |l − o − ①(θ, T_end)|,   median over COUNT messages, for each muscle
 
-θ is measured, or else estimated by ②. New offsets o are accepted if e is at most WORSE times the
-error with the previous offsets and the same network, or at most FLOOR. Learning pauses while the
-published offsets disagree with the messages, whichever node published them.
+θ is measured, or else estimated by ②. New offsets o are accepted if e is at most LARGEST_RATIO
+times the error with the previous offsets and the same network, or at most LEARNED_ERROR. Learning
+pauses while the published offsets disagree with the messages, whichever node published them.
 """
 
 import math
@@ -18,11 +18,13 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-SPACING, COUNT = 0.1, 20  # time between compared messages [s], and their number
-WORSE = 2.0
-#: error that a healthy network may have [m]: one that has learned this arm, and one that has not
-FLOOR, FLOOR_UNLEARNED = 0.04, 0.1
-SAME = 0.008  # largest difference between two correct calibrations of the same arm [m]
+SPACING = 0.1  # time between compared messages [s]
+COUNT = 20  # number of compared messages
+LARGEST_RATIO = 2.0  # largest accepted error, relative to the error with the previous offsets
+LEARNED_ERROR = 0.04  # error that is accepted of a network that has learned an arm [m]
+UNLEARNED_ERROR = 0.1  # error that is accepted of a network that has not learned an arm [m]
+#: largest difference between two correct calibrations of the same arm [m]
+CALIBRATION_SPREAD = 0.008
 
 
 class OffsetCheck:
@@ -48,7 +50,8 @@ class OffsetCheck:
         self._now.clear()
         self.problem = ''
         change = np.abs(offsets.offset - self._believed.offset).max()
-        self.is_believed = offsets.known and self._believed.known and bool(change <= SAME)
+        is_same = bool(change <= CALIBRATION_SPREAD)
+        self.is_believed = offsets.known and self._believed.known and is_same
         if not offsets.known:  # the next offsets come from a new calibration
             self._believed = LengthOffsets(self._believed.offset, offsets.deviation)
 
@@ -57,7 +60,10 @@ class OffsetCheck:
         self._now.clear()
 
     def step(self, mae: Mae | None, message: MuscleSample, theta: Array | None, dt: float) -> None:
-        """Take a message, `dt` [s] after the previous one, and θ [rad] (D,) if it was measured."""
+        """Compare a message, `dt` [s] after the previous one, with θ [rad] (D,) if measured.
+
+        After COUNT messages, the new offsets are accepted or rejected.
+        """
         self._since += dt
         if self._since < SPACING - 1e-9 or mae is None or not self._offsets.known:
             return
@@ -73,15 +79,17 @@ class OffsetCheck:
 
     def _judge(self, mae: Mae) -> None:
         error = _length_error(mae, self._now)
-        limit = np.full_like(error, FLOOR if mae.covariance is not None else FLOOR_UNLEARNED)
+        accepted = LEARNED_ERROR if mae.covariance is not None else UNLEARNED_ERROR
+        limit = np.full_like(error, accepted)
         if len(self._before) == COUNT:
-            limit = np.maximum(FLOOR, WORSE * _length_error(mae, self._before))
+            limit = np.maximum(LEARNED_ERROR, LARGEST_RATIO * _length_error(mae, self._before))
         excess = error / limit
         if excess.max() > 1.0:
             m = int(excess.argmax())
             self.problem = (
-                f'the length offsets disagree with the messages: {mae.muscles[m]} is off by '
-                f'{1e3 * error[m]:.0f} mm, limit {1e3 * limit[m]:.0f} mm; call estimator/zero'
+                f'the length offsets disagree with the messages: the length of {mae.muscles[m]} is '
+                f'off by {1e3 * error[m]:.0f} mm; legal: at most {1e3 * limit[m]:.0f} mm; call '
+                'estimator/zero'
             )
             return
         self._believed, self.is_believed, self.problem = self._offsets, True, ''

@@ -21,13 +21,13 @@ from collections import deque
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.offset_check import SAME
+from musculoskeletal_ae.learning.offset_check import CALIBRATION_SPREAD
 from musculoskeletal_ae.learning.samples import SampleStore, StoredSample
 from musculoskeletal_ae.signals.limits import LIMITS
 
-HELD = 5.0  # time before a finding in which samples may be wrong [s]
+HELD_TIME = 5.0  # time before a finding in which samples may be wrong [s]
 #: jump of a length between two messages that is always detected [m]
-SEEN = LIMITS.step + LIMITS.speed * LIMITS.longest_step
+DETECTED_JUMP = LIMITS.step + LIMITS.speed * LIMITS.longest_step
 
 
 class OffsetHistory:
@@ -39,7 +39,7 @@ class OffsetHistory:
     """
 
     def __init__(self, samples: SampleStore, offset: Array) -> None:
-        """Start with offsets [m] (M,)."""
+        """Start with the offsets under which `samples` were taken [m], (M,)."""
         self._samples, self._offset = samples, offset
         #: number of the first sample that was taken under the present offsets
         self._first = samples.accepted + 1
@@ -52,7 +52,7 @@ class OffsetHistory:
     def accepted(self, now: float) -> None:
         """Record that the newest sample of the store was taken at `now` [s]."""
         self._recent.append((now, self._samples.accepted))
-        while self._recent and not 0.0 <= now - self._recent[0][0] <= HELD:
+        while self._recent and not 0.0 <= now - self._recent[0][0] <= HELD_TIME:
             self._recent.popleft()
 
     def interrupt(self) -> None:
@@ -62,7 +62,7 @@ class OffsetHistory:
     def revoke(self, now: float) -> None:
         """Hold back recent samples, because a finding at `now` [s] has revoked the offsets."""
         if not self._is_revoked:
-            recent = {number for at, number in self._recent if 0.0 <= now - at <= HELD}
+            recent = {number for at, number in self._recent if 0.0 <= now - at <= HELD_TIME}
             self._held += self._samples.take_out(recent)
         self._is_revoked = True
 
@@ -70,16 +70,16 @@ class OffsetHistory:
         """Use plausible offsets [m] (M,) from now on, and put back, drop or correct samples."""
         change = self._offset - offset
         size = float(np.abs(change).max())
-        if size <= SAME:
+        if size <= CALIBRATION_SPREAD:
             self._samples.put_back(self._held)
         else:
             self.dropped += len(self._held)
-            if self._is_continuous and not self._is_revoked and size > SEEN:
+            if self._is_continuous and not self._is_revoked and size > DETECTED_JUMP:
                 self.corrected += self._samples.lengthen(change, self._first)
             else:
                 self._first = self._samples.accepted + 1
         self._held = []
-        if size > SAME or self._is_revoked:
+        if size > CALIBRATION_SPREAD or self._is_revoked:
             self._recent.clear()
             self._is_continuous = True
         self._offset, self._is_revoked = offset, False

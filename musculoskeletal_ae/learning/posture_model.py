@@ -7,7 +7,8 @@
     gravity   u_ni − R_iᵀ(θ_n) ĝ
 
 Here w are the parameters of the body, θ_n the postures of the samples and z the joint-sensor
-offsets; see `postures`. K and b are those of the joints' springs; see `springs`.
+offsets (`postures`). K and b describe the joints' springs (`springs`). y_nj are measured angles and
+u_ni measured directions of gravity.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from musculoskeletal_ae.signals.friction import end_tension
 DIFFERENCE = 1e-6  # step of the finite differences [rad] or [m]
 #: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]; for prismatic
 #: joints times RACK [m]
-BENT = 0.05
-SMALL = 1e-6
+REUSED_MOTION = 0.05
+SMALL = 1e-6  # smallest divisor
 
 
 class Unknowns(NamedTuple):
@@ -49,7 +50,7 @@ class Residuals(NamedTuple):
     torque: Array  # (N, D)
     torque_by_body: Array  # −∂τ/∂w, (N, D, W)
     torque_by_springs: Array  # −∂τ/∂(α, β) of the S joints with springs, (N, D, 2S)
-    load: Array  # median sum of the muscles' absolute torques at each joint [N·m], (D,)
+    load: Array  # sum of the muscles' absolute torques at each joint, median [N·m], (D,)
     angle: Array  # (N, D); 0 where the angle was not measured
     gravity: Array  # (N, 3J)
     gravity_by_posture: Array  # (N, 3J, D)
@@ -169,7 +170,7 @@ class PostureModel:
     def _down(self, theta: Array) -> Array:
         """Return gravity's direction in the frames of the tree's joints, (1+D, N, 3J).
 
-        The first entry is at θ; in the others, one joint of the group each is moved by
+        The first entry is at θ. In each of the others, one joint of the group is moved by
         `DIFFERENCE`. Without an IMU the result has 0 columns.
         """
         if not self._tilt.size:
@@ -196,7 +197,7 @@ class PostureModel:
         """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at or near θ (N, D)."""
         joints, radian = self.joints, self.body.robot.kinematics.radian
         at = self._bent.theta[:, joints]
-        moved = np.flatnonzero(~(np.abs(own - at) < BENT * radian).all(axis=1))
+        moved = np.flatnonzero(~(np.abs(own - at) < REUSED_MOTION * radian).all(axis=1))
         hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
         self._bent.theta[np.ix_(moved, joints)] = own[moved]
         self._bent.stiffness[np.ix_(moved, joints, joints)] = np.einsum(

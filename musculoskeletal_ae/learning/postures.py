@@ -49,21 +49,23 @@ from musculoskeletal_ae.learning.stops import Stops
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
 
-# For prismatic joints, [rad] below are times RACK [m].
-GRAVITY = 0.02  # σ_u: error and mounting error of an accelerometer [rad]
+# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
+# RACK [m].
+GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
 FIRST_NOISE = 0.002  # initial σ of a length [m]
 LEAST_NOISE = 0.0008  # smallest σ of a length in the weights: error that no body explains [m]
 #: σ_τ as a share of the muscles' absolute torques at a joint. It is wide, because friction and the
 #: offsets of the tension sensors are common to all samples.
-TORQUE = 0.3
-LEAST_TORQUE = 0.01  # smallest usual residual torque, as the same share
-SCALINGS = 2  # iterations of the Birge ratio
+TORQUE_NOISE = 0.3
+#: smallest usual residual torque, as a share of the muscles' absolute torques at a joint
+LEAST_TORQUE = 0.01
+SCALINGS = 2  # number of iterations that compute the Birge ratio
 ROUNDS = 12  # largest number of Gauss–Newton iterations
-#: The iterations end when the cost decreases by less than this for each length. The step is then
-#: far shorter than the posterior spread, and the noise has settled. With ten times this value, the
-#: fit mistakes a slipped joint sensor for a changed muscle more often.
-ENOUGH = 3e-4
-EXPECTED = 0.3  # typical step of a posture [rad]
+#: Decrease of the cost per length below which the iterations end. The step is then far shorter than
+#: the posterior spread, and the noise has settled. With ten times this value, the fit mistakes a
+#: slipped joint sensor for a changed muscle more often.
+LEAST_DECREASE = 3e-4
+TYPICAL_STEP = 0.3  # typical step of a posture [rad]
 
 
 class Weights(NamedTuple):
@@ -106,8 +108,8 @@ class GroupFit:
             mean: Prior mean w̄ of each muscle.
             spread: Prior spread s of each muscle.
             least_noise: Smallest σ of a length [m].
-            is_learned: Whether the prior means were learned; otherwise they are those of the
-                geometric model.
+            is_learned: Whether the prior means were learned; otherwise they describe the geometric
+                model.
         """
         self._least_ratio = 1.0 if is_learned else 0.0
         self.model, self.stops = model, Stops(model)
@@ -122,7 +124,7 @@ class GroupFit:
         self._stiffness: Array  # ∂τ/∂θ in the last normal equations
         radian = model.body.robot.kinematics.radian
         self.usual = (
-            1.0 / (EXPECTED * radian) ** 2,
+            1.0 / (TYPICAL_STEP * radian) ** 2,
             np.concatenate(
                 [self.prior.precision, self.prior.zero_precision, self.prior.spring_precision]
             ),
@@ -133,7 +135,7 @@ class GroupFit:
 
         The root R is upper triangular, and (RᵀR)⁻¹ is the covariance of w, z and e.
         """
-        enough = ENOUGH * self._known.sum()
+        enough = LEAST_DECREASE * self._known.sum()
         fit = minimise(self, self.point(start), ROUNDS, enough)
         root = self._posterior(fit.point)
         self._widen(fit.point.residuals, root)
@@ -144,13 +146,13 @@ class GroupFit:
 
         The spreads of the prior are scaled by the Birge ratio √(χ²/γ). χ² is the square of the
         deviation from the prior mean in units of the spreads, and γ the number of parameters that
-        the samples determine. An arm that differs from its model more than the prior expects, as
-        far as the samples show, is expected to do so in what they do not show, such as offsets of
-        joint sensors. An arm that agrees with a learned prior may still be wrong in the latter; the
-        ratio is then at least 1.
+        the samples determine. If the samples show that an arm differs from its model more than the
+        prior expects, it is expected to differ as much in properties that they do not show, such as
+        offsets of joint sensors. With a learned prior the ratio is at least 1: an arm that agrees
+        with such a prior may still differ in those properties.
         """
         prior = self.prior
-        # Errors of the body model are common to all samples: see ALIKE.
+        # Errors of the body model are common to all samples (`priors.INDEPENDENT_SAMPLES`).
         self._weights = self._weights._replace(torque=self._weights.torque / prior.unread)
         prior.repeated = prior.repeated * prior.unread
         equations = self.equations(point)
@@ -161,7 +163,7 @@ class GroupFit:
         for _ in range(SCALINGS):
             inverse = solve_triangular(root, np.eye(len(root)))[parameters]
             undetermined = float(scaled @ np.square(inverse).sum(axis=1))
-            # One more parameter at its expected deviation: without samples the ratio is 1.
+            # Add one parameter at its expected deviation, so that the ratio is 1 without samples.
             ratio = (chi_square + 1.0) / (max(0.0, len(parameters) - undetermined) + 1.0)
             scaled = prior.precision / max(self._least_ratio, ratio)
             common = equations.common.copy()
@@ -191,13 +193,13 @@ class GroupFit:
         usual_torque = 1.5 * np.median(np.abs(residuals.torque), axis=0)
         usual_torque = np.maximum(usual_torque, LEAST_TORQUE * residuals.load + SMALL)
         is_free = self.stops.lean(own, residuals.torque / usual_torque)
-        sigma = np.maximum(usual_torque, TORQUE * residuals.load)
+        sigma = np.maximum(usual_torque, TORQUE_NOISE * residuals.load)
         y = self.prior.angle_precision
         self._weights = Weights(
             self.weight / np.maximum(self.noise, LEAST_NOISE) ** 2,
             is_free * student(residuals.torque / sigma) / sigma**2,
             y * student(residuals.angle * np.sqrt(y)),
-            self.model.is_tilt_known / GRAVITY**2,
+            self.model.is_tilt_known / GRAVITY_NOISE**2,
         )
 
     def _pull(self, unknowns: Unknowns) -> tuple[Array, Array]:
@@ -220,7 +222,7 @@ class GroupFit:
         )
 
     def equations(self, point: Point) -> Equations:
-        """Return the normal equations of θ, and of w and z."""
+        """Return the normal equations of θ, and of (w, z, e)."""
         model, weights, residuals = self.model, self._weights, point.residuals
         count, places = model.by_sensor.shape
         size = model.parameter_count
@@ -326,11 +328,11 @@ def fit_jointly(
         mean: Prior mean of each muscle's parameters.
         spread: Prior spread of each muscle's parameters.
         least_noise: Smallest σ of a length [m].
-        is_learned: Whether the prior means were learned; otherwise they are those of the geometric
+        is_learned: Whether the prior means were learned; otherwise they describe the geometric
             model.
 
     Returns:
-        The fields of `Fit`.
+        The fields of `Fit`, in their order.
     """
     own, zero = np.isfinite(observed.theta) & (observed.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in observed.length]

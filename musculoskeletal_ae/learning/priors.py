@@ -13,26 +13,27 @@ from musculoskeletal_ae.learning.body import Layout
 from musculoskeletal_ae.learning.posture_model import PostureModel
 from musculoskeletal_ae.learning.stops import sensor_zeros
 
-# For prismatic joints, [rad] below are times RACK [m].
 #: Errors of the body model are common to all samples. Therefore all samples together count as at
 #: most this number of independent ones, for joint-sensor offsets, for springs of the joints, and
 #: for the posterior uncertainty from the torque and the stops of joints without a sensor.
-ALIKE = 10.0
-SENSOR = 0.002  # σ_y of a joint sensor [rad]
-SMALL = 1e-6  # smallest σ_y [rad]
+INDEPENDENT_SAMPLES = 10.0
+# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
+# RACK [m].
+SENSOR_NOISE = 0.002  # σ_y of a joint sensor [rad]
+LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
 
 
 @dataclass(frozen=True)
 class Prior:
     """Standard deviations of the differences between a body and its geometric model."""
 
-    attachment: float = 0.007  # each coordinate of each route point [m]
-    elastic: float = 0.2  # logarithm of each elastic constant
-    friction: float = 0.05  # μ, around `friction_mean`
+    attachment: float = 0.007  # σ of each coordinate of each route point [m]
+    elastic: float = 0.2  # σ of the logarithm of each elastic constant
+    friction: float = 0.05  # σ of μ around `friction_mean`
     friction_mean: float = 0.05  # mean of μ
-    offset: float = 0.001  # offset of the length sensor [m]
-    creep: float = 1e-5  # creep of a tendon from one sample to the next [m]
-    smooth: float = 0.002  # residual model [m]
+    offset: float = 0.001  # σ of the offset of the length sensor [m]
+    creep: float = 1e-5  # σ of the creep of a tendon from one sample to the next [m]
+    smooth: float = 0.002  # σ of the parameters of the residual model [m]
 
     def spread(self, layout: Layout) -> Array:
         """Return the prior spread s of every parameter of a muscle."""
@@ -92,21 +93,22 @@ class GroupPrior:
         """Return the prior of a group from the `mean` and `spread` of each of its muscles."""
         observed, robot, by_sensor = model.observed, model.body.robot, model.by_sensor
         radian = robot.kinematics.radian
-        angle_spread = np.where(by_sensor, SENSOR * radian, observed.spread)
-        repeated = np.maximum(1.0, by_sensor.sum(axis=0) / ALIKE)
+        angle_spread = np.where(by_sensor, SENSOR_NOISE * radian, observed.spread)
+        repeated = np.maximum(1.0, by_sensor.sum(axis=0) / INDEPENDENT_SAMPLES)
         readings = np.where(by_sensor, observed.theta, np.nan)
         zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper, radian)
+        repeated_samples = max(1.0, len(readings) / INDEPENDENT_SAMPLES)
         return cls(
             mean=np.concatenate(mean),
             precision=np.concatenate([1.0 / each**2 for each in spread]),
             zero=zero,
             zero_precision=repeated / zero_spread**2,
             angle_precision=np.where(
-                model.is_read, 1.0 / np.maximum(angle_spread, SMALL) ** 2, 0.0
+                model.is_read, 1.0 / np.maximum(angle_spread, LEAST_ANGLE_NOISE) ** 2, 0.0
             ),
             repeated=repeated,
-            unread=np.maximum(1.0, (~by_sensor).sum(axis=0) / ALIKE),
-            spring_precision=max(1.0, len(readings) / ALIKE) / model.spring_spread.ravel() ** 2,
+            unread=np.maximum(1.0, (~by_sensor).sum(axis=0) / INDEPENDENT_SAMPLES),
+            spring_precision=repeated_samples / model.spring_spread.ravel() ** 2,
         )
 
     def deviation(self, parameters: list[Array]) -> Array:

@@ -24,7 +24,7 @@ def learner_report(learner: Learner) -> Report:
     elif learner.checkpoint is None:
         message = 'waiting for a checkpoint: set the parameter `checkpoint`'
     elif not learner.enabled:
-        message = 'stopped by learner/enable'
+        message = 'stopped by learner/enable; call it with true to resume'
     elif not learner.body.offsets.known:
         message = 'waiting for the length calibration by the estimator'
     elif not learner.offset_check.is_believed:

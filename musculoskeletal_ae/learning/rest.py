@@ -3,8 +3,8 @@
 
 The arm is at rest while the means of the two halves of a short window differ by no more than the
 settings' rates allow. Sensor noise is taken into account, because θ from a camera is much noisier
-than θ from a joint sensor. A rest is averaged until it ends, or in parts of `LONGEST`. For an arm
-without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
+than θ from a joint sensor. A rest is averaged until it ends, or in parts of `LONGEST_PART`. For an
+arm without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
 measured.
 
 The slow start and end of a motion cannot be distinguished from rest, but it disturbs the direction
@@ -23,12 +23,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 from musculoskeletal_ae.learning.settings import Settings
 
-LONGEST = 1.0  # longest part of a rest that one sample averages [s]
-MOST = 20_000  # largest number of readings in a rest; bounds the memory if the clock stands still
+LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]
+#: largest number of readings in a rest, which bounds the memory if the clock stands still
+MOST_READINGS = 20_000
 #: Smallest number of readings in each half of the window. Fewer readings could hide a drift; the
 #: window is longer than `rest_time` if messages are slow.
 LEAST_READINGS = 4
-SURE = 3.0  # standard errors of a difference of means that count as noise
+NOISE_FACTOR = 3.0  # largest difference of means that counts as noise, in standard errors
 
 
 class ReadingWindow:
@@ -38,7 +39,7 @@ class ReadingWindow:
     """
 
     def __init__(self) -> None:
-        self.readings: deque[tuple[float, Sample]] = deque(maxlen=MOST)
+        self.readings: deque[tuple[float, Sample]] = deque(maxlen=MOST_READINGS)
         self._rows = np.empty((0, 1))  # (l, θ) of the readings, starting at row `_first`
         self._first = 0
 
@@ -53,7 +54,7 @@ class ReadingWindow:
 
     def append(self, time: float, reading: Sample) -> None:
         """Add a reading received at `time` [s]."""
-        held = min(len(self.readings), MOST - 1)  # a full window loses its oldest reading
+        held = min(len(self.readings), MOST_READINGS - 1)  # a full window loses its oldest reading
         self._first += len(self.readings) - held
         row = np.concatenate((reading.length, reading.theta))
         if self._first + held == len(self._rows):
@@ -135,10 +136,10 @@ class RestDetector:
         self._rest: OpenRest | None = None  # None while the arm moves
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
-        """Take a reading, `dt` [s] after the previous one, with θ NaN where it was not measured.
+        """Process a reading, `dt` [s] after the previous one, with NaN for unmeasured θ.
 
         Returns:
-            The mean of a rest that has ended or has reached `LONGEST`, otherwise None.
+            The mean of a rest that has ended or has lasted for `LONGEST_PART`, otherwise None.
         """
         self._time += dt
         self._window.append(self._time, reading)
@@ -163,7 +164,7 @@ class RestDetector:
         time, earlier = self._window.readings[0]
         if time >= rest.since:
             rest.gravity.append(earlier.gravity)
-        if rest.span < LONGEST and len(rest.readings) < MOST:
+        if rest.span < LONGEST_PART and len(rest.readings) < MOST_READINGS:
             return None
         self._rest = OpenRest(since=rest.since)
         return rest.mean()
@@ -187,7 +188,8 @@ class RestDetector:
             return self.blind
         rate = self.settings.rest_joint_rate * half * self._radian
         allowed, whole = np.broadcast_to(rate, enough.shape), known[0].all(0) & known[1].all(0)
-        # Some joints are in only part of the messages, for example if two nodes publish joints.
+        # Only some messages may contain a joint, for example if two nodes publish joints. Compare
+        # the means of such a joint separately.
         some = (
             [a[k[:, j], j] for a, k in zip(angles, known)] for j in np.flatnonzero(enough & ~whole)
         )
@@ -218,4 +220,4 @@ def _unmoved(halves: list[Array], allowed: Array | float) -> bool:
         for half in halves
         if len(half) > 1
     )
-    return bool((difference <= allowed + SURE * np.sqrt(error)).all())
+    return bool((difference <= allowed + NOISE_FACTOR * np.sqrt(error)).all())

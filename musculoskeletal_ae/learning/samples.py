@@ -21,14 +21,15 @@ from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import end_tension
 
-CAPACITY = 400
+CAPACITY = 400  # default of the largest number of samples in a store
 #: Tendon creep is estimated once the number of accepted samples exceeds this share of the capacity,
 #: if the same share of the samples has all joint angles.
-CREEPING = 0.5
-NOTHING: Array = np.zeros(0)
-#: typical moment arm [m]; converts lengths to angles where no joint angle was measured
+CREEP_SHARE = 0.5
+NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
+#: typical moment arm, which converts lengths to angles where no joint angle was measured [m]
 MOMENT_ARM = 0.04
-LEAST_DISTANCE = 1e-6  # [rad], [N]; replaces a threshold of 0, so that any difference is new
+#: threshold that replaces 0 [rad or N], so that any difference makes a sample new
+LEAST_DISTANCE = 1e-6
 
 
 class Sample(NamedTuple):
@@ -38,7 +39,7 @@ class Sample(NamedTuple):
     tension: Array  # T [N], (M,)
     length: Array  # l [m], (M,)
     direction: Array  # direction s of the last sliding: +1 wound in, −1 paid out, (M,)
-    #: standard deviation of each θ [rad], (D,); 0 or empty: measured by a joint sensor
+    #: standard deviation of each θ [rad], (D,); 0 or empty if a joint sensor measured θ
     spread: Array = NOTHING
     #: direction of gravity in the frames of the tree's joints, (3J,); NaN or empty without an IMU
     gravity: Array = NOTHING
@@ -102,7 +103,11 @@ class Observations:
         return State(self.theta, self.tension, self.length)
 
     def end_tension(self, friction: Array) -> Array:
-        """Return T at the elastic elements [N] (N, M) by μ (M,), which is a network's input."""
+        """Return the tension at the elastic elements [N], (N, M), which a network takes as input.
+
+        Args:
+            friction: Tendon friction μ of each muscle, (M,).
+        """
         return end_tension(friction, self.tension, self.direction)
 
     def with_all_angles(self) -> Observations:
@@ -179,7 +184,7 @@ class SampleStore:
     def lengthen(self, by: Array, first: int) -> int:
         """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.
 
-        Lengths of muscles that were isolated in a sample stay.
+        Lengths of muscles that were isolated in a sample are not changed.
 
         Returns:
             The number of changed samples.
@@ -211,7 +216,7 @@ class SampleStore:
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
         # Without joint angles, creep cannot be distinguished from a drift of the postures.
         read = np.isfinite(theta).all(axis=1).mean()
-        if self.accepted <= CREEPING * self.capacity or read < CREEPING:
+        if self.accepted <= CREEP_SHARE * self.capacity or read < CREEP_SHARE:
             age[:] = 0.0
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 

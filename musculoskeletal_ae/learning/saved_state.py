@@ -46,7 +46,7 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
-    """Return the state to be saved."""
+    """Return the state to be saved: the samples of a store, and a checkpoint's content."""
     stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
     saved = tuple(_saved(number, sample, known) for number, sample, known in stored)
     return SavedState(robot.joints, robot.muscles, saved, network)
@@ -89,10 +89,10 @@ def from_bytes(data: bytes, robot: Robot) -> SavedState:
     try:
         state = msgspec.msgpack.decode(content, type=SavedState)
     except msgspec.MsgspecError as error:
-        raise StateError(f'the state is not of this version of the learner ({error})') from error
+        raise StateError(f'another version of the learner saved the state ({error})') from error
     if state.joints != robot.joints or not set(state.muscles) <= set(robot.muscles):
         raise StateError(
-            f'the state is of a robot with joints {", ".join(state.joints)} and muscles '
+            f'the state belongs to a robot with joints {", ".join(state.joints)} and muscles '
             f'{", ".join(state.muscles)}; this robot has {", ".join(robot.joints)} and '
             f'{", ".join(robot.muscles)}'
         )
@@ -119,7 +119,10 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
 
 
 def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
-    """Add the saved samples to a store; they do not describe muscles added to the robot since."""
+    """Add the saved samples to a store.
+
+    They do not describe muscles that were added to the robot after the state was saved.
+    """
     places = list(robot.muscle_indices(state.muscles))
     for saved in state.samples:
         theta = np.array(saved.theta)

@@ -14,7 +14,8 @@ from musculoskeletal_ae.mae.mae import Mae
 
 #: shortest time between the starts of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
-LEAST_BLIND = 20  # samples required for the first update of an arm without joint sensors
+#: number of samples required for the first update of an arm without joint sensors
+LEAST_BLIND = 20
 
 
 class UpdateScheduler:
@@ -36,7 +37,7 @@ class UpdateScheduler:
         self.least_samples, self._steps = least_samples, steps
         self._has_news = True
         self._began_at = -math.inf  # start of the last update [s]
-        self._has_changed = False  # whether a muscle has changed since then
+        self._has_changed = False  # whether a muscle has changed since the start of the last update
         self._updates_to_repeat = 0
 
     def restart(self, updates_to_repeat: int = 0) -> None:
@@ -60,7 +61,7 @@ class UpdateScheduler:
     def begin(
         self, now: float, samples: SampleStore, healthy: Reservoir, isolated: tuple[int, ...]
     ) -> Job:
-        """Return the job of an update that begins at `now` [s]."""
+        """Return the job of an update that begins at `now` [s], and record its beginning."""
         self._has_news = self.updates + 1 < self._updates_to_repeat
         self._began_at, self._has_changed = now, False
         return Job(

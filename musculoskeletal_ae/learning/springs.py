@@ -16,28 +16,34 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
-#: prior standard deviations: of α, and of the angle at which a spring is at rest [rad], for
-#: prismatic joints times RACK [m]
-STIFFNESS, REST = 0.5, 0.2
-LARGEST = 2.0  # bound on |α|
+STIFFNESS_SPREAD = 0.5  # prior standard deviation of α
+#: prior standard deviation of the angle at which a spring exerts no torque [rad]; for prismatic
+#: joints times RACK [m]
+REST_SPREAD = 0.2
+LARGEST_LOG = 2.0  # largest |α|
 
 
 def none_learned(joint_count: int) -> Array:
-    """Return α and β without learning: zeros, (2, D)."""
+    """Return the α and β of springs that have not been learned, which are 0, (2, D)."""
     return np.zeros((2, joint_count))
 
 
 def prior_spread(nominal: JointElasticity, radian: Array) -> Array:
-    """Return the prior spread of α and of β [N·m], (2, D); `radian` as in `Kinematics`."""
+    """Return the prior spread of α and of β [N·m], (2, D).
+
+    Args:
+        nominal: The springs that muscles.yaml states.
+        radian: Displacement of each joint that counts as one radian [rad or m], (D,).
+    """
     stiffness = np.diag(nominal.stiffness)
-    return np.stack([np.full(len(stiffness), STIFFNESS), stiffness * REST * radian])
+    return np.stack([np.full(len(stiffness), STIFFNESS_SPREAD), stiffness * REST_SPREAD * radian])
 
 
 def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
-    """Return the springs with corrections α and β, (2, D)."""
+    """Return the springs of muscles.yaml, `nominal`, with corrections α and β (2, D)."""
     if not nominal.is_present:
         return nominal
-    log = np.clip(springs[0], -LARGEST, LARGEST)
+    log = np.clip(springs[0], -LARGEST_LOG, LARGEST_LOG)
     scale = np.exp(0.5 * log)
     stiffness = scale[:, None] * nominal.stiffness * scale
     return JointElasticity(stiffness, np.exp(log) * nominal.preload + springs[1], nominal.damping)

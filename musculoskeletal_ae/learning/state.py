@@ -27,11 +27,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
 NETWORK = 'network.safetensors'
-LARGEST = (
-    1 << 26
-)  # largest size of a state [bytes]; those of the shipped arms are 100 times smaller
-#: time between checks that the files still exist, and between attempts to save [s]
-CHECK_INTERVAL, RETRY_INTERVAL = 0.5, 2.0
+#: largest size of a state file [bytes]; the states of the shipped arms are 100 times smaller
+LARGEST = 1 << 26
+CHECK_INTERVAL = 0.5  # time between checks that the files still exist [s]
+RETRY_INTERVAL = 2.0  # time between attempts to save after a failed one [s]
 
 
 class StateStore:
@@ -94,7 +93,7 @@ class StateStore:
                 unfinished.unlink()
 
     def close(self) -> None:
-        """Release the directory. No save is needed, because the newest state is on disk."""
+        """Release the directory without saving, because the newest state is on disk already."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -105,7 +104,8 @@ class StateStore:
         """Load the saved samples into an empty store; return the saved network, if there is one.
 
         An unusable state is renamed to a backup, and the previous state is used. If muscles were
-        added to the robot since, only the samples are used; they do not describe the added muscles.
+        added to the robot after the save, only the samples are used; they do not describe those
+        muscles.
 
         Raises:
             StateError: If a state cannot be kept as a backup.

@@ -27,22 +27,26 @@ from musculoskeletal_ae.arrays import Array, Bools
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.posture_model import PostureModel
 
-# For prismatic joints, [rad] below are times RACK [m].
-ZERO, ZEROED = np.deg2rad(2.0), 0.003  # σ of roughly and of accurately calibrated offsets [rad]
-STOP = 0.01  # standard deviation of the stops from the limits [rad]
-ZEROS = np.linspace(-4.0 * ZERO, 4.0 * ZERO, 281)  # grid of offsets z [rad]
+# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
+# RACK [m].
+ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
+ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
+STOP_SPREAD = 0.01  # standard deviation of the distance between a stop and its limit [rad]
+OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)  # grid of z [rad]
 NO_STOPS = 0.1  # probability that a joint's limits are not mechanical stops
 NOT_REACHED = 0.5  # probability that a stop is never reached
-SHARES, WIDTHS = (0.03, 0.1, 0.3), (0.001, 0.002, 0.004)  # grids of π and σ [rad] if it is reached
-GIVE = 2.0  # σ beyond the limit, relative to σ within
-BEYOND = 0.01  # density of readings beyond a limit, relative to the density within
-# A joint without a sensor is at its stop if it is within NEAR_STOP of a limit [rad] and the muscles
-# push it there with more than PUSHED times the usual residual torque.
-NEAR_STOP, PUSHED = 0.05, 3.0
+SHARES = 0.03, 0.1, 0.3  # grid of π, if the stop is reached
+WIDTHS = 0.001, 0.002, 0.004  # grid of σ, if the stop is reached [rad]
+WIDTH_RATIO = 2.0  # σ beyond the limit, relative to σ within
+DENSITY_RATIO = 0.01  # density of readings beyond a limit, relative to the density within
+# A joint without a sensor is at its stop if it is near a limit and the muscles push it there.
+NEAR_STOP = 0.05  # largest distance from the limit [rad]
+LEAST_PUSH = 3.0  # smallest torque towards the limit, relative to the usual residual torque
 SMALL = 1e-6  # weight of every angle, relative to the weight of a stop
-NEAR = 0.3  # distance from a limit within which readings may belong to its cluster [rad]
-# Two rests are distinct if another joint differs by ELSEWHERE, or the reading itself by SAME [rad].
-ELSEWHERE, SAME = 0.1, 0.01
+NEAR_LIMIT = 0.3  # distance from a limit within which readings may belong to its cluster [rad]
+# Two rests are distinct if another joint or the reading itself differs.
+OTHER_DIFFERENCE = 0.1  # smallest difference of another joint [rad]
+OWN_DIFFERENCE = 0.01  # smallest difference of the reading [rad]
 
 
 def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tuple[Array, Array]:
@@ -56,37 +60,38 @@ def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tupl
     """
     theta, lower, upper = (read / radian).T, lower / radian, upper / radian
     apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)
-    elsewhere: Bools = np.logical_or.reduce(apart > ELSEWHERE)
+    elsewhere: Bools = np.logical_or.reduce(apart > OTHER_DIFFERENCE)
     estimates = [_zero(*each, elsewhere) for each in zip(theta, lower.tolist(), upper.tolist())]
     zero, spread = np.reshape(estimates, (-1, 2)).T
-    return zero * radian, np.hypot(spread, STOP) * radian
+    return zero * radian, np.hypot(spread, STOP_SPREAD) * radian
 
 
 def _zero(own: Array, lower: float, upper: float, elsewhere: Bools) -> tuple[float, float]:
     own = _different(own, elsewhere)
     stops = _at_stop(own - lower, upper - lower) + _at_stop(upper - own, upper - lower)[::-1]
     log = np.logaddexp(np.log(1.0 - NO_STOPS) + stops, np.log(NO_STOPS))
-    weight = np.exp(log - log.max()) * (_normal(ZEROS, ZERO) + _normal(ZEROS, ZEROED))
+    prior = _normal(OFFSETS, ROUGH_OFFSET) + _normal(OFFSETS, ACCURATE_OFFSET)
+    weight = np.exp(log - log.max()) * prior
     weight /= weight.sum()
     # Use the median: with little evidence it stays near 0, where most offsets are.
-    zero = float(np.interp(0.5, np.cumsum(weight) - 0.5 * weight, ZEROS))
-    return zero, float(np.sqrt(weight @ (ZEROS - zero) ** 2))
+    zero = float(np.interp(0.5, np.cumsum(weight) - 0.5 * weight, OFFSETS))
+    return zero, float(np.sqrt(weight @ (OFFSETS - zero) ** 2))
 
 
 def _at_stop(within: Array, span: float) -> Array:
-    """Return log p(y | z) for each z in ZEROS, relative to a uniform density.
+    """Return log p(y | z) for each z in OFFSETS, relative to a uniform density.
 
     Args:
         within: Distances of the readings from a limit, positive within the range [rad], (N,).
         span: The joint's range [rad].
     """
     single = np.float32  # logarithms in single precision take a fraction of the time
-    distance = (within[within < NEAR, None] - ZEROS).astype(single)
-    even = np.where(distance > 0.0, single(1.0), single(BEYOND))
-    wide = np.where(distance > 0.0, single(1.0), single(GIVE))
+    distance = (within[within < NEAR_LIMIT, None] - OFFSETS).astype(single)
+    even = np.where(distance > 0.0, single(1.0), single(DENSITY_RATIO))
+    wide = np.where(distance > 0.0, single(1.0), single(WIDTH_RATIO))
     logs = [np.log(NOT_REACHED) + np.log(even).sum(axis=0, dtype=float)]
     for width in WIDTHS:
-        mean = 0.5 * (1.0 + GIVE) * width
+        mean = 0.5 * (1.0 + WIDTH_RATIO) * width
         pile = span / mean * _normal(distance / (width * wide), 1.0)
         for share in SHARES:
             log = np.log((1.0 - share) * even + share * pile).sum(axis=0, dtype=float)
@@ -97,7 +102,7 @@ def _at_stop(within: Array, span: float) -> Array:
 
 
 def _different(own: Array, elsewhere: Bools) -> Array:
-    """Return the readings of a joint at distinct rests, at most (N,).
+    """Return the readings of a joint at distinct rests, (N,) or fewer.
 
     Repeated readings of a parked joint, or of an arm that returns to the same posture, would
     otherwise look like a cluster at a stop.
@@ -107,9 +112,9 @@ def _different(own: Array, elsewhere: Bools) -> Array:
         elsewhere: Whether the postures of two rests differ, (N, N).
     """
     read = np.flatnonzero(np.isfinite(own))
-    moved = read[np.abs(np.diff(own[read], prepend=np.inf)) > SAME]
+    moved = read[np.abs(np.diff(own[read], prepend=np.inf)) > OWN_DIFFERENCE]
     own = own[moved]
-    alike = (np.abs(own[:, None] - own) < SAME) & ~elsewhere[np.ix_(moved, moved)]
+    alike = (np.abs(own[:, None] - own) < OWN_DIFFERENCE) & ~elsewhere[np.ix_(moved, moved)]
     kept = np.ones(len(own), dtype=bool)
     for n in np.flatnonzero(np.tril(alike, -1).any(axis=1)):
         kept[n] = not (alike[n, :n] & kept[:n]).any()
@@ -130,7 +135,7 @@ class Stops:
         self._lower, self._upper = robot.lower, robot.upper
         self._radian = robot.kinematics.radian
         self._by_sensor = model.by_sensor
-        self._near = self._radian * np.where(model.by_sensor, 2.0 * ZERO, NEAR_STOP)
+        self._near = self._radian * np.where(model.by_sensor, 2.0 * ROUGH_OFFSET, NEAR_STOP)
         # The torque of a muscle before it was changed cannot be computed from its new parameters.
         # A tension of 0 N means that the muscle was isolated.
         changed = ~observed.known & (observed.tension > 0.0)
@@ -149,10 +154,10 @@ class Stops:
             score: Residual torque at each joint relative to its usual size, (N, D). Positive
                 values push the joint towards its upper limit; the stop balances this torque.
         """
-        # A joint with a sensor stays at its stop until the torque pulls it away. A joint without a
-        # sensor has to exceed PUSHED every time: otherwise a wrong stop would hold the joint and
-        # distort the other joints.
-        enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, PUSHED)
+        # A joint with a sensor stays at its stop until the torque pulls it away. The score of a
+        # joint without a sensor has to exceed LEAST_PUSH every time. Otherwise a wrong stop would
+        # hold the joint and distort the other joints.
+        enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, LEAST_PUSH)
         above = self.is_balanced & (own > self._upper - self._near) & (score > enough)
         below = self.is_balanced & (own < self._lower + self._near) & (score < -enough)
         self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
@@ -161,14 +166,18 @@ class Stops:
     def pull(self, own: Array, repeated: Array) -> tuple[Array, Array]:
         """Return the displacements back to the stops [rad] and their weights, (N, D) each.
 
-        Both apply to joints at a stop or beyond it. `repeated` is that of `GroupPrior`.
+        Both are nonzero only for joints at a stop or beyond it.
+
+        Args:
+            own: θ [rad], (N, D).
+            repeated: As in `GroupPrior`, (D,).
         """
         goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
         is_pulled = ~np.isnan(self._at) | (goal != own)
-        return goal - own, is_pulled / (STOP * self._radian) ** 2 / repeated
+        return goal - own, is_pulled / (STOP_SPREAD * self._radian) ** 2 / repeated
 
     @property
     def least_weight(self) -> Array:
         """A small weight for every angle that keeps the normal equations regular, (D,)."""
-        weight: Array = SMALL / (STOP * self._radian) ** 2
+        weight: Array = SMALL / (STOP_SPREAD * self._radian) ** 2
         return weight

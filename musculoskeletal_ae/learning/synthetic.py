@@ -13,8 +13,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: share of samples with most muscles near T_bias, as under muscle stiffness control
 HELD_SHARE = 0.5
-# Postures extend slightly beyond the joint limits, because friction or contact can move the arm
-# there.
+#: share of a joint's range by which postures may exceed its limits, because friction or contact can
+#: move the arm there
 MARGIN = 0.02
 
 
@@ -26,7 +26,7 @@ class TrainingData(NamedTuple):
 
 
 #: share of the friction that remains unknown although the direction of sliding is estimated
-UNSURE = 0.25
+UNKNOWN_FRICTION = 0.25
 
 
 def synthetic_samples(
@@ -40,9 +40,9 @@ def synthetic_samples(
         target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
 
     T_r is the tension at the elastic elements. An estimator knows it except for the share u
-    (UNSURE) of the friction. The network's input contains this error and the noise ε, and its
-    target does not. ② therefore learns to weight muscles by the accuracy of their lengths, as in
-    weighted least squares.
+    (UNKNOWN_FRICTION) of the friction. The network's input contains this error and the noise ε, and
+    its target does not. ② therefore learns to weight muscles by the accuracy of their lengths, as
+    in weighted least squares.
 
     Args:
         body: The calibrated body.
@@ -56,7 +56,7 @@ def synthetic_samples(
     tension = held_tensions(robot, count, rng)
     # Sliding leaves the direction near either end of [−1, 1] most of the time.
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
-    length, scattered = body.lengths(theta, tension, np.zeros(shape), UNSURE * direction)
+    length, scattered = body.lengths(theta, tension, np.zeros(shape), UNKNOWN_FRICTION * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
     true, entered = State(theta, tension, length), State(theta, tension, scattered)
     return TrainingData(entered.scaled(), true.scaled())

@@ -56,7 +56,7 @@ class Update(NamedTuple):
 
     mae: Mae  # the trained network
     loss: float  # training loss
-    noise: Array = np.empty(0)  # σ of each length that the body does not explain [m], (M,) or empty
+    noise: Array = np.empty(0)  # σ of each length, as far as the body does not explain it [m], (M,)
     #: a muscle whose newest samples contradict all older ones, and their number; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
     #: several muscles that the newest samples contradict at once, which indicates a wrong θ
@@ -88,7 +88,7 @@ class Trainer:
 
     @property
     def body(self) -> CalibratedBody | None:
-        """The most recently fitted body; None without one, or if another process has it."""
+        """The most recently fitted body; None if there is none or if another process has it."""
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
@@ -112,13 +112,15 @@ class Trainer:
 
 # -- separate training process --------------------------------------------------------------------
 
-NICENESS = 5  # added to the niceness of the node
-#: pause before a lost training process is restarted [s]; it doubles up to the longest one
-FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
-#: Time after which a process that has not answered counts as hung [s], plus a time for each
-#: training step. The first answer takes longer: imports can take minutes on a slow disk.
-PATIENCE_AT_FIRST, PATIENCE, PATIENCE_PER_STEP = 300.0, 60.0, 0.1
-ENDING = 2.0  # longest wait for a killed process to end [s]
+NICENESS = 5  # number that is added to the niceness of the node
+FIRST_PAUSE = 1.0  # pause before a lost training process is restarted [s]; doubles each time
+LONGEST_PAUSE = 60.0  # largest value of this pause [s]
+# A process counts as hung if it has not answered within PATIENCE, plus PATIENCE_PER_STEP for each
+# training step. The first answer may take longer, because imports can take minutes on a slow disk.
+PATIENCE_AT_FIRST = 300.0  # for the first answer, instead of PATIENCE [s]
+PATIENCE = 60.0  # [s]
+PATIENCE_PER_STEP = 0.1  # [s]
+LONGEST_ENDING = 2.0  # longest wait for a killed process to end [s]
 
 
 class TrainerProcess(Trainer):
@@ -211,16 +213,16 @@ class TrainerProcess(Trainer):
         self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
 
     def _end(self) -> None:
-        # The process may be killed at once: everything that it knows is kept in this object, too.
+        # The process may be killed at once, because this object keeps a copy of all that it knows.
         if self._process is not None:
             self._process.kill()
-            self._process.join(ENDING)
+            self._process.join(LONGEST_ENDING)
             self._jobs.put(None)
-            self._thread.join(ENDING)
+            self._thread.join(LONGEST_ENDING)
             self._process = None
 
     def values(self) -> dict[str, str]:
-        """Return number of restarts and process id."""
+        """Return the number of restarts and the process id for /diagnostics."""
         values = {'training process restarts': str(self.restarts)}
         return values if self.pid is None else {**values, 'training process': str(self.pid)}
 
@@ -262,7 +264,7 @@ def _talk(
                 data, *others = connection.recv()
                 answers.put(Update(checkpoint.from_bytes(data, robot), *others))
         except (EOFError, OSError):
-            process.join(ENDING)
+            process.join(LONGEST_ENDING)
             answers.put(f'status {process.exitcode}')
         # Report every error, such as a truncated pickle or a lack of memory; otherwise the node
         # would wait until the deadline.

@@ -28,7 +28,7 @@ from musculoskeletal_ae.learning.body_fit import (
     BodyFit,
     contradicted_muscles,
 )
-from musculoskeletal_ae.learning.covariance import MANY, observed_theta
+from musculoskeletal_ae.learning.covariance import MANY_MESSAGES, observed_theta
 from musculoskeletal_ae.learning.fit import Fit
 from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
 from musculoskeletal_ae.learning.samples import Observations
@@ -39,15 +39,12 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: share of the training samples that rest samples replace
-REAL_SHARE = 0.1
-#: share of the training samples that motion samples replace if there are many; half of it if there
-#: are `MANY`
+REAL_SHARE = 0.1  # share of the training samples that rest samples replace
+#: share of the training samples that motion samples replace if there are many of them; with
+#: MANY_MESSAGES motion samples, half of this share
 MOVING_SHARE = 0.3
-#: mean number of times that a training sample is used
-USES = 3
-#: smallest robust weight with which a rest sample is used for training
-TRUSTED = 0.3
+USES = 3  # mean number of times that a training sample is used
+LEAST_WEIGHT = 0.3  # smallest robust weight with which a rest sample is used for training
 
 
 def learned_steps(mae: Mae) -> int:
@@ -109,7 +106,7 @@ class BodyUpdater(Updater):
 
     def _mix_in_real(self, data: TrainingData, observed: Observations, fit: Fit) -> None:
         """Replace some training samples by rest samples that fit the body."""
-        trusted = np.flatnonzero((fit.weight > TRUSTED).all(axis=1))
+        trusted = np.flatnonzero((fit.weight > LEAST_WEIGHT).all(axis=1))
         self._put(data, observed[trusted], slice(int(REAL_SHARE * len(data.entered))))
 
     def _mix_in_moving(self, data: TrainingData, observed: Observations, noise: Array) -> None:
@@ -117,7 +114,7 @@ class BodyUpdater(Updater):
         (length,) = self.body.lengths(observed.theta, observed.tension, observed.direction)
         error = np.abs(observed.length + self.body.crept(observed.age) - length)
         sound = np.flatnonzero((error <= np.maximum(OUTLIER * noise, LEAST_CHANGE)).all(axis=1))
-        share = MOVING_SHARE * len(sound) / (len(sound) + MANY)
+        share = MOVING_SHARE * len(sound) / (len(sound) + MANY_MESSAGES)
         self._put(
             data, observed[sound], slice(len(data.entered) - int(share * len(data.entered)), None)
         )

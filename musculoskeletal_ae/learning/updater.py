@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of all online learning methods: an updater turns samples into a network.
 
-An updater keeps its network and optimiser between updates. `update.py` implements preset
-`default`; the folder presets/ contains the others.
+An updater keeps its network and optimiser between updates. `update.py` implements the method of
+preset `default`, and `paper/online_learning.py` the method of preset `paper`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: separates initial training and online learning in `Mae.training`
+#: text that separates initial training and online learning in `Mae.training`
 LEARNED = '; learned online: '
 NEWEST = 20  # number of newest samples over which the estimation error is computed
 
@@ -43,7 +43,7 @@ class Updater(ABC):
         return None
 
     def update(self, job: Job) -> Update:
-        """Run one update. Its duration is bounded, because the store is bounded."""
+        """Run one update. Its duration is bounded, because the number of samples is."""
         start, newest = time.perf_counter(), job.observed[-NEWEST:]
         mae = self._mae.without(job.isolated)
         estimate = observed_theta(mae, newest)

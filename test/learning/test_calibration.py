@@ -6,10 +6,10 @@ import pytest
 
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.learning.calibration import (
-    GLITCHES,
+    GLITCH_SHARE,
     LEAST_SAMPLES,
     LEAST_TIME,
-    RECENT,
+    RECENT_TIME,
     Healthy,
     Reservoir,
     calibrate,
@@ -52,11 +52,11 @@ def test_glitches_do_not_change_the_threshold(learned, seed):
     mae, _, _, stage = learned
     observed = Stage(stage.body, seed).messages(1000)
     clean = calibrate(mae, Healthy(observed, LEAST_TIME, 50), 50)
-    for row in range(int(GLITCHES * len(observed))):
+    for row in range(int(GLITCH_SHARE * len(observed))):
         observed[100 * row + 7, 6 + row] += 0.2
     with_glitches = calibrate(mae, Healthy(observed, LEAST_TIME, 50), 50)
     assert clean.samples == 1000
-    assert with_glitches.samples == 1000 - int(GLITCHES * len(observed))
+    assert with_glitches.samples == 1000 - int(GLITCH_SHARE * len(observed))
     for name, threshold in clean.thresholds.items():
         assert with_glitches.thresholds[name] == pytest.approx(threshold, rel=0.02)
 
@@ -126,6 +126,6 @@ def test_messages_of_long_ago_are_not_learned_and_the_others_have_an_age():
         reservoir.rest(reading(float(n), theta=n))
     observed = reservoir.healthy().learned
     np.testing.assert_array_equal(observed.age, [4, 2])
-    while reservoir.time < RECENT + 0.05:
+    while reservoir.time < RECENT_TIME + 0.05:
         reservoir.step(reading(0.0, theta=np.nan), 0.2)
     np.testing.assert_array_equal(reservoir.healthy().learned.length[:, 0], [2.0])

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.stops import STOP, ZERO, sensor_zeros
+from musculoskeletal_ae.learning.stops import ROUGH_OFFSET, STOP_SPREAD, sensor_zeros
 
 LOWER, UPPER = np.array([-0.4, -1.5, -0.8]), np.array([1.2, 0.1, 0.8])
 TRUE = np.array([0.05, -0.04, 0.0])  # zeros of the sensors [rad]
@@ -32,8 +32,8 @@ def estimated_zeros(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
 def test_readings_at_the_stops_give_the_joint_sensor_offsets(seed):
     noise = 0.002 * np.random.default_rng(9).standard_normal((150, 3))
     zero, spread = estimated_zeros(rests(seed=seed) + TRUE + noise)
-    assert zero == pytest.approx(TRUE, abs=STOP)
-    assert (spread < 0.5 * ZERO).all()
+    assert zero == pytest.approx(TRUE, abs=STOP_SPREAD)
+    assert (spread < 0.5 * ROUGH_OFFSET).all()
 
 
 def test_a_sensor_without_offset_is_not_corrected():
@@ -44,7 +44,7 @@ def test_a_sensor_without_offset_is_not_corrected():
 def test_joints_that_never_reach_a_stop_give_no_offset():
     zero, spread = estimated_zeros(within(0.1) + TRUE)
     assert zero == pytest.approx(np.zeros(3), abs=0.003)
-    assert (spread > 0.5 * ZERO).all()
+    assert (spread > 0.5 * ROUGH_OFFSET).all()
 
 
 @pytest.mark.parametrize('count', [20, 60, 200])
@@ -52,7 +52,7 @@ def test_a_few_readings_close_together_are_no_stop(count):
     rng = np.random.default_rng(4)
     for _ in range(10):
         zero, _ = estimated_zeros(rng.uniform(LOWER, UPPER, (count, 3)))
-        assert np.linalg.norm(zero) < 2.0 * STOP
+        assert np.linalg.norm(zero) < 2.0 * STOP_SPREAD
 
 
 def test_one_posture_held_near_a_limit_is_no_stop():
@@ -73,14 +73,14 @@ def test_limits_that_stop_nothing_are_not_taken_for_stops():
     rng = np.random.default_rng(2)
     theta = rng.uniform(LOWER - 0.1, UPPER + 0.1, (150, 3))
     zero, _ = estimated_zeros(theta)
-    assert zero == pytest.approx(np.zeros(3), abs=STOP)
+    assert zero == pytest.approx(np.zeros(3), abs=STOP_SPREAD)
 
 
 def test_a_joint_without_sensor_has_no_offset():
     read = rests() + TRUE
     read[:, 1] = np.nan
     zero, spread = estimated_zeros(read)
-    assert zero == pytest.approx(TRUE * [1, 0, 1], abs=STOP)
+    assert zero == pytest.approx(TRUE * [1, 0, 1], abs=STOP_SPREAD)
     assert np.isfinite(spread).all()
     read[:] = np.nan
     assert estimated_zeros(read[:0])[0] == pytest.approx(np.zeros(3))

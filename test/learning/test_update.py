@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
-from musculoskeletal_ae.learning.synthetic import UNSURE, synthetic_samples
+from musculoskeletal_ae.learning.synthetic import UNKNOWN_FRICTION, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import BodyUpdater, learned_steps
 from musculoskeletal_ae.mae import checkpoint
@@ -146,7 +146,7 @@ def test_synthetic_lengths_scatter_by_the_unknown_part_of_friction(other_body):
     all_of_it = [
         other_body.lengths(theta, tension, way * np.ones_like(length))[0] for way in (-1, 1)
     ]
-    assert np.abs(off).max() < 1.5 * UNSURE * np.abs(all_of_it - length).max()
+    assert np.abs(off).max() < 1.5 * UNKNOWN_FRICTION * np.abs(all_of_it - length).max()
     assert abs(np.sign(off).mean()) < 0.1 and np.abs(off).mean() > 1e-5
 
 
