@@ -15,7 +15,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 SERVICE = 'estimator/check_health'
-ASK_PERIOD = 1.0  # [s] after which the request is repeated if the estimator has not answered
+ASK_PERIOD = 1.0  # time after which a request that the estimator has not answered is repeated [s]
 
 
 class AnomalyLatch:
@@ -26,7 +26,7 @@ class AnomalyLatch:
         self._node, self._follow = node, follow
         self._is_latched = False
         self._client: Any = node.create_client(Trigger, SERVICE)
-        self._future: Any = None  # of the pending request
+        self._future: Any = None  # future of the pending request; None if there is none
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer: Any = node.create_timer(ASK_PERIOD, self._ask, clock=steady)
         self._timer.cancel()

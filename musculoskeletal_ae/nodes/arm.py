@@ -32,13 +32,15 @@ from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.validity import read_wrench
 
-MARKER_RATE = 10.0  # [Hz]
-NAME_HEIGHT = 0.018  # [m]
-BONES = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
-SOLID = (*BONE_COLOUR, 1.0)
+MARKER_RATE = 10.0  # rate of the markers [Hz]
+NAME_HEIGHT = 0.018  # height of the muscles' names [m]
+#: colours of the bones by arm: red, green, blue and opacity
+BONE_COLOURS = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
+HARDWARE_COLOUR = (*BONE_COLOUR, 1.0)  # colour of the bones of all other arms
 # After a pause (a debugger, a jump of /clock) the arm continues without simulating the missed time.
-# One step covers at most LONGEST_STEP [s] or MOST_PERIODS periods, whichever is longer.
-LONGEST_STEP, MOST_PERIODS = 0.1, 2.0
+# Therefore one step covers at most LONGEST_STEP or MOST_PERIODS periods, whichever is longer.
+LONGEST_STEP = 0.1  # [s]
+MOST_PERIODS = 2.0
 
 
 class Markers:
@@ -47,7 +49,7 @@ class Markers:
     def __init__(self, node: Shell, arm: str, lines: Callable[[], list[Line]]) -> None:
         """Draw the lines that `lines` returns; an empty list publishes nothing."""
         self._node, self._lines = node, lines
-        self._bones = BONES.get(arm, SOLID)
+        self._bones = BONE_COLOURS.get(arm, HARDWARE_COLOUR)
         self._publisher = node.create_publisher(MarkerArray, f'{arm}/markers', RELIABLE)
         node.create_timer(1.0 / MARKER_RATE, self._publish)
 

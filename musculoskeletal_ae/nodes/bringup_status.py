@@ -19,14 +19,14 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
+from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.report import Report
 
 
 class BringupStatus(Shell):
     """Prints the estimation error, A, and the numbers of samples and checkpoints."""
 
-    # A terminal that is paused by Ctrl-S, or a pager that is not read on, blocks the prints.
+    # Printing blocks while a terminal is paused by Ctrl-S or a pager is full, which is no fault.
     is_watched = False
 
     def __init__(self, **options: Any) -> None:
@@ -34,7 +34,7 @@ class BringupStatus(Shell):
         self.duration: float = self.parameter('duration')
         self.patience: float = self.parameter('patience')
         self.begun = time.monotonic()
-        self.measured: tuple[float, Array | None] = -math.inf, None  # when [s], and θ
+        self.measured: tuple[float, Array | None] = -math.inf, None  # time of arrival [s], and θ
         self.errors: list[float] = []
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
@@ -52,7 +52,7 @@ class BringupStatus(Shell):
     def theta(self) -> Array | None:
         """Measured θ [rad] (D,); None without a recent message."""
         at, theta = self.measured
-        return theta if time.monotonic() - at <= OLD else None
+        return theta if time.monotonic() - at <= LARGEST_AGE else None
 
     def _estimated(self, theta: Array) -> None:
         if (measured := self.theta) is not None:
@@ -68,7 +68,10 @@ class BringupStatus(Shell):
         self.situation.tick()
         if self.started is None and not self.anomalies:
             if 0.0 < self.patience < now - self.begun:
-                sys.exit(f'the system did not come up: no estimate within {self.patience:g} s')
+                sys.exit(
+                    f'the system did not come up: no estimate within {self.patience:g} s; see the '
+                    'logs of the nodes'
+                )
             return
         self.started = self.started or now
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]

@@ -54,12 +54,15 @@ class Candidates:
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def on_anomaly(self, detected: bool) -> None:
-        """Process whether an anomaly is latched; replace a recent network that may be its cause."""
+        """Process a change of the anomaly; replace a recent network that may be its cause."""
         if detected and self.validator.mae is not None:
             self.queue.give_up()
         before = self.validator.anomaly(detected, time.monotonic())
         if before is not None:
-            self._node.get_logger().warning(f'back to checkpoint version {before.version}')
+            self._node.get_logger().warning(
+                f'an anomaly followed the new network; checkpoint version {before.version} is used '
+                'again'
+            )
             self._use(before)
             self._publish(before)
 
@@ -81,7 +84,7 @@ class Candidates:
         try:
             self._use(mae)
         except (np.linalg.LinAlgError, FloatingPointError) as error:
-            raise CheckpointError(f'cannot be computed with ({error})') from error
+            raise CheckpointError(f'the network cannot be evaluated ({error})') from error
         self.validator.take(mae, time.monotonic())
         self._publish(mae, message)
 

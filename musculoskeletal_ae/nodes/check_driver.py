@@ -38,9 +38,9 @@ if TYPE_CHECKING:  # slow imports, which --help does not need
     from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 JOINTS = 'joint_states'
-DISCOVERY = 1.0  # [s] within which other nodes are discovered
-SILENCE = 1.0  # [s] without messages after which the motion test ends
-TICK = 0.02  # [s]; a late tick shows that this process was paused
+DISCOVERY_TIME = 1.0  # time in which other nodes are discovered [s]
+SILENCE = 1.0  # time without messages after which the motion test ends [s]
+TICK = 0.02  # period of a timer, which shows by a late tick that this process was paused [s]
 
 
 def _say(text: object) -> None:
@@ -67,7 +67,7 @@ class CheckDriver:
         self._ticked_at = time.monotonic()
         self.node.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.spin_until = Spinner(self.node).spin_until
-        self.spin_until(lambda: False, DISCOVERY)
+        self.spin_until(lambda: False, DISCOVERY_TIME)
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -122,7 +122,7 @@ class CheckDriver:
         return True
 
     def wind(self, verdict: Verdict) -> None:
-        """Wind each muscle in slightly, and add what is wrong to the verdict."""
+        """Wind each muscle in slightly, and add faults of its response to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
         read = partial(
             import_heavy('musculoskeletal_ae.validity').read_muscle_states,
@@ -165,7 +165,7 @@ class CheckDriver:
 
 
 def _motors(robot: Robot, options: Namespace) -> MotorInterface:
-    """Return how the motors are connected.
+    """Return the interface to the motors, as the options state it.
 
     Raises:
         MusculoskeletalError: If a file of parameters cannot be used, or does not fit the muscles.
@@ -192,7 +192,10 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
 def _check(options: Namespace, arguments: list[str]) -> int:
     robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(options.robot)
     if options.posture and len(options.posture) != robot.joint_count:
-        raise MusculoskeletalError(f'--posture: expected {robot.joint_count} values, one per joint')
+        raise MusculoskeletalError(
+            f'--posture: expected {robot.joint_count} values, one per joint, got '
+            f'{len(options.posture)}'
+        )
     if options.move:  # refuse wrong options before waiting for a driver
         kind = import_heavy('musculoskeletal_ae.driver.verdict').Verdict
         _winding(robot, kind(robot), options)
@@ -243,7 +246,7 @@ def _parse(arguments: list[str]) -> Namespace:
     text = 'for winches without absolute encoders: do not check the length offsets'
     add('--unzeroed', action='store_true', help=text)
     add('--move', action='store_true', help='then wind each muscle in slightly, one at a time')
-    add('--muscles', type=names, metavar='NAME,…', help='with --move: only these')
+    add('--muscles', type=names, metavar='NAME,…', help='with --move: wind only these muscles in')
     text = (
         'with --move: highest commanded tension [N] (default: T_bias + 40 N; for K above '
         '50 kN/m: T_bias + 0.8 mm times K; at most tension.max)'
@@ -252,7 +255,7 @@ def _parse(arguments: list[str]) -> Namespace:
     add('--wait', action='store_true', help='wait for a driver, and listen until it has no faults')
     options = parser.parse_args(arguments)
     if (options.muscles or options.tension) and not options.move:
-        parser.error('--muscles and --tension go with --move')
+        parser.error('--muscles and --tension need --move; add it, or remove them')
     return options
 
 

@@ -11,15 +11,15 @@ from std_msgs.msg import UInt8MultiArray
 from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
 from musculoskeletal_ae.reception import Reception
 
-#: Topics of the networks that the learner proposes, and that the estimator has accepted.
-CANDIDATES, ACCEPTED = 'mae_checkpoint', 'accepted_checkpoint'
-#: Time between steps [s]. A step takes a few milliseconds, which is at most a quarter of a core.
+CANDIDATES = 'mae_checkpoint'  # topic of the networks that the learner proposes
+ACCEPTED = 'accepted_checkpoint'  # topic of the networks that the estimator has accepted
+#: Time between steps [s]. A step takes a few milliseconds, at most a quarter of this time.
 STEP_PERIOD = 0.02
-LARGEST = 64 << 20  # [bytes] of a checkpoint; a typical one has half a MB
+LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical one has half a MB
 
 
 class CheckpointQueue:
-    """Handles one checkpoint at a time, then the newest of those that arrived meanwhile."""
+    """Handles one checkpoint at a time, and then the newest one that has arrived meanwhile."""
 
     def __init__(
         self,
@@ -60,7 +60,8 @@ class CheckpointQueue:
             CheckpointError: If the message is too large to be a network.
         """
         if len(message.data) > LARGEST:
-            raise CheckpointError(f'{len(message.data)} bytes, at most {LARGEST}')
+            size = len(message.data)
+            raise CheckpointError(f'the checkpoint has {size} bytes; legal: at most {LARGEST}')
         self._next = message
         if self._timer.is_canceled():
             self._timer.reset()
@@ -88,5 +89,5 @@ class CheckpointQueue:
             self._reception.reject(self._topic, error.reason, str(error))
         except Exception as error:  # noqa: BLE001 - a received file may do anything
             self._reception.reject_error(self._topic, error)
-        if self._steps is steps:  # else the last step called `give_up`, and another one began
+        if self._steps is steps:  # otherwise `give_up` was called, and another checkpoint has begun
             self._steps = None

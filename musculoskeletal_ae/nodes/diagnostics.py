@@ -12,7 +12,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 
-PERIOD = 1.0  # [s] between reports
+PERIOD = 1.0  # time between reports [s]
 
 
 class Diagnostics:

@@ -57,7 +57,7 @@ class Estimator(Shell):
         self.candidates = Candidates(self, self._use, self.core.keep_isolated)
         self._advertise()
         self.sources.watch(*OWN_TOPICS)
-        # Last values published on the latched topics; None: none yet.
+        # Last values published on the latched topics; None before the first.
         self.published_anomaly = False
         self.published_isolated: tuple[int, ...] | None = None
         self.published_offsets: LengthOffsets | None = None
@@ -141,7 +141,9 @@ class Estimator(Shell):
 
     def _isolate_more(self, request: Trigger.Request) -> str:
         if not self.muscles_to_isolate:
-            raise MusculoskeletalError('no muscle named: set the parameter isolate_muscles first')
+            raise MusculoskeletalError(
+                'the parameter isolate_muscles names no muscle; set it first'
+            )
         wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
         self.core.reset()  # before isolating, because it restores a suspect
         answer = self._isolate(wanted)
@@ -150,7 +152,7 @@ class Estimator(Shell):
 
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
-        restored = self.muscles_to_isolate or isolated  # if none is named, all
+        restored = self.muscles_to_isolate or isolated  # all if the parameter names none
         self.candidates.validator.declare_repaired(restored, time.monotonic())
         return self._isolate(set(isolated) - set(restored))
 
@@ -177,7 +179,7 @@ class Estimator(Shell):
 
     def _on_joints(self, theta: Array) -> None:
         if np.isnan(theta).any():
-            return  # some sensors determine neither the length offsets nor the posture
+            return  # sensors of only some joints determine neither length offsets nor posture
         self.core.joints(theta, time.monotonic())
         if self.frames is not None and self.tf_source == 'sensor':
             self.frames.publish(theta)

@@ -46,7 +46,7 @@ PRIVATE_NAMES = (
     '_guard', '_is_shutdown', '_tasks',
     '_take_client', '_take_service', '_take_subscription', '_take_timer',
 )  # fmt: skip
-FULL_ROUND_PERIOD = 1.0  # [s]
+FULL_ROUND_PERIOD = 1.0  # longest time between two full rounds (see `LeanExecutor`) [s]
 
 
 class _Group(NamedTuple):
@@ -67,11 +67,11 @@ class LeanExecutor(SingleThreadedExecutor):
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
-        self._wait_set: Any = None  # of rcl; None: not built yet
+        self._wait_set: Any = None  # wait set of rcl; None before it is built
         self._groups: tuple[_Group, ...] = ()
         self._actions: list[Any] = []
         self._handles = ExitStack()  # keeps entities of the wait set alive
-        self._next_full_round = 0.0  # [s] of the monotonic clock
+        self._next_full_round = 0.0  # time of the next full round on the monotonic clock [s]
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Run all ready callbacks; wait at most `timeout_sec` and the period of full rounds."""

@@ -27,7 +27,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.robot.kinematics import body_frames
 
-PACE_TIME = 5.0  # [s] over which the real-time factor is averaged
+PACE_TIME = 5.0  # time over which the real-time factor is averaged [s]
 
 
 class HardwareEmulator(Arm):
@@ -61,7 +61,9 @@ class HardwareEmulator(Arm):
             links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
             if link not in links:
                 legal = ', '.join(links)
-                raise MusculoskeletalError(f'parameter imu_link: {link!r}; legal: {legal}')
+                raise MusculoskeletalError(
+                    f'parameter imu_link: unknown link {link!r}; legal: {legal}'
+                )
             self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_length_commands(self.arm.command_length)
         if not self.robot.follows_position:
@@ -74,14 +76,14 @@ class HardwareEmulator(Arm):
         if self.parameter('clock'):
             self.clock_publisher = self.create_publisher(ClockMessage, '/clock', RELIABLE)
             self.time = time.time_ns()
-        # On a steady clock, because with use_sim_time this node itself advances the ROS clock.
+        # The timer uses a steady clock, because with use_sim_time this node advances the ROS clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0 / self.rate, self._tick, clock=steady)
 
     def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
-        return 'arm at rest, no wrench, modules cool and safe; parameters unchanged'
+        return 'the arm is at rest without a wrench, the modules are cool and in their safe state'
 
     def _set_marker_pose_rate(self, rate: float) -> None:
         self.marker_pose_rate, self.pose_due = rate, 0.0
@@ -138,11 +140,12 @@ class HardwareEmulator(Arm):
 
     def report(self) -> Report:
         """Return the diagnostic report."""
-        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all are
+        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all temperatures are NaN
         values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
         if self.arm.has_diverged:
-            problem = 'simulation diverged under excessive forces'
-            return Report('error', f'{problem}: call hardware_emulator/reset', values)
+            problem = 'the simulation diverged under excessive forces'
+            return Report('error', f'{problem}; call hardware_emulator/reset', values)
         if self.arm.safe:
-            return Report('warn', 'modules safe: no commands', values)
+            problem = 'the modules are in their safe state, because no commands arrive'
+            return Report('warn', problem, values)
         return Report('ok', 'following commands', values)

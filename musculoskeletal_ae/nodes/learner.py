@@ -28,7 +28,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 
-POLL = 0.05  # [s] between checks of the training process
+POLL_PERIOD = 0.05  # time between checks of the training process [s]
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 
@@ -57,7 +57,7 @@ class Learner(Shell):
         core = self.core
         if value('fresh'):
             core.replace(None)
-        # These setters replace what was learned, which cannot be undone: hence `prepare`.
+        # These setters replace what was learned and cannot be undone, so they need `prepare`.
         self.follow_parameter('fresh', self._start, self._afresh)
         self.follow_parameter('checkpoint', self._start, self._network)
         self.follow_parameter('relearn_muscles', self._name, self.robot.muscle_indices)
@@ -76,7 +76,7 @@ class Learner(Shell):
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
         serve(self, Trigger, 'learner/relearn', self._relearn)
-        self.create_timer(POLL, self._poll, clock=STEADY)
+        self.create_timer(POLL_PERIOD, self._poll, clock=STEADY)
 
     # -- parameters -----------------------------------------------------------------------------
 
@@ -88,7 +88,7 @@ class Learner(Shell):
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 
     def _afresh(self, value: bool) -> Mae | None:
-        """Return the network to restart from; None at the start of the node."""
+        """Return the network from which to start again; None at the start of the node."""
         if not (value and self.running):
             return None
         path = self.parameter('checkpoint')
@@ -120,7 +120,8 @@ class Learner(Shell):
         self.core.use_body(self.core.body.with_offsets(self.body.offsets))
 
     def _isolate(self) -> None:
-        # An estimator that has just started knows no isolated muscles before it has our network.
+        # An estimator that has just started publishes no isolated muscles, because it does not have
+        # our network yet. Its first message is therefore ignored if it names none.
         number = self._reception.numbers['isolated_muscles']
         knows = number > 1 or (number == 0 and self.has_heard_isolated)
         muscles = self.body.isolated

@@ -54,12 +54,12 @@ def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointStat
 
 
 def motor_command(motors: MotorInterface, length: Array) -> Float64MultiArray:
-    """Return the command to the motors of muscles with l_target [m] (M,), without a layout."""
+    """Return the message that commands l_target [m] (M,) to the motors; it has no layout."""
     return Float64MultiArray(data=array('d', motors.command(length).tobytes()))
 
 
 def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: Time) -> JointState:
-    """Return a joint state of the motors of muscles with l [m] and T [N], (M,) each."""
+    """Return the joint state of the muscles' motors for l [m] and T [N], (M,) each."""
     names, position, effort = motors.joint_values(length, tension)
     message = joint_message(names, position, stamp)
     message.velocity = array('d', [math.nan] * len(names))
@@ -76,7 +76,7 @@ def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Whether a publisher has a subscriber; without one, callers skip building the message."""
+    """Return whether a publisher has a subscriber; otherwise callers need not build a message."""
     return publisher.get_subscription_count() > 0
 
 

@@ -37,13 +37,14 @@ from musculoskeletal_ae.parameters import (
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 FRAME_PREFIX = Parameter('', 'prefix of every published frame name, such as "left/"')
-MOTORS = parameters_of(MotorSettings)
+MOTORS = parameters_of(MotorSettings)  # parameters of the interface to the motors
+#: parameters of every node
 SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX, **MOTORS}
-NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
+NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}  # of nodes that use a network
 
-ALL_NODES = '/**'  # section of all nodes in a file of parameters
+ALL_NODES = '/**'  # name of the section for all nodes in a parameter file
 
-#: by node, then by name
+#: all parameters, by node and by name
 PARAMETERS: dict[str, dict[str, Parameter]] = {
     'controller': {
         **SHARED,
@@ -192,11 +193,11 @@ OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
 
 def check_names(names: Iterable[str], node: str = '') -> None:
-    """Refuse the name of a parameter that nothing would read.
+    """Check that each name is that of a parameter which a node reads.
 
     Args:
         names: Names of parameters.
-        node: Node or executable that the parameters are for; '': all nodes, as in a file.
+        node: Node or executable to which the parameters are passed; '' for all nodes, as in a file.
 
     Raises:
         MusculoskeletalError: If no node has the parameter, or only another node than `node`.
@@ -211,16 +212,16 @@ def check_names(names: Iterable[str], node: str = '') -> None:
             near = get_close_matches(name, legal, 1) or ['none, see --help']
             problem = f'no node has a parameter {name!r}; nearest: {near[0]}'
         elif own and len(users) == 1 and users[0] not in own:
-            problem = f'{node} has no parameter {name!r}; {users[0]} has'
+            problem = f'{node} has no parameter {name!r}; only {users[0]} has one of this name'
         if problem:
             raise MusculoskeletalError(printable(problem))
 
 
 def motor_settings(files: Iterable[Path]) -> MotorSettings:
-    """Return the motor parameters in files of ROS parameters, for tools, which are no nodes.
+    """Return the motor parameters in ROS parameter files, which tools read without being nodes.
 
     Args:
-        files: The files; later ones win.
+        files: The files; values in later files replace those in earlier ones.
 
     Raises:
         MusculoskeletalError: If a file cannot be read, has a parameter that no node has, or has
@@ -251,7 +252,7 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
 
 
 def _motor_value(name: str, value: Any) -> Any:
-    """Return the checked value of a motor parameter, which ROS would check for a node."""
+    """Return the checked value of a motor parameter; ROS checks it only for nodes."""
     parameter = MOTORS[name]
     is_list = isinstance(parameter.default, tuple)
     words = value if isinstance(value, list) else [value]

@@ -20,16 +20,16 @@ import threading
 import time
 from collections.abc import Callable
 
-LONGEST = 10.0  # [s] without progress
-LOOK_PERIOD = 0.5  # [s]
+LONGEST_STALL = 10.0  # longest legal time without progress [s]
+LOOK_PERIOD = 0.5  # time between two checks [s]
 STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
-#: modules in which the main thread may stay long
-PATIENT = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
+#: names of modules in which the main thread may stay long
+SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
 
 def end_process() -> None:
     """Dump the stacks of all threads, and end the process immediately."""
-    print(f'no progress for {LONGEST:g} s: ending; stacks of all threads:', file=sys.stderr)
+    print(f'no progress for {LONGEST_STALL:g} s: ending; stacks of all threads:', file=sys.stderr)
     faulthandler.dump_traceback(all_threads=True)
     os._exit(STALLED)
 
@@ -39,7 +39,7 @@ class ProgressWatch:
 
     def __init__(
         self,
-        longest: float = LONGEST,
+        longest: float = LONGEST_STALL,
         look_period: float = LOOK_PERIOD,
         on_stall: Callable[[], object] = end_process,
     ) -> None:
@@ -51,7 +51,7 @@ class ProgressWatch:
             on_stall: Called in another thread after `longest` without progress.
         """
         self._longest, self._look_period, self._on_stall = longest, look_period, on_stall
-        self._quiet = 0.0  # [s]
+        self._quiet = 0.0  # time without progress [s]
         self._is_stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, name='progress', daemon=True)
 
@@ -93,7 +93,7 @@ def _is_patient() -> bool:
     """Whether the main thread is in code that may take long."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
-        if frame.f_globals.get('__name__', '').partition('.')[0] in PATIENT:
+        if frame.f_globals.get('__name__', '').partition('.')[0] in SLOW_MODULES:
             return True
         frame = frame.f_back
     return False

@@ -27,15 +27,15 @@ from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, 
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-# If the recorder is killed, the messages of at most this time are lost.
-FLUSH_PERIOD = 0.5  # [s]
-# Holds one or two seconds of the fastest topic while the disk is busy.
+#: time between writes to disk [s]; a killed recorder loses the messages of at most this time
+FLUSH_PERIOD = 0.5
+#: QoS that holds one or two seconds of the fastest topic while the disk is busy
 LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Time after Ctrl-C for recording messages that have already arrived.
-DRAIN_TIME = 0.5  # [s]
-# Time to discover existing publishers, and to connect to them, before announcing the recording.
-DISCOVERY_TIME, CONNECTION_TIME = 0.5, 2.0  # [s]
+DRAIN_TIME = 0.5  # time after Ctrl-C for recording messages that have already arrived [s]
+# The recording is announced after the following times.
+DISCOVERY_TIME = 0.5  # time in which existing publishers are discovered [s]
+CONNECTION_TIME = 2.0  # longest time in which they are connected [s]
 
 
 class Record(Node):
@@ -50,7 +50,8 @@ class Record(Node):
         self.timeless = 0  # number of other messages that arrived before the first /clock
         self._sim_time = self.get_parameter('use_sim_time').value
         self._subscriptions_of: dict[str, Subscription] = {}  # by the name in the interface
-        self._incompatible: dict[str, QoSPolicyKind] = {}  # policy that a publisher does not offer
+        #: policy that a publisher does not offer as requested, by topic
+        self._incompatible: dict[str, QoSPolicyKind] = {}
         self._topics = topics
         recorded = set[str]()
         for name, topic in topics.items():
@@ -98,7 +99,7 @@ class Record(Node):
         )
 
     def missing(self) -> list[str]:
-        """Return the topics without messages, each with whether it has a publisher."""
+        """Return a text for each topic without messages, which says whether it has a publisher."""
         silent = [
             each.topic_name
             for each in self._subscriptions_of.values()
@@ -189,7 +190,7 @@ def parse(arguments: list[str]) -> Namespace:
     add('--recover', type=Path, metavar='BAG', help=recover_help)
     options = parser.parse_args(arguments)
     if options.directory and options.out:
-        parser.error('DIR is given twice')
+        parser.error('DIR is given twice; remove --out')
     if options.recover and (options.topics or options.duration):
         parser.error('--recover copies the whole recording: remove --topics and --duration')
     options.out = options.out or options.directory

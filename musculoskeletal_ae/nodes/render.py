@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `render`: one picture of a running arm as a PNG, no display needed."""
+"""The tool `render`: saves a picture of a running arm as a PNG file, without a display."""
 
 from argparse import Namespace
 from functools import partial
@@ -16,7 +16,7 @@ from musculoskeletal_ae.options import Parser, picture, positive
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
-DISCOVERY = 2.0  # [s] within which running nodes discover each other
+DISCOVERY_TIME = 2.0  # time in which running nodes discover each other [s]
 
 
 def _line(strip: Marker) -> Line:
@@ -36,7 +36,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
     first, spinner = node.resolve_topic_name(topics[0]), Spinner(node)
     spinner.spin_until(lambda: drawn, options.timeout)
     # The publisher of the preferred topic may be discovered later, or send its next markers later.
-    spinner.spin_until(lambda: topics[0] in drawn, DISCOVERY if drawn else 0.0)
+    spinner.spin_until(lambda: topics[0] in drawn, DISCOVERY_TIME if drawn else 0.0)
     if drawn and node.count_publishers(first):
         spinner.spin_until(lambda: topics[0] in drawn, options.timeout)
     if not drawn:

@@ -42,24 +42,24 @@ from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-# Deep enough that a reader that is one second late still receives every message.
+#: depth of the QoS, with which a reader that is one second late still receives every message
 DEPTH = 1000
-# Services are answered at least once per SERVICE_PERIOD; waits up to SLEPT use time.sleep.
-SERVICE_PERIOD, SLEPT = 0.02, 0.002  # [s]
-# A publisher discovers a subscriber slightly before that subscriber can receive messages.
-SETTLE_TIME = 0.3  # [s]
-LAP_GAP = 10_000_000  # [ns] between the last message of a lap and the first of the next
+SERVICE_PERIOD = 0.02  # longest time between two rounds in which services are answered [s]
+LONGEST_SLEEP = 0.002  # longest wait that uses time.sleep instead of answering services [s]
+#: time from the discovery of a subscriber until it can receive messages [s]
+SETTLE_TIME = 0.3
+LAP_GAP = 10_000_000  # time between the last message of a lap and the first of the next [ns]
 TRAJECTORY = 'joint_trajectory'
-# Value of a rate on /diagnostics if no message was used since the previous report.
+#: value of a rate on /diagnostics if no message was used since the previous report
 NO_RATE = '0.0 Hz'
-# [s] to wait for a first report of the subscribers, and for two reports after sending.
-FIRST_REPORT_TIME, REPORT_TIME = 2.0 * PERIOD, 5.0 * PERIOD
-SENDINGS = 3  # attempts to send a trajectory
-# [s] to wait for subscribers: playback may start without them, a single trajectory cannot.
-WAIT, SEND_WAIT = 2.0, 10.0
-ACKNOWLEDGE_TIME = 2.0  # [s] to wait until reliable readers have acknowledged the messages
-# Recorded time between two messages on /clock, and the shortest wall time that nodes can handle.
-CLOCK_PERIOD, SHORTEST_CLOCK_PERIOD = 0.005, 0.001  # [s]
+FIRST_REPORT_TIME = 2.0 * PERIOD  # longest wait for a first report of the subscribers [s]
+REPORT_TIME = 5.0 * PERIOD  # longest wait for two reports after sending a trajectory [s]
+SENDINGS = 3  # number of attempts to send a trajectory
+WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
+SEND_WAIT = 10.0  # the same for a single trajectory, which needs a subscriber [s]
+ACKNOWLEDGE_TIME = 2.0  # longest wait until reliable readers have acknowledged the messages [s]
+CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
+SHORTEST_CLOCK_PERIOD = 0.001  # shortest wall time between two of them that nodes can handle [s]
 
 
 class Replay(Node):
@@ -71,7 +71,7 @@ class Replay(Node):
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
         self.length = (self._stop - self._start) / 1e9  # [s]
-        self._before = (self._start - bag.start) / 1e9  # [s] of the bag that are skipped
+        self._before = (self._start - bag.start) / 1e9  # skipped time at the start of the bag [s]
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher: dict[str, Publisher] = {}
         for recorded, name in names.items():
@@ -151,7 +151,7 @@ class Replay(Node):
             wait = min(due, SERVICE_PERIOD)
             if self._recorded_time:
                 wait = min(wait, max(self._next_tick - now, 0.0))
-            if wait > SLEPT or now > self._next_service:
+            if wait > LONGEST_SLEEP or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.spin_once(wait)
                 STOP.raise_if_received()
@@ -279,25 +279,32 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
         answers.begin()
         publisher.publish(message)
         is_acknowledged = publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
-        # The first report may have been on its way when the trajectory arrived.
+        # Wait for two reports: the first may have been on its way when the trajectory arrived.
         spinner.spin_until(
             lambda: answers.is_taken or answers.refusal or len(answers.reports) > 1,
             REPORT_TIME if has_reported else 0.0,
         )
         if answers.refusal:
-            raise MusculoskeletalError(f'the controller did not take it: {answers.refusal}')
+            raise MusculoskeletalError(
+                f'the controller did not take the trajectory: {answers.refusal}'
+            )
         if answers.is_taken:
             return
         if is_acknowledged and not answers.reports:
             print(f'{topic}: received; no node has reported whether it uses it', file=sys.stderr)
             return
     raise MusculoskeletalError(
-        f'{topic} was sent {SENDINGS} times and did not arrive; is this machine overloaded?'
+        f'{topic} was sent {SENDINGS} times, and no node has used it; try again when this machine '
+        'is less busy'
     )
 
 
 def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish a hand-guided motion as one trajectory; fail if the controller refuses it."""
+    """Publish a hand-guided motion as one trajectory, and return the exit status 0.
+
+    Raises:
+        MusculoskeletalError: If the bag has no such motion, or the controller refuses it.
+    """
     names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
     if len(names) > 1:  # with --keep-names, the bag's arms stay separate
         problem = f'has the motion of several arms: {", ".join(names)}'

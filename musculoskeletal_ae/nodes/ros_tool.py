@@ -25,7 +25,7 @@ from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
-LONGEST_WAIT = 0.1  # [s] between checks of a condition and of the stop signals
+LONGEST_WAIT = 0.1  # longest time between checks of a condition and of the stop signals [s]
 
 
 def message_class(type_name: str) -> Any:
@@ -90,8 +90,8 @@ def run_tool(
     Args:
         name: Name of the executable.
         parse: Parses the arguments that are not for ROS.
-        work: Does the work, from the options and all arguments.
-        argv: Arguments, those for ROS included; None: those of the process.
+        work: Function of the options and of all arguments that returns the exit status.
+        argv: Arguments, including those for ROS; by default the arguments of the process.
 
     Returns:
         The status of `work`; 1 if an input cannot be used; 2 if an option is wrong.

@@ -27,8 +27,8 @@ from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_
 from musculoskeletal_ae.nodes.shell import STEADY
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-STOP_CHECK_PERIOD = 0.1  # [s]
-NICENESS = 5  # of nodes that are not time-critical
+STOP_CHECK_PERIOD = 0.1  # time between checks for a stop signal [s]
+NICENESS = 5  # niceness of nodes that are not time-critical
 
 
 def run(name: str) -> int:

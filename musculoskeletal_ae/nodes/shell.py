@@ -80,20 +80,20 @@ if TYPE_CHECKING:  # importing it loads the bag writer
 #: clock for message ages and watchdogs; independent of /clock
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
-MOST_OFFSET = 10.0  # [m] of a length sensor
-#: remedies for incompatible QoS, by who states the policy and by policy
+MOST_OFFSET = 10.0  # largest offset of a length sensor [m]
+#: remedies for incompatible QoS, by the side that states the policy and by policy
 QOS_REMEDIES = {
     ('publisher offers', QoSPolicyKind.RELIABILITY): 'publish it reliable',
     ('publisher offers', QoSPolicyKind.DURABILITY): 'publish it transient local (latched)',
-    ('subscriber asks', QoSPolicyKind.RELIABILITY): 'subscribe best-effort',
-    ('subscriber asks', QoSPolicyKind.DURABILITY): 'subscribe volatile',
+    ('subscriber needs', QoSPolicyKind.RELIABILITY): 'subscribe best-effort',
+    ('subscriber needs', QoSPolicyKind.DURABILITY): 'subscribe volatile',
 }
-MANY_REPORTS = QoSProfile(depth=50)  # all nodes of the graph report on one topic
-#: needed topics that are published continually, so that their silence is an error
+MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
+#: needed topics that are published continually, whose silence is therefore an error
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
-#: [s] without a usable message after which a stream is silent
-SILENCE = 1.0
-#: [s] between two reports; more means that this node itself has paused, and messages wait unread
+SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
+#: Time between two reports above which this node itself was paused [s]. Its messages then wait
+#: unread, so it reports no silence.
 LONGEST_PERIOD = 1.5
 
 
@@ -101,7 +101,7 @@ class Shell(Node):
     """A node that knows its robot, counts what it rejects and reports once a second."""
 
     core: Any = None  # the object that computes, without ROS
-    is_time_critical = True  # whether commands wait for it
+    is_time_critical = True  # whether a delay of this node delays commands
     is_watched = True  # whether the process ends if it makes no progress for 10 s
     recording: StopRecording | None = None  # records every new message before it is used
     #: topics of `AUTHORS` whose messages this node accepts from several publishers
@@ -129,7 +129,7 @@ class Shell(Node):
             self.parameter(key)  # raises if the value is not legal
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
-        self.rate: float = self.parameter('rate')  # of the muscle modules [Hz]
+        self.rate: float = self.parameter('rate')  # rate of the muscle modules [Hz]
         settings = MotorSettings(**{name: self.parameter(name) for name in MOTORS})
         self.motors = MotorInterface(settings, self.robot.muscles)
         #: topics of a ros2_control robot, by the names of those whose place they take
@@ -162,8 +162,8 @@ class Shell(Node):
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
-        self._reported_at = math.inf  # [s]
-        self.checkpoint_version: int | None = None  # of the network in use
+        self._reported_at = math.inf  # time of the last report [s]
+        self.checkpoint_version: int | None = None  # version of the network in use
         self.needed: list[str] = []  # topics that the node needs to work
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
@@ -217,7 +217,7 @@ class Shell(Node):
     ) -> Any:
         """Advertise; report subscribers with incompatible QoS."""
         events = PublisherEventCallbacks(
-            incompatible_qos=lambda event: self._on_incompatible(topic, 'subscriber asks', event)
+            incompatible_qos=lambda event: self._on_incompatible(topic, 'subscriber needs', event)
         )
         options.setdefault('event_callbacks', events)
         return super().create_publisher(msg_type, topic, qos_profile, **options)
@@ -225,7 +225,7 @@ class Shell(Node):
     def _on_incompatible(self, topic: str, who: str, event: Any) -> None:
         policy = QoSPolicyKind(event.last_policy_kind)
         remedy = QOS_REMEDIES.get((who, policy), 'see "Quality of service" in the interface')
-        problem = f'a {who} another {policy.name.lower()} than this node: {remedy}'
+        problem = f'a {who} another {policy.name.lower()} than this node; {remedy}'
         self._reception.reject(topic, 'incompatible QoS', f'incompatible QoS: {problem}')
         self._reception.refuse(f'{topic}: incompatible QoS: {problem}')
 
@@ -254,7 +254,7 @@ class Shell(Node):
     def _counting_errors(self, source: str) -> Iterator[None]:
         try:
             yield
-        except ExternalShutdownException:  # asks for the end of the node
+        except ExternalShutdownException:  # requests the end of the node
             raise
         except Exception as error:  # noqa: BLE001
             self.on_callback_error(source, error)
@@ -302,9 +302,10 @@ class Shell(Node):
         """Call `setter` with the value of a parameter now, and whenever the parameter is set.
 
         Parameters of one request are set together or not at all. If one is refused, the setters of
-        the others are called again with the previous values. Setters whose effect cannot be
-        undone in this way need `prepare`. They are called after all others, in the order of
-        registration, and once if several parameters share one. Only the first of them may raise.
+        the others are called again with the previous values. A setter whose effect cannot be undone
+        in this way needs `prepare`. Such setters are called after all others, in the order of
+        registration, and once if several parameters share a setter. Only the first of them may
+        raise an error.
 
         Args:
             name: Name of the parameter.
@@ -369,7 +370,7 @@ class Shell(Node):
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
-                raise CheckpointError(f'cannot be computed with ({error})') from error
+                raise CheckpointError(f'the network cannot be evaluated ({error})') from error
             self.checkpoint_version = mae.version
             self.stop_waiting_for(ACCEPTED)
 
@@ -383,7 +384,8 @@ class Shell(Node):
         def use_file(mae: Mae) -> None:
             if has_accepted:
                 raise MusculoskeletalError(
-                    'all nodes use the network of the estimator; set its `checkpoint` instead'
+                    'all nodes use the network of the estimator; set the parameter `checkpoint` of '
+                    'the estimator instead'
                 )
             CheckpointValidator(self.robot).check(mae)
             put_to_use(mae)
@@ -524,7 +526,8 @@ class Shell(Node):
         def take(rows: Array) -> None:
             nonlocal previous
             if np.abs(rows[0]).max() > MOST_OFFSET or rows[1].min() < 0.0:
-                detail = f'{rows.tolist()}, legal: ± {MOST_OFFSET:g} m, deviations from 0 on'
+                expected = f'offsets within ±{MOST_OFFSET:g} m and standard deviations >= 0'
+                detail = f'expected {expected}, got {rows.tolist()}'
                 raise MessageError('impossible offsets', detail)
             offsets, before = LengthOffsets(*rows), previous
             previous = offsets
@@ -648,7 +651,7 @@ def _recorded(
 
 @contextmanager
 def _naming_parameter(name: str) -> Iterator[None]:
-    """Prefix errors with the name of the parameter."""
+    """Prefix the messages of errors in this context with the name of the parameter."""
     try:
         yield
     except (MusculoskeletalError, OSError) as error:

@@ -25,7 +25,7 @@ from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.validity import read_target
 
-TEMPERATURE = 25.0  # [°C]
+TEMPERATURE = 25.0  # reported temperature of all modules [°C]
 
 
 class Sim(Arm):
@@ -49,7 +49,7 @@ class Sim(Arm):
         else:
             self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
-        if not self.as_robot:  # as the robot, its own sensors have no offsets
+        if not self.as_robot:  # sensors of a simulated robot have no offsets
             self.follow_offsets(lambda: None)  # `_command` reads `body.offsets`
         self.follow_isolated(self._isolate)
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
@@ -67,7 +67,7 @@ class Sim(Arm):
             self.arm.use(mae)
 
     def _isolate(self) -> None:
-        # With as_robot, modules exert tension on isolated muscles like real ones.
+        # With as_robot, isolation does not change the simulation, as it does not change a real arm.
         if self.arm is not None and not self.as_robot:
             self.arm.isolate(self.body.isolated)
 

@@ -22,19 +22,21 @@ from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
 from musculoskeletal_ae.report import Level
 
-OLD = 1.0  # [s] age at which a moving value is no longer shown
-#: [s] without a report after which a node counts as silent; nodes report once a second
-SILENT = 2.0
-#: [s] between two ticks, and the longest interval that is not a pause of this process; nodes do not
-#: become silent during such a pause
-TICK, LONGEST_TICK = 1.0, 1.5
-FORGOTTEN = 5.0  # [s] without a report after which any other node no longer counts
+LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
+#: time without a report after which a node counts as silent [s]; nodes report once a second
+SILENCE = 2.0
+TICK = 1.0  # time between two ticks [s]
+#: Interval between two ticks above which this process was paused [s]. Nodes do not become silent
+#: during such a pause.
+LONGEST_TICK = 1.5
+#: time without a report after which a node that is not in NEEDED no longer counts [s]
+FORGET_TIME = 5.0
 #: nodes whose silence is an error once they have reported
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
-VERSION = 'checkpoint version'
-#: A network of one of the estimator's last REPORTS reports is no mismatch. Another network is one
-#: after as many reports of its node; nodes report once a second.
+VERSION = 'checkpoint version'  # key of the version in reports
+#: Number of reports after which another network than the estimator's counts as a mismatch. Nodes
+#: report once a second. Networks that the estimator named in as many last reports do not count.
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
@@ -58,7 +60,7 @@ def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> 
 
 
 class Trouble(NamedTuple):
-    """One part of the status line."""
+    """One part of the status line: a problem with its remedy."""
 
     text: str
     steps: tuple[str, ...] = ()  # identifiers of the remedy's steps
@@ -102,9 +104,10 @@ class Situation:
         self.samples = self.checkpoints = self.suspect = self.doing = ''
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # by full name
-        self._has_explored = False  # in the last mode before a stop
-        self._accepted: deque[str] = deque(maxlen=REPORTS)  # the estimator's last versions
-        self._other_networks: dict[str, tuple[str, int]] = {}  # version and for how many reports
+        self._has_explored = False  # whether the arm explored before the last stop
+        self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
+        #: version of a node's other network and the number of reports that name it, by node
+        self._other_networks: dict[str, tuple[str, int]] = {}
         self._ticked_at, self._slept = math.nan, 0.0  # [s]
 
     def tick(self) -> None:
@@ -116,7 +119,7 @@ class Situation:
         self._ticked_at = now
         awake = now - self._slept
         for name, node in list(self._nodes.items()):
-            if not _is_needed(name) and awake - node.heard_at > FORGOTTEN:
+            if not _is_needed(name) and awake - node.heard_at > FORGET_TIME:
                 del self._nodes[name]
 
     def diagnosed(self, message: DiagnosticArray) -> None:
@@ -197,7 +200,7 @@ class Situation:
         return {} if node is None else node.values
 
     def _is_shown(self, name: str, node: Node) -> bool:
-        """Whether `_stops` or `_body` already shows a report."""
+        """Return whether `_stops` or `_body` already shows the report of a node."""
         if node.level == DiagnosticStatus.OK or 'fault' in node.values:
             return False
         if SEVERAL in node.values:  # shown if the stop names the same publishers
@@ -212,7 +215,7 @@ class Situation:
         return False
 
     def _stops(self) -> list[Trouble]:
-        """Return the anomaly and the stop."""
+        """Return the parts of the status line about an anomaly and a stop."""
         control = self._values('controller')
         mode, cause = control.get('mode'), control.get('stop cause')
         is_verifying = mode == VERIFYING
@@ -239,7 +242,8 @@ class Situation:
 
     def _mismatches(self) -> list[str]:
         return [
-            f'{node} uses network {version}, the estimator {self._accepted[-1]}: restart {node}'
+            f'{node} uses network {version}, but the estimator uses network {self._accepted[-1]}; '
+            f'restart {node}'
             for node, (version, reports) in self._other_networks.items()
             if reports >= REPORTS
         ]
@@ -250,17 +254,17 @@ class Situation:
         return {
             name: now - node.heard_at
             for name, node in self._nodes.items()
-            if now - node.heard_at > SILENT and _is_needed(name)
+            if now - node.heard_at > SILENCE and _is_needed(name)
         }
 
     def _silent(self) -> list[str]:
         return [
-            f'{name}: no report for {silence:.0f} s: see its log, then restart it'
+            f'{name}: no report for {silence:.0f} s; see its log, then restart it'
             for name, silence in self.silent_nodes().items()
         ]
 
     def _body(self) -> list[Trouble]:
-        """Return isolated muscles and unknown length offsets.
+        """Return the parts of the status line about isolated muscles and length offsets.
 
         A restarted estimator starts from the offsets of its first start, which may be wrong. The
         controller then treats them as unknown, although the estimator reports none as unknown.
@@ -292,12 +296,12 @@ class Situation:
 
 
 def _is_needed(name: str) -> bool:
-    """Whether a node's silence is an error."""
+    """Return whether a node's silence is an error."""
     return name.rpartition('/')[2] in NEEDED
 
 
 def _is_own(name: str) -> bool:
-    """Whether a node only summarizes the reports of others."""
+    """Return whether a node only summarizes the reports of other nodes."""
     return name.rpartition('/')[2] == 'bringup_status'
 
 

@@ -48,14 +48,13 @@ COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CO
 SEVERAL = 'several publishers'  # rejection reason
 SILENT_TOPIC = 'silent topic'  # key of a value in reports
 
-LOOK_PERIOD = 0.1  # [s] between checks of the graph
-LOOKS, TURNS = 20, 3  # TURNS turns within LOOKS checks mean two publishers of one name
-#: [s] for which the graph keeps a killed node, plus a margin
-LEASE = 30.0
-#: [s] for which the graph may know a publisher but not its node
-NAMING = 1.0
-TWIN_SILENCE = 3.0  # [s] without a report after which a second node counts as stopped
-UNNAMED = '_NODE_NAME_UNKNOWN_'
+LOOK_PERIOD = 0.1  # time between checks of the graph [s]
+LOOKS = 20  # number of checks within which turns of two publishers are counted
+TURNS = 3  # number of turns that prove two publishers of one name
+LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
+NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
+TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]
+UNNAMED = '_NODE_NAME_UNKNOWN_'  # name that the graph returns for such a publisher's node
 
 
 class Publisher(NamedTuple):
@@ -81,7 +80,7 @@ class Authorship:
 
     def __init__(self) -> None:
         self.intruders, self.is_certain = '', True
-        self._first_seen: dict[bytes, float] = {}  # by publisher [s]
+        self._first_seen: dict[bytes, float] = {}  # time of discovery [s], by publisher
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
 
     def look(self, publishers: Iterable[Publisher], turns: int, now: float) -> None:
@@ -128,7 +127,7 @@ class Twins:
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
         self._has_reported = False
-        self._heard_at = -math.inf  # of another node [s]
+        self._heard_at = -math.inf  # time of the last report of another node [s]
 
     def take(self, report: bytes, now: float) -> None:
         """Process a report in CDR that arrived at `now` [s].
@@ -214,7 +213,7 @@ class Sources:
         )
 
     def remedy(self) -> str:
-        """Return the remedy for several publishers."""
+        """Return the remedy for topics with several publishers, as text."""
         authors = {AUTHORS[topic] for topic, each in self._authorships.items() if each.intruders}
         if not authors:
             return 'stop one of them'

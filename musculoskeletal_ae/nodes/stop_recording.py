@@ -3,7 +3,8 @@
 
 A node keeps the recent messages that it received and published. When it stops, a thread writes them
 to `stop_DATE-TIME/` in ROS's log directory (`log/` under bringup.sh), which does not delay the
-commands of the stop. The oldest recordings beyond a number are deleted.
+commands of the stop. If there are more recordings than the user wants to keep, the oldest ones are
+deleted.
 """
 
 import shutil
@@ -24,15 +25,15 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 SECONDS = 10.0  # duration of a recording [s]
 MOST = 50_000  # largest number of messages in a recording
-MOST_BYTES = 32 << 20  # largest total size of these messages
+MOST_BYTES = 32 << 20  # largest total size of the messages in a recording [bytes]
 LARGEST_MESSAGE = 4 << 20  # largest recorded message [bytes]; a typical network has half a MB
 FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
 #: pattern of the bags' directories, including bags that are incomplete because of a kill
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
 
 
-#: Time of arrival [ns], topic, and serialized message. Python's garbage collector would traverse
-#: tens of thousands of message objects, and delay a command by 10 ms.
+#: Time of arrival [ns], topic, and serialized message. Messages are kept as bytes: Python's garbage
+#: collector would traverse tens of thousands of message objects and delay a command by 10 ms.
 Heard = tuple[int, str, bytes]
 
 

@@ -34,7 +34,7 @@ from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import OLD, Situation, figures
+from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -44,26 +44,33 @@ from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.stop_signals import STOP, Reaction, import_heavy
 from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
+#: QoS of topics of which only the newest message counts
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+#: QoS of /diagnostics, on which all nodes of the graph report
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
-PERIOD = 1.0 / 30.0  # [s] between pictures
-TEXT_PERIOD = 0.25  # [s] between updates of texts and curves
-GRAPH_PERIOD = 1.0  # [s] between checks of the graph
-PATIENCE = 10.0  # [s] to wait for the response of a service
-STOP_CHECK_PERIOD = 0.1  # [s]
-SETTLED = 2.5  # [s] after a reset, within which a remaining cause stops the arm again
+PERIOD = 1.0 / 30.0  # time between pictures [s]
+TEXT_PERIOD = 0.25  # time between updates of texts and curves [s]
+GRAPH_PERIOD = 1.0  # time between checks of the graph [s]
+PATIENCE = 10.0  # longest wait for the response of a service [s]
+STOP_CHECK_PERIOD = 0.1  # time between checks for a stop signal [s]
+#: time after a reset within which a remaining cause stops the arm again [s]
+SETTLE_TIME = 2.5
+#: topics from which the arms on the page are drawn
 ARM_TOPICS = {
     'measured': 'joint_states',
     'estimated': 'estimated_joint_states',
     'simulated': 'sim/joint_states',
 }
-SET, GET = 'hardware_emulator/set_parameters', 'hardware_emulator/get_parameters'
-DO = (
+SET = 'hardware_emulator/set_parameters'
+GET = 'hardware_emulator/get_parameters'
+#: Trigger services that visitors may call
+TRIGGERS = (
     'controller/stop', 'controller/reset', 'estimator/reset', 'estimator/restore',
     'estimator/zero', 'replay/pause', 'replay/resume',
 )  # fmt: skip
-SERVICES = {'controller/explore': SetBool, **dict.fromkeys(DO, Trigger), GET: GetParameters}
+SERVICES = {'controller/explore': SetBool, **dict.fromkeys(TRIGGERS, Trigger), GET: GetParameters}
 SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
+#: service of each node whose availability shows that the node is running
 SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
 
 
@@ -143,10 +150,10 @@ class View(Node):
             receive: Any = self.reception.of(topic, partial(note, what, read), publishers)
             self.subscribed.append(self.create_subscription(kind, topic, receive, qos))
 
-    def _newest(self, what: str, old: float = OLD) -> Any:
-        """Return the newest value; None if it is older than `old` [s]."""
+    def _newest(self, what: str, largest_age: float = LARGEST_AGE) -> Any:
+        """Return the newest value; None if it is older than `largest_age` [s]."""
         when, value = self.newest.get(what, (-math.inf, None))
-        return value if time.monotonic() - when < old else None
+        return value if time.monotonic() - when < largest_age else None
 
     def _take(self) -> None:
         for each in self.subscribed:
@@ -253,7 +260,7 @@ class View(Node):
 
     def _show_reset_outcome(self) -> None:
         """Notify visitors of the outcome of a reset, after the time for a renewed stop."""
-        if time.monotonic() > self.reset_at + SETTLED:
+        if time.monotonic() > self.reset_at + SETTLE_TIME:
             self.reset_at = math.inf
             trouble = self.page.with_buttons(self.situation.trouble())
             is_stopped = self.situation.is_stopped
@@ -263,7 +270,7 @@ class View(Node):
         """Reset anomaly and stop, unless a muscle of the emulated arm is still ruptured."""
         isolated = set(self.robot.names(self._isolated()).split(', '))
         if remaining := [name for name in self.ruptured if name not in isolated]:
-            problem = f'{", ".join(remaining)}: ruptured, which would stop the arm again'
+            problem = f'{", ".join(remaining)} would stop the arm again, being ruptured'
             self.page.notify(f'{problem}; press "Mend" first', False)
             return
 
@@ -328,7 +335,7 @@ class View(Node):
                 self.targets.publish(joint_message([*value], theta, stamp))
             case 'hand':
                 if value.shape != (3,) or not np.isfinite(value).all():
-                    raise ValueError(f'expected a position of three numbers [m], not {value}')
+                    raise ValueError(f'expected a position of three numbers [m], got {value}')
                 if (theta := self._newest('estimated')) is not None:
                     pose = pin.SE3(np.eye(3), value)
                     target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta

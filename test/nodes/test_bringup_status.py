@@ -154,7 +154,7 @@ def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seco
     for _ in range(3):
         second(20, 3)
     assert situation.trouble() == (
-        'controller uses network 3, the estimator 20: restart controller'
+        'controller uses network 3, but the estimator uses network 20; restart controller'
     )
     second(20, 20)
     assert situation.trouble() == ''
@@ -201,7 +201,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert second('sim', lasting=60.0)[0] == 'ok'  # the machine was suspended
     assert second('sim')[0] == 'error'
     level, trouble = second('sim')
-    assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s: ')
+    assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s; ')
     assert 'sim' not in trouble and 'view' not in trouble
     assert second('sim', 'learner') == ('ok', '')
     situation.diagnosed(diagnostics('/left/second', 'wrong', DiagnosticStatus.ERROR))
