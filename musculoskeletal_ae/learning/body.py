@@ -32,15 +32,14 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import end_tension
 
 FEATURES = 60  # number of random features drawn for each muscle
-WIDTH = 0.35  # width of the kernel that they approximate, as a share of the joint ranges
+WIDTH = 0.35  # width of the kernel that the features approximate, as a share of the joint ranges
 #: The directions in feature space that vary least are dropped: about half of them, together this
 #: share of the variance. At the prior's spread that is less than 0.1 mm.
 LEFT_OUT = 1e-3
 POSTURES = 500  # number of random postures over which that variance is computed
-# At this value the tension at the elastic element is twice that at the motor; friction cannot
-# exceed it.
+#: largest |μ|, at which the tension at the elastic element is twice the tension at the motor
 LARGEST_FRICTION = 0.7
-LARGEST_LOG = 1.5  # bound on |κ|
+LARGEST_LOG = 1.5  # largest |κ|
 
 
 class Layout:
@@ -174,7 +173,7 @@ class CalibratedBody:
 
     @property
     def elasticity(self) -> JointElasticity:
-        """The springs and dampers of the joints, as far as learned."""
+        """The springs and dampers of the joints, with learned corrections."""
         return springs.learned(self.robot.kinematics.elasticity, self.springs)
 
     def elastic(self, m: int) -> SeriesElastic:

@@ -232,7 +232,7 @@ class SampleCollector:
     # -- changes of state -----------------------------------------------------------------------
 
     def use_body(self, body: BodyState) -> None:
-        """Take samples under another body state from now on; discard incomplete samples."""
+        """Use another body state for samples from now on; discard incomplete samples."""
         self._stream.use_body(body)
         self.healthy.use_isolated(body.isolated)
         self.reset()

@@ -152,7 +152,7 @@ class CheckpointKeeper:
         return True
 
     def numbered(self, mae: Mae) -> Mae:
-        """Return the network with a version above its own and that of the network in use."""
+        """Return the network with a new version, higher than its own and than the one in use."""
         before = 0 if self.mae is None else self.mae.version
         return replace(mae, version=1 + max(mae.version, before))
 

@@ -52,7 +52,7 @@ class AnomalyMargin:
         return self.is_anomaly or self._time < self._closed_until
 
     def pass_time(self, dt: float) -> None:
-        """Advance the time by `dt` [s] to that of the next message."""
+        """Advance the time by `dt` [s], to the time of the next message."""
         self._time += dt
 
     def hold(self, dt: float, reading: Sample, rest: Sample | None) -> list[Waiting]:

@@ -86,7 +86,7 @@ class PostureModel:
         """
         self.body, self.observed = body.limb(joints, muscles), observed.limb(joints, muscles)
         self.joints = joints
-        self._kinematics = body.robot.kinematics  # of the whole body
+        self._kinematics = body.robot.kinematics  # kinematics of the whole body
         #: joints of the group with a spring, indices in θ of the whole body, (S,)
         self.sprung: Ints = joints[self._kinematics.elasticity.is_sprung[joints]]
         ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])

@@ -71,7 +71,7 @@ class ReadingWindow:
             self._first += 1
 
     def parts(self, time: float) -> tuple[Array, Array]:
-        """Return the rows of the readings up to `time` [s], and those of later readings."""
+        """Return the rows of the readings up to `time` [s], and the rows of later readings."""
         earlier_count = bisect_right(self.readings, time, key=itemgetter(0))
         middle, end = self._first + earlier_count, self._first + len(self.readings)
         return self._rows[self._first : middle], self._rows[middle:end]

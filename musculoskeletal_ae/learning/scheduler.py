@@ -2,7 +2,7 @@
 """Decides when an update of the network begins, and composes its job.
 
 An update begins when there are new data and enough samples, and the last update began at least
-`LEAST_INTERVAL` ago. Times are those of the caller's clock, which may jump backward.
+`LEAST_INTERVAL` ago. The caller supplies all times from its clock, which may jump backward.
 """
 
 import math

@@ -19,7 +19,7 @@ ASK_PERIOD = 1.0  # time after which a request that the estimator has not answer
 
 
 class AnomalyLatch:
-    """Follows `anomaly_detected` for one node."""
+    """Latches anomalies for one node, from messages of `anomaly_detected`."""
 
     def __init__(self, node: Node, follow: Callable[[bool], object]) -> None:
         """Begin without an anomaly; call `follow` with every confirmed change."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishers that an emulated, simulated or estimated arm shares: states, markers and frames.
 
-Markers show bones, muscles and names in RViz and Foxglove. Bones of the hardware are ivory and
-opaque, those of the estimate green, those of the simulator violet. Link poses go to /tf.
+Markers show bones, muscles and names in RViz and Foxglove. The bones of the hardware are ivory and
+opaque, the bones of the estimate green, and the bones of the simulator violet. Link poses are
+published on /tf.
 """
 
 from collections.abc import Callable
@@ -137,7 +138,7 @@ class Arm(Shell):
         self.sources.watch(f'{prefix}joint_states', f'{prefix}muscle_states')
         if joint_sensors:
             self._joints = self.create_publisher(JointState, f'{prefix}joint_states', RELIABLE)
-        # Motors may share a topic with the joints, as those of joint_state_broadcaster do.
+        # Motors may share a topic with the joints, for example if joint_state_broadcaster is used.
         self._motors = self._muscles = None
         if not prefix and self.motors.is_ros2_control:
             topic = self.motors.state_topic

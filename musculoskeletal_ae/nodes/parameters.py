@@ -40,7 +40,8 @@ FRAME_PREFIX = Parameter('', 'prefix of every published frame name, such as "lef
 MOTORS = parameters_of(MotorSettings)  # parameters of the interface to the motors
 #: parameters of every node
 SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX, **MOTORS}
-NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}  # of nodes that use a network
+#: parameters of every node that uses a network
+NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
 ALL_NODES = '/**'  # name of the section for all nodes in a parameter file
 
@@ -193,7 +194,7 @@ OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
 
 def check_names(names: Iterable[str], node: str = '') -> None:
-    """Check that each name is that of a parameter which a node reads.
+    """Check that a node reads a parameter of each name.
 
     Args:
         names: Names of parameters.

@@ -49,7 +49,8 @@ class Record(Node):
         self._early: dict[str, tuple[Topic, bytes, dict[str, int]]] = {}
         self.timeless = 0  # number of other messages that arrived before the first /clock
         self._sim_time = self.get_parameter('use_sim_time').value
-        self._subscriptions_of: dict[str, Subscription] = {}  # by the name in the interface
+        #: subscriptions, by the topic's name in the interface
+        self._subscriptions_of: dict[str, Subscription] = {}
         #: policy that a publisher does not offer as requested, by topic
         self._incompatible: dict[str, QoSPolicyKind] = {}
         self._topics = topics

@@ -175,7 +175,7 @@ class Shell(Node):
     # -- methods for subclasses to override -----------------------------------------------------
 
     def report(self) -> Report:
-        """Return the diagnostic report; by default that of the core, if there is one."""
+        """Return the diagnostic report; by default the report of the core, if there is one."""
         return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
 
     def clock_jumped_back(self) -> None:
@@ -309,7 +309,7 @@ class Shell(Node):
 
         Args:
             name: Name of the parameter.
-            setter: Takes the value; raises a MusculoskeletalError to refuse it.
+            setter: Uses the value it is called with, or raises a MusculoskeletalError to refuse it.
             prepare: Converts the value for `setter`, or returns None if there is nothing to do;
                 raises a MusculoskeletalError to refuse it.
         """
@@ -358,7 +358,7 @@ class Shell(Node):
     def follow_accepted_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Follow the network that the estimator has accepted; until then, use that of a file.
+        """Follow the network that the estimator has accepted; until then, use one from a file.
 
         Args:
             use: Puts a network to use.
@@ -443,7 +443,8 @@ class Shell(Node):
         Args:
             kind: Message type.
             topic: Name of the topic; `full_name` returns where its messages come from.
-            callback: Takes a message; raises a MusculoskeletalError to refuse it.
+            callback: Uses the message it is called with, or raises a MusculoskeletalError to
+                refuse it.
             qos: Quality of service; LATCHED topics can be resubscribed to.
         """
         wire, full, recording = self._wires.get(topic, topic), self.full_name(topic), self.recording
@@ -511,7 +512,7 @@ class Shell(Node):
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
     def follow_muscle_messages(self, follow: Callable[[Any], object]) -> None:
-        """Pass unchecked messages of muscle_states, or those of ros2_control, to `follow`."""
+        """Pass unchecked messages of muscle_states, or of the ros2_control robot, to `follow`."""
         kind = JointState if self.motors.is_ros2_control else Float64MultiArray
         self.listen(kind, STATES, lambda message: follow(self.motors.reading(message)), SENSOR)
 
@@ -566,7 +567,7 @@ class Shell(Node):
 
         Args:
             topic: Name of the topic.
-            follow: Takes θ.
+            follow: Function of θ.
             some: Whether a message may lack joints; those are NaN. Positions that are not finite
                 are then counted, and also NaN.
         """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Summarizes the state of a running arm from the reports of all nodes on /diagnostics.
 
-The level is that of the worst node; a required node that stops reporting is an error. Decisions
-compare identifiers only, such as the controller's values `mode` and `stop cause`. Sentences are
-shown unchanged.
+The level of the whole arm is the worst level of its nodes, and 'error' if a required node stops
+reporting. Decisions compare identifiers only, such as the controller's values `mode` and
+`stop cause`. Sentences are shown unchanged.
 """
 
 import contextlib
@@ -103,7 +103,7 @@ class Situation:
         self.detected = False
         self.samples = self.checkpoints = self.suspect = self.doing = ''
         self.distance = self.limit = math.nan
-        self._nodes: dict[str, Node] = {}  # by full name
+        self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._has_explored = False  # whether the arm explored before the last stop
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
         #: version of a node's other network and the number of reports that name it, by node

@@ -118,7 +118,8 @@ class Authorship:
 class Twins:
     """Detects a second node of the same name from its reports on /diagnostics.
 
-    Reports are searched as bytes, because deserializing those of all nodes takes 1 % of a core.
+    Reports are searched as bytes, because deserializing the reports of all nodes takes 1 % of a
+    core.
     """
 
     def __init__(self, name: str, identity: str) -> None:

@@ -50,7 +50,7 @@ class StopRecording:
 
         Args:
             resolve: Returns the full name of a topic.
-            directory: Where bags are written; None: ROS's log directory.
+            directory: Where bags are written; by default ROS's log directory.
             topics: The topics that may be kept, by name.
         """
         self._resolve, self._topics = resolve, topics

@@ -99,10 +99,11 @@ class View(Node):
         self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
         self.newest: dict[str, tuple[float, Any]] = {}  # arrival time [s] and value, by name
         self.subscribed: list[Any] = []  # subscriptions, while somebody views the page
-        self.texts_at = self.graph_at = self.reported_at = -math.inf  # [s] of the monotonic clock
+        #: monotonic time [s] of the last update of texts, check of the graph, and report
+        self.texts_at = self.graph_at = self.reported_at = -math.inf
         self.ruptured: list[str] = []
         self.payload = 0.0
-        self.reset_at = math.inf  # [s] of a reset whose outcome has not been shown yet
+        self.reset_at = math.inf  # time of a reset whose outcome has not been shown yet [s]
         #: service requests without a response: time sent [s], future, callback
         self.pending: list[tuple[float, Any, Callable[[Any], None]]] = []
         self.answers = SingleThreadedExecutor()
@@ -201,7 +202,7 @@ class View(Node):
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
 
     def _show(self, now: float) -> None:
-        """Take the newest messages and show them; `now` is monotonic time [s]."""
+        """Read the newest messages and show them; `now` is monotonic time [s]."""
         self._take()
         self.situation.tick()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}

@@ -3,7 +3,7 @@
 
 K. Kawaharazuka et al., "Musculoskeletal AutoEncoder: A Unified Online Acquisition Method of
 Intersensory Networks for State Estimation, Control, and Simulation of Musculoskeletal Humanoids",
-IEEE Robotics and Automation Letters, 2020. Equation numbers are those of the paper:
+IEEE Robotics and Automation Letters, 2020. Section and equation numbers are the paper's:
 
     §III-A          network.py            layers, units, masks
     §III-B  (2, 3)  initial_training.py   random states of the geometric model, L_initial, Adam

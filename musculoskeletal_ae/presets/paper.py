@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class PaperPreset:
     """The methods of the paper; see `Preset` for the meaning of each part.
 
-    `hidden` is the number of units of each hidden layer of the encoder. By default it is that of
-    the paper; `experiments/layers.py` varies it.
+    `hidden` is the number of units of each hidden layer of the encoder. The default is the paper's
+    choice; `experiments/layers.py` varies it.
     """
 
     name = 'paper'

@@ -80,7 +80,7 @@ class Finding(NamedTuple):
     kind: str  # an identifier, such as 'wrong_sign'
     message: str  # names the muscles and joints
     remedy: str = ''  # '' for 'not_held' and 'not_stiff': `remedies` computes theirs
-    joint: int = -1  # for 'not_held' and 'not_stiff': the joint that is weakest most often
+    joint: int = -1  # joint that is weakest most often, for 'not_held' and 'not_stiff'
 
 
 class Setting(NamedTuple):

@@ -60,7 +60,7 @@ class RoutePoint(NamedTuple):
     """A via point of the tendon."""
 
     link: str
-    xyz: Array  # in the link's frame [m], (3,)
+    xyz: Array  # position in the link's frame [m], (3,)
     divisor: float | None = None  # if set, a branch begins here, whose length counts 1/divisor
 
 
@@ -120,9 +120,9 @@ class RobotDescription:
 
     directory: Path
     urdf: str
-    model: pin.Model  # of the whole URDF
-    joints: tuple[str, ...]  # in the order of θ
-    muscles: tuple[str, ...]  # in the order of T and l
+    model: pin.Model  # model of the whole URDF
+    joints: tuple[str, ...]  # names of the joints, in the order of θ
+    muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
     routes: tuple[Route, ...]  # one for each muscle
     series_elastic: SeriesElastic
     #: K_stiff of muscle stiffness control [N/m], (M,); infinite for modules that follow positions
@@ -135,7 +135,7 @@ class RobotDescription:
     #: length that a stop pays out if tensions are unknown [m], (M,)
     release: Array
     end_effectors: tuple[str, ...]  # links; `end_effector` is the first
-    couplings: dict[str, Coupling]  # of joints that follow others
+    couplings: dict[str, Coupling]  # coupling of each joint that follows another one
     joint_elasticity: JointElasticity  # springs and dampers of the joints
     warnings: tuple[str, ...]  # accepted, but questionable entries
 

@@ -5,8 +5,8 @@ The pose of a revolute joint in its parent is its fixed placement times (Rodrigu
 
     exp([a]ₓ θ) = 1 + sin θ [a]ₓ + (1 − cos θ) [a]ₓ²
 
-and that of a prismatic joint its fixed placement times the translation θ a. Both are sums of
-constant matrices, so that all joints are computed by the same operation.
+and the pose of a prismatic joint is its fixed placement times the translation θ a. Both are sums of
+constant matrices with scalar factors, so that all joints are computed by the same operation.
 
 The position of a coupled joint is a polynomial of its master, q = Σ c_k θ_masterᵏ, usually a linear
 one. With A(θ) = ∂q/∂θ, pinocchio's gravity g, inertia M and Jacobian J of all joints of the tree
@@ -142,7 +142,13 @@ class JointTree:
     def __init__(
         self, model: pin.Model, joints: Sequence[str], couplings: Mapping[str, Coupling]
     ) -> None:
-        """Read the tree of a model whose joints are those of θ and those coupled to them."""
+        """Read the tree of a model.
+
+        Args:
+            model: The model, which has only the joints in `joints` and the joints coupled to them.
+            joints: The D joints of θ, in order.
+            couplings: Coupling of each coupled joint.
+        """
         count, ids = model.njoints, [model.getJointId(name) for name in joints]
 
         self.order = np.array([model.joints[i].idx_q for i in ids])

@@ -16,9 +16,9 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
-LARGEST = 1e8  # [SI units] of any number
-LONGEST_LIST = 1000  # muscles, points of a route, joints
-SHORTEST_AXIS = 1e-6  # a shorter vector defines no direction
+LARGEST = 1e8  # largest size of any number [SI units]
+LONGEST_LIST = 1000  # largest number of entries of a list: muscles, points of a route, joints
+SHORTEST_AXIS = 1e-6  # length below which a vector defines no direction
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
@@ -29,7 +29,7 @@ Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
 
 
 class ElasticEntry(Strict, frozen=True):
-    """Constants of a series elastic element; omitted ones have their defaults."""
+    """Constants of a series elastic element; omitted constants have their defaults."""
 
     force: Positive | UnsetType = UNSET
     rate: Positive | UnsetType = UNSET
@@ -37,7 +37,7 @@ class ElasticEntry(Strict, frozen=True):
 
 
 class TensionEntry(Strict, frozen=True):
-    """Tensions of a muscle [N]; omitted ones have their defaults."""
+    """Tensions of a muscle [N]; omitted tensions have their defaults."""
 
     bias: Positive | UnsetType = UNSET
     limit: Positive | UnsetType = UNSET
@@ -79,7 +79,7 @@ class RouteEntry(Strict, frozen=True):
         axis = np.array(self.axis)
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
-            raise ValueError(f'axis: expected a direction, got {list(self.axis)}')
+            raise ValueError(f'axis: expected a nonzero vector, got {list(self.axis)}')
         if self.side is not None and self.side_link in (None, self.link):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))
@@ -132,11 +132,11 @@ class CouplingEntry(Strict, frozen=True):
 
 
 class JointElasticityEntry(Strict, frozen=True):
-    """Spring and damper of a joint; where it slides, per metre instead of per radian."""
+    """Spring and damper of a joint; for a prismatic joint per metre instead of per radian."""
 
     joint: Name
     stiffness: NotNegative = 0.0  # [N·m/rad]
-    rest_angle: Number = 0.0  # at which the spring exerts no torque [rad]
+    rest_angle: Number = 0.0  # angle at which the spring exerts no torque [rad]
     damping: NotNegative = 0.0  # [N·m·s/rad]
     #: terms of the stiffness with other joints [N·m/rad]
     coupled: Annotated[dict[Name, Number], Meta(max_length=LONGEST_LIST)] = field(
@@ -153,8 +153,8 @@ class MuscleFile(Strict, frozen=True):
     actuation: Literal['stiffness', 'position'] = 'stiffness'
     tension_source: Literal['sensor', 'none'] = 'sensor'
     stiffness: Positive | UnsetType = UNSET  # K_stiff of muscle stiffness control [N/m]
-    speed: Positive | UnsetType = UNSET  # of a module that follows positions [m/s]
-    release: Positive | UnsetType = UNSET  # that it pays out if no tension is known [m]
+    speed: Positive | UnsetType = UNSET  # speed of a module that follows positions [m/s]
+    release: Positive | UnsetType = UNSET  # length that a stop pays out without a tension [m]
     tension: TensionEntry = TensionEntry()
     end_effector: Name | None = None
     end_effectors: Names | None = None

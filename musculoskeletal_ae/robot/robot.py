@@ -130,7 +130,7 @@ class Robot:
     def assumed_tension(self) -> Array:
         """Tension that models and plans use where it is not known [N], (M,).
 
-        It is that of a well-tensed arm, by which `check_robot` judges.
+        It is the tension of a well-tensed arm, from which `check_robot` starts.
         """
         whole = self.description.tension
         return np.maximum(whole.bias, DESIRED_SHARE * whole.limit)
@@ -139,7 +139,7 @@ class Robot:
     def release(self) -> Array:
         """Length that a stop pays out where no tension is known [m], (M,).
 
-        By default it is what takes a tension from T_limit to T_bias in the same posture.
+        By default it is the length that lowers a tension from T_limit to T_bias in one posture.
         """
         whole = self.description.tension
         usual = self.elongation(whole.limit) - self.elongation(whole.bias)
@@ -174,7 +174,7 @@ class Robot:
         return reduced
 
     def with_elasticity(self, elasticity: JointElasticity | None) -> Robot:
-        """Return a copy with learned springs and dampers; None: those of the description.
+        """Return a copy with learned springs and dampers, or with the described ones for None.
 
         The copy shares the geometry with the original.
         """

@@ -41,7 +41,7 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
         robot: The robot.
         reach: Largest distance by which a via point may move [m].
         postures: Number of random postures in which each candidate is evaluated.
-        seed: Random seed. The postures differ from those of a check with the same seed.
+        seed: Random seed. The postures differ from the postures of a check with the same seed.
 
     Returns:
         The change d [m] (P, 3), in the frames of the links, and the measure of `lacking` before

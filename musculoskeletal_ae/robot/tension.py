@@ -98,7 +98,7 @@ def holding_tension(
         robot: The robot.
         theta: θ [rad], (D,).
         desired: Of all such tensions, the one nearest to this is returned [N], scalar or (M,).
-        jacobian: G [m/rad], (M, D); by default that of the geometric model.
+        jacobian: G [m/rad], (M, D); by default computed by the geometric model.
 
     Raises:
         InfeasibleError: If no such tension exists, or if an entry is not finite.

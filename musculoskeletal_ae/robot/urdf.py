@@ -22,7 +22,7 @@ from musculoskeletal_ae.robot.joint_tree import Coupling
 MOST_PARTS = 2000
 #: largest depth of nested elements, which the parser of MuJoCo and pinocchio does not exceed either
 DEEPEST = 500
-#: elements below <robot> that only a preprocessor understands, besides those of xacro's namespace
+#: elements below <robot> that only a preprocessor understands, besides xacro's own elements
 PREPROCESSED = 'include', 'macro', 'property'
 LARGEST = 1e6  # largest size of any number except efforts and velocities [SI units]
 

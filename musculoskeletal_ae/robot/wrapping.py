@@ -12,7 +12,7 @@ On a cylinder the tendon also advances evenly along the axis, which gives √(le
 - With a `side`, it passes the object on that side.
 - A side *inside* the object makes the object a ring through which the tendon runs.
 
-The choice of tangents is that of MuJoCo's `mju_wrap`, so that imported models keep their lengths.
+The tangents are chosen as by MuJoCo's `mju_wrap`, so that imported models keep their lengths.
 Where the tendon lifts off, the arc has length zero and the tangents lie on the straight line.
 Length and moment arm are therefore continuous there. A point on the rim of the object is attached
 to it: within RIM · r of the surface it counts as outside, where MuJoCo lets rounding decide.
@@ -243,7 +243,7 @@ def wrapped_segment(
         v = cross(axis, u)
     else:
         u = _unit(a)
-        normal = cross(u, _unit(b))  # of unit vectors, because ends may be close to the centre
+        normal = cross(u, _unit(b))  # uses unit vectors, because ends may be close to the centre
         if dot(normal, normal) < 1e-18:
             # The line passes through the centre: use the plane of the side, or any plane.
             normal = cross(a, side) if sided else _beside(u)

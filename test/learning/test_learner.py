@@ -67,7 +67,7 @@ def between(start, end, count):
 class Arm:
     """An arm that rests in one posture after another, on a simulated clock."""
 
-    MOVES = 10  # messages on the way from one to the next
+    MOVES = 10  # number of messages on the way between two postures
 
     def __init__(self, learner, stage, time=0.0):
         self.learner, self.stage, self.time, self.published = learner, stage, time, []
@@ -120,7 +120,7 @@ def test_two_centimetres_of_a_prismatic_joint_are_another_posture(tmp_path):
     learner, pull = Learner(robot), np.full(robot.muscle_count, 60.0)
     theta = 0.5 * (robot.lower + robot.upper)
     theta[-1], length = 0.01, robot.muscle_lengths(theta, pull)
-    for k in range(1200):  # rest, slow motion of 5 mm/s that the tendons do not show, and rest
+    for k in range(1200):  # rest, then a slow motion of 5 mm/s that no length shows, then rest
         theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (400 <= k < 800)]
         learner.step(DT * k, theta, pull, length)
     angles = [sample.theta[-1] for sample in learner.samples.samples]
@@ -238,7 +238,7 @@ def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learn
     learner.poll(0.5)
     assert not calibrated(learner)
     assert not any(known[2] for known in learner.samples.known)
-    learner.poll(1.5)  # begun after the change: its statistics are of the arm as it is
+    learner.poll(1.5)  # this update began after the change, so its statistics describe the arm
     assert not learner.trainer.jobs[-1].statistics_hold
     assert calibrated(learner)
 
@@ -290,7 +290,7 @@ def test_a_replaced_network_drops_samples_and_continues_the_version_count(learne
     learner.replace(initial)
     assert len(learner.samples) == 0
     assert learner.mae.version == version + 1
-    assert learner.poll(0.0) == learner.checkpoint  # at once
+    assert learner.poll(0.0) == learner.checkpoint  # published without delay
     learner.replace(None)
     assert learner.checkpoint is None
     learner.accept(stage.sample())
@@ -336,7 +336,7 @@ def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial
             assert np.isfinite(sample.theta).tolist() == [False, True]
 
 
-UP = np.array([0.0, 0.0, 9.8])  # [m/s²] of an accelerometer that hangs as its link does
+UP = np.array([0.0, 0.0, 9.8])  # reading at rest if the link hangs down [m/s²]
 
 
 def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_received_in(
@@ -391,12 +391,12 @@ def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stag
     learner.trainer.released = True
     published = learner.poll(4.0)
     assert learner.trainer.ready and learner.updates == updates
-    if not goes_back:  # to the previous network, as after an anomaly
+    if not goes_back:  # after an anomaly the learner goes back to the previous network
         assert published is None and learner.checkpoint == checkpoint
     stop(learner, False)
     jobs = len(learner.trainer.jobs)
     learner.poll(6.0)
-    assert len(learner.trainer.jobs) == jobs + 1  # the sample is learned then
+    assert len(learner.trainer.jobs) == jobs + 1  # the sample is learned after the stop
 
 
 NAN = np.nan

@@ -28,7 +28,7 @@ class Resting(Stage):
         tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
         direction = self.rng.choice([-1.0, 1.0], tension.shape)
         steps = 1e-4 * np.eye(robot.joint_count)
-        for _ in range(3):  # the nearest tensions that hold the arm
+        for _ in range(3):  # iterate to the nearest tensions that hold the arm
             slope = np.stack(
                 [
                     body.lengths(theta + step, tension, direction)[0]
@@ -135,7 +135,7 @@ def test_measured_positions_of_a_prismatic_joint_stay_where_they_were_measured(t
     for seed in range(4):
         observed = Resting(drawn_body(robot, 7, seed, scale=0.7), seed=9).observations(40)
         off.append(fit_body(CalibratedBody(robot), observed).theta[:, -1] - observed.theta[:, -1])
-    # 0.2 mm; 0.7 mm if the prior of sensor offsets were 2° interpreted as metres.
+    # Measured: 0.2 mm. It would be 0.7 mm if the prior of 2° were applied as metres.
     assert np.abs(off).mean() < 4e-4
 
 
@@ -164,7 +164,7 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
 
 def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_samples(arm26):
     inside = []
-    for seed in (0, 2, 4):  # the bodies with the largest errors
+    for seed in (0, 2, 4):  # seeds of the bodies with the largest errors
         resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
         observed, test = resting.observations(60), resting.observations(40)
         body = CalibratedBody(arm26)
@@ -177,4 +177,4 @@ def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_sample
         covariance = estimate_covariance(exact, body, fit, tension, seed, None)
         error = estimate(test.end_tension(body.frictions()), test.length) - test.theta
         inside.append((ellipsoids(covariance, error) <= 1.0).mean())
-    assert np.mean(inside) > 0.65  # 0.76; counted sample by sample 0.55
+    assert np.mean(inside) > 0.65  # measured: 0.76; 0.55 if samples counted as independent

@@ -238,7 +238,8 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     for _ in range(4):
         theta, *parts, spread, gravity, _, _ = stage.sample()
         measured = theta, *(part[kept] for part in parts), spread, gravity
-        store.add(Sample(*measured, isolated=(added,)))  # the muscle after the added one
+        # This index means the muscle after the added one.
+        store.add(Sample(*measured, isolated=(added,)))
     store.forget(0, newest=1)
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
@@ -253,7 +254,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
         np.testing.assert_array_equal(np.array(loaded.known)[:, kept], store.known)
         assert not np.array(loaded.known)[:, added].any()
         assert arm26.muscles[added] in learner.report().values['saved state not used']
-        # They cause as many updates as at first; then the learner waits for new samples.
+        # The samples cause as many updates as when they were new. Then the learner waits.
         for now in range(10):
             learner.poll(2.0 * now)
         assert learner.updates == 4
@@ -350,7 +351,7 @@ def test_a_directory_that_became_read_only_is_an_error_until_it_is_not(begun, st
 
 def test_a_directory_that_is_deleted_is_noticed_at_once_and_made_again(begun, stage, tmp_path):
     learner = begun()
-    accept(learner, stage, 1)  # too few for an update
+    accept(learner, stage, 1)  # one sample is not enough for an update
     shutil.rmtree(tmp_path / 'state')
     learner.poll(0.0)
     assert learner.report().level == 'error'
@@ -395,7 +396,7 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
     with monkeypatch.context() as patch:
         patch.setattr(CheckpointValidator, 'check', refuse)
         messages = []
-        for _ in range(2):  # no network replaces the state
+        for _ in range(2):  # the second start finds no network to reject
             with closing(
                 Learner(arm26, trainer=IdleTrainer, directory=tmp_path / 'state')
             ) as again:
@@ -405,7 +406,7 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
     assert messages[1] == ''
     assert len(list((tmp_path / 'state').glob('backup-*'))) == 1
     assert_same(read_backup(tmp_path / 'state', arm26, tmp_path / 'scratch')[0], before.samples)
-    learner = begun()  # learns of them again
+    learner = begun()  # learns from the saved samples again
     for now in range(10):
         learner.poll(2.0 * now)
     assert learner.updates == 3

@@ -15,7 +15,8 @@ from musculoskeletal_ae.learning.trainer import Trainer, TrainerProcess
 
 from .conftest import job
 
-PATIENCE = 300.0  # [s] until a test fails: a busy machine takes minutes to start a process
+# Time after which a test fails [s]; a busy machine starts a process within minutes.
+PATIENCE = 300.0
 
 
 @pytest.fixture
@@ -74,7 +75,7 @@ def test_a_training_process_that_hangs_is_replaced_and_its_job_repeated(
     with monkeypatch.context() as patch:
         patch.setattr(trainers, 'PATIENCE', 0.3)
         process._patience = 0.3
-        # More than the capacity of a pipe, so that sending hangs as well.
+        # The job exceeds the capacity of a pipe, so that sending it hangs as well.
         process.submit(job(stage.store(300), steps=1))
         assert answer(process) is None
     assert 'did not answer in time' in process.trouble

@@ -74,7 +74,7 @@ def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
     stage = CompliantStage(other_body)
     store = stage.store(30)
     observed, messages = (stage.store(400).observations() for _ in range(2))
-    # Over eight bodies and streams 0.91 with a standard deviation of 0.02.
+    # Measured over eight bodies and streams: a ratio of 0.91, with a standard deviation of 0.02.
     assert learned(learned=messages) < 0.98 * learned()
 
 
@@ -84,7 +84,7 @@ def test_motion_samples_that_contradict_the_body_model_are_not_learned(arm26, in
         return update.mae.encoder[0][0]
 
     store, wrong = stage.store(30), stage.store(300).observations()
-    wrong.theta[:, 0] += 0.3  # as read by a joint sensor that slipped
+    wrong.theta[:, 0] += 0.3  # a joint sensor slipped by this angle [rad]
     np.testing.assert_array_equal(learned(learned=wrong), learned())
 
 
@@ -102,7 +102,8 @@ def test_the_covariance_covers_95_percent_of_validation_messages(arm26, initial,
 
     store = stage.store(30)
     assert inside() < 0.8
-    # Over eight drawn bodies: 0.46 to 0.59, and 0.94 with a standard deviation of 0.02.
+    # Measured over eight drawn bodies: 0.46 to 0.59 without validation messages, and 0.94 with them
+    # (standard deviation 0.02).
     assert inside(judging=judging) == pytest.approx(0.95, abs=0.07)
 
 
@@ -111,7 +112,8 @@ def test_a_changed_muscle_is_detected(arm26, initial, stage):
     assert updater.update(job(store, steps=1)).changed == ()
     for _ in range(5):
         sample = stage.sample()
-        shift = 0.02 * (np.arange(6) == 3)  # in all of 20 drawn bodies; at 0.01 in two of three
+        # Found in all of 20 drawn bodies; a shift of 0.01 m in two of three.
+        shift = 0.02 * (np.arange(6) == 3)
         store.add(sample._replace(length=sample.length + shift))
     assert updater.update(job(store, steps=1)).changed == ((3, 5),)
 
@@ -234,7 +236,7 @@ def test_the_covariance_of_a_network_covers_its_errors_and_is_saved(arm26, learn
     error = mae.estimate(tension, length).theta - theta
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
     inside = (distance <= chi2.ppf(0.95, 2)).mean()
-    assert inside > 0.8  # a frictionless body from the same distribution as the prior
+    assert inside > 0.8  # the body has no friction, and its errors follow the prior
     spread = np.sqrt(np.diag(mae.covariance))
     assert (spread < 5.0 * error.std(axis=0)).all()
     again = checkpoint.from_bytes(checkpoint.to_bytes(mae), arm26)

@@ -12,7 +12,7 @@ from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
-POSTURE = 1.0 + MARGIN + 0.5  # [s] of rest after which there is a sample
+POSTURE = 1.0 + MARGIN + 0.5  # duration of a rest that gives a sample [s]
 
 
 class ArmWithOffsets(Arm):
@@ -64,7 +64,7 @@ def test_false_zeros_are_not_believed_and_cost_nothing(learner, arm, false):
     assert 'length offsets disagree' in report.message
     assert 'estimator/zero' in report.message
     use(learner, np.zeros(6), known=False)
-    use(learner, np.full(6, 0.001))  # as determined by estimator/zero
+    use(learner, np.full(6, 0.001))  # the result of estimator/zero
     arm.rest(2.0 * POSTURE)
     arm.rest(POSTURE)
     assert len(learner.samples) >= 3
@@ -125,7 +125,7 @@ def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
     if is_interrupted:  # a power cycle may have changed the offsets
         history.interrupt()
     history.use(np.zeros(6))
-    assert history.corrected == corrected  # the first two also had wrong offsets
+    assert history.corrected == corrected  # includes the first two samples
     if not is_interrupted:
         for sample, expected in zip(store.samples, true, strict=True):
             np.testing.assert_allclose(sample.length, expected.length)

@@ -25,7 +25,7 @@ def diagnostics(
 
 def test_before_the_first_sample_a_hint_explains_why_the_error_may_rise():
     situation = Situation('/left')
-    assert situation.hint() == ''  # there is no learner
+    assert situation.hint() == ''  # no learner has reported
     situation.diagnosed(diagnostics('/left/learner', samples='0'))
     assert 'error may rise' in situation.hint()
     situation.diagnosed(diagnostics('/left/learner', samples='3', checkpoints='2'))
@@ -93,7 +93,7 @@ def test_a_stop_of_this_arm_alone_is_shown_with_its_remedy():
     situation.diagnosed(stopped(StopCause.OPERATOR))
     assert situation.trouble() == f'STOPPED: controller/stop was called {RESET}'
     situation.diagnosed(diagnostics('/left/controller', mode='paused', stop_cause='stale_estimate'))
-    assert situation.trouble() == ''  # it goes on by itself
+    assert situation.trouble() == ''  # the controller resumes by itself
 
 
 @pytest.mark.parametrize('cause', StopCause)
@@ -109,7 +109,7 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps'}
     situation.diagnosed(diagnostics('/left/estimator', **suspect, d='12.5', d_limit='9.0'))
     assert (situation.distance, situation.limit) == (12.5, 9.0)
-    assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # without a controller
+    assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # no controller has reported
     situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
     situation.diagnosed(stopped(StopCause.ANOMALY))
     assert situation.trouble() == (
@@ -148,7 +148,7 @@ def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seco
                 diagnostics(f'/{node}', mode='holding', checkpoint_version=str(version))
             )
 
-    for version in range(10):  # the controller follows a moment later
+    for version in range(10):  # the controller uses each version a report later
         second(version, max(version - 1, 0))
         assert situation.trouble() == ''
     for _ in range(3):
@@ -198,7 +198,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
 
     for _ in range(3):
         assert second('sim', 'learner', 'view') == ('ok', '')
-    assert second('sim', lasting=60.0)[0] == 'ok'  # the machine was suspended
+    assert second('sim', lasting=60.0)[0] == 'ok'  # a suspended machine is no silence
     assert second('sim')[0] == 'error'
     level, trouble = second('sim')
     assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s; ')
@@ -206,7 +206,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert second('sim', 'learner') == ('ok', '')
     situation.diagnosed(diagnostics('/left/second', 'wrong', DiagnosticStatus.ERROR))
     assert second('sim', 'learner')[1] == '/left/second: wrong'
-    for _ in range(6):  # it has ended, and does not belong to the arm
+    for _ in range(6):  # /left/second has ended and is not a node of the arm
         second('sim', 'learner')
     assert second('sim', 'learner') == ('ok', '')
 

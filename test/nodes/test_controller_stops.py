@@ -119,7 +119,7 @@ def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_takes_over(mo
     arm.controller = arm.start_controller()
     arm.says('no target')
 
-    def heard():  # the publisher may have discovered it late
+    def heard():  # repeat, because discovery may be late
         arm.target(THERE)
         return arm.controller.core.target_state.theta is not None
 
@@ -176,6 +176,6 @@ def test_a_killed_learner_does_not_disturb_a_motion(moving):
     arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'a movement under way')
     arm.kill(learner)
     arm.goes_to(THERE)
-    for node in ('controller', 'estimator', 'hardware_emulator'):  # after it has come to rest
+    for node in ('controller', 'estimator', 'hardware_emulator'):  # once the arm is at rest
         arm.graph.wait(lambda node=node: arm.state(node).level == 'ok', f'{node} to be well')
     arm.never_jumped(before)

@@ -46,6 +46,7 @@ def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(gra
     graph.wait(lambda: not graph.set_parameter('controller', 'method', 'float')[0], 'a refusal')
     done, reason = graph.set_parameter('controller', 'method', 'tension')
     assert not done and 'follows muscle_length_command only; legal: geometric, first' in reason
-    assert core.settings.method in ('proposed', 'float')  # before the subscription was seen
+    # Float if set before the subscription was discovered.
+    assert core.settings.method in ('proposed', 'float')
     graph.listen(Float64MultiArray, 'muscle_tension_command')
     graph.wait(lambda: graph.set_parameter('controller', 'method', 'tension')[0], 'no refusal')

@@ -89,7 +89,7 @@ def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimato
         'not finite': nan,
         'wrong length': Float64MultiArray(data=[0.0] * 17),
         'empty': Float64MultiArray(),
-        'oversized': Float64MultiArray(data=[0.0] * 1_300_000),  # 10 MB
+        'oversized': Float64MultiArray(data=[0.0] * 1_300_000),  # 10 MB of data
         'wrong layout': shifted,
     }
     for reason, message in cases.items():

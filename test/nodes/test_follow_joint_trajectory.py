@@ -68,7 +68,7 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     desired = np.array([feedback.desired.positions for feedback in first.feedback])
     distance = np.linalg.norm(desired - HERE, axis=1)
     assert (np.diff(distance) <= 0.0).all() and distance[-1] < distance[0]
-    # A new one replaces it.
+    # A new goal replaces an active one.
     second = send(trajectory(arm, THERE, 20))
     arm.graph.wait(lambda: second.feedback, 'feedback')
     third = send(trajectory(arm, THERE, 20))
@@ -77,7 +77,7 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     third.cancel()
     assert third.ended()[0] == GoalStatus.STATUS_CANCELED
     arm.says('holding')
-    # A goal that the arm cannot follow.
+    # Send a goal that the arm cannot follow.
     tolerance = JointTolerance(name=arm.robot.joints[0], position=1e-6)
     fourth = send(trajectory(arm, THERE), path_tolerance=[tolerance])
     status, result = fourth.ended()
@@ -111,7 +111,7 @@ class FakeServer(Waitable):
         node.add_waitable(self)
 
     def is_ready(self, _wait_set):
-        return self.pending  # like a request that waits to be taken
+        return self.pending  # ready until the request is taken
 
     def take_data(self):
         self.pending = False

@@ -68,7 +68,7 @@ def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
 
 def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trained):
     graph, names = arm.graph, list(arm.robot.muscles[1:3])
-    assert not graph.call(Trigger, 'estimator/isolate').success  # no muscle is named
+    assert not graph.call(Trigger, 'estimator/isolate').success  # isolate_muscles names no muscle
     done, reason = graph.set_parameter('estimator', 'isolate_muscles', ['tail'])
     assert not done
     assert 'legal: ' in reason

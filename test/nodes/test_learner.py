@@ -27,9 +27,9 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
-# Faster than on a robot, so that a test takes seconds.
+# Shorter rests and fewer steps than on a robot, so that a test takes seconds.
 QUICK = {'rest_time': 0.4, 'update_steps': 20}
-REST, MOVE = 0.8, 0.1  # [s] in one posture, and from one to the next
+REST, MOVE = 0.8, 0.1  # time in one posture, and between two [s]
 DT = 0.01
 
 
@@ -247,7 +247,7 @@ def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, gra
     assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
     assert not any(known[1] for known in learner.node.core.samples.known)
-    # The service discards what arrived since then.
+    # The service forgets the muscle in samples that arrived after the parameter was set.
     samples = learner.samples
     learner.learn(lambda: learner.samples > samples, 'a sample')
     assert any(known[1] for known in learner.node.core.samples.known)
@@ -283,7 +283,7 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
     assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
     assert not together(fresh=True, checkpoint='').successful
     assert learner.samples >= 2 and all(known.all() for known in core.samples.known)
-    # One start, and one backup of the earlier state.
+    # The three parameters together cause one start and one backup of the earlier state.
     assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
     assert learner.samples == 0
     assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1.state']
@@ -414,7 +414,7 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
     shutil.rmtree(state)
     before = len(levels())
     graph.wait(lambda: DiagnosticStatus.ERROR in levels()[before:], 'the error')
-    # One report that may have been due, and one that the loss causes.
+    # One regular report may come first. The next one is caused by the loss.
     assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
     learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
     learner.learn(lambda: levels()[-1] != DiagnosticStatus.ERROR, 'the end of the error')

@@ -48,7 +48,7 @@ def test_a_trajectory_is_followed_and_its_state_published_and_a_wrong_one_moves_
     since = state.points[0].time_from_start
     assert since.sec + 1e-9 * since.nanosec > 0.9
     arm.never_jumped()
-    # One joint alone, then a message without points: the arm holds.
+    # Move one joint only. Then send a message without points, after which the arm holds.
     publisher.publish(trajectory(arm, HERE[1:], 20, [robot.joints[1]]))
     arm.says('following a trajectory')
     publisher.publish(JointTrajectory())

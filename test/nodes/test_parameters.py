@@ -79,7 +79,7 @@ def test_every_parameter_that_is_settable_is_followed(graph, monkeypatch, tmp_pa
     monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
     node = graph.host(kind, robot='arm26')
     settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
-    assert settable - {'stop_recordings'} == set(node._setters)  # it is evaluated at every stop
+    assert settable - {'stop_recordings'} == set(node._setters)  # read at every stop instead
 
 
 @pytest.mark.parametrize(

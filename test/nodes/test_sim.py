@@ -117,7 +117,7 @@ def test_joints_are_forced_and_released(arm, core):
     for names, extra, reason in (
         (['knee'], {}, 'unknown joint'),
         (['elbow'] * 2, {}, 'duplicate joint'),
-        ([], {'effort': [1.0]}, 'empty'),  # no joint is released
+        ([], {'effort': [1.0]}, 'empty'),  # must not release the joints
     ):
         force.publish(JointState(name=names, position=[0.0] * len(names), **extra))
         arm.wait(lambda reason=reason: reason in str(arm.report('sim').values), reason)
@@ -174,7 +174,7 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
     common = {'robot': 'arm26', 'checkpoint': trained_file}
     graph.host(Sim, **common, as_robot=True)
     graph.host(Estimator, **common)
-    # Avoids stops because of a loaded machine.
+    # A large max_age avoids stops on a loaded machine.
     graph.host(Controller, **common, first_duration=1.0, max_age=1.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
@@ -197,7 +197,7 @@ def test_the_simulator_as_robot_keeps_tension_in_isolated_muscles(graph, arm26, 
     graph.next('muscle_states', 2)
     _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
-    assert shell.longest_step == 1.0  # shorter steps would be too slow at 2 Hz
+    assert shell.longest_step == 1.0  # two periods at 2 Hz
 
 
 def test_the_simulator_as_robot_does_not_use_length_offsets_of_others(graph, trained_file):

@@ -90,7 +90,8 @@ def test_an_anomaly_cancels_the_validation_of_a_network(arm, trained):
 def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_nodes(
     arm, trained, monkeypatch
 ):
-    monkeypatch.setattr(checkpoint_validation, 'PROOF', 1e6)  # however slow the machine is
+    # Not proven in time, however slow the machine is.
+    monkeypatch.setattr(checkpoint_validation, 'PROOF', 1e6)
     nodes = arm.estimator, arm.controller
     first = trained['default'].version
     network = replace(trained['paper'], version=first + 1)
@@ -148,16 +149,16 @@ def test_impossible_lengths_stop_the_arm_with_their_cause_and_without_a_jump(arm
     arm.goes_to(HERE)
     done, _ = arm.graph.set_parameter('hardware_emulator', 'length_offset', [0.15])
     assert done
-    # A jump, or implausible lengths.
+    # The cause is a jump of a length, or implausible lengths.
     arm.says('stopped: muscle_states are implausible: length ')
     assert any(reason.startswith('muscle_states: length ') for reason in arm.estimator.rejected)
     arm.never_jumped()
-    # Until the stop, which may be late, the modules follow MSC.
+    # The stop may be late. Until then the modules follow MSC, so the arm moves a little.
     assert np.linalg.norm(arm.posture() - HERE) < 0.7
 
 
 def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_file):
-    pace = 0.3  # seconds of /clock in a second
+    pace = 0.3  # simulated seconds per second
     sent = graph.listen(Float64MultiArray, 'muscle_length_command', 1000)
     node = graph.host(
         Controller,
@@ -192,7 +193,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         graph.spin(0.01)
         assert time.monotonic() - started < 60.0
     assert node.core.supervisor.is_running
-    # With the steady clock it would end after 0.6 s of simulated time.
+    # By the steady clock, the trajectory would end after 0.6 s of simulated time.
     assert follower.trajectory.duration >= 2.0
     assert done_at - begun >= 0.9 * follower.trajectory.duration
     assert len(sent) > 0

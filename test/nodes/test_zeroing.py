@@ -23,7 +23,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, faults=['unzeroed'])
     hardware.arm.step(10.0)
     node = graph.host(Estimator, **common)
-    # Tolerates late messages on a loaded machine.
+    # A large max_age tolerates late messages on a loaded machine.
     controller = graph.host(Controller, **common, max_age=10.0)
     learner = graph.host(Learner, robot='arm26', state_directory=str(tmp_path))
     if stands:
@@ -40,7 +40,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     offset = hardware.arm.faults.zero
     assert np.abs(offset).min() > 0.05
     for other in nodes:
-        # The network knows the geometric model only.
+        # The tolerance is large, because the network has learned only the geometric model.
         np.testing.assert_allclose(other.body.offsets.offset, offset, atol=0.03)
         assert not any('length' in reason for reason in other.rejected)
     assert controller.core.stream.body.offsets.known and controller.core.supervisor.is_running
@@ -69,7 +69,7 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
 
     reported(0.05, 0.0)
     graph.wait(lambda: controller.body.offsets.offset.all(), 'the zeros')
-    reported(0.0, 0.0)  # like a restarted estimator
+    reported(0.0, 0.0)  # a restarted estimator publishes these
     known(False)
     reported(0.0, 0.0)
     graph.spin(0.3)

@@ -87,7 +87,8 @@ def test_the_shipped_arms_are_sound_with_margin(name, seed):
     assert result.stiff.mean() >= 0.98
     singular = np.linalg.svd(result.moment_arms, compute_uv=False)[:, -1]
     assert np.percentile(singular, 5) >= 0.03
-    longest = 0.1 if name == 'musashi_upper_body' else 0.07  # that of the neck
+    # The longest moment arm of the whole body is at the neck.
+    longest = 0.1 if name == 'musashi_upper_body' else 0.07
     assert np.abs(result.moment_arms).max() <= longest
 
 
@@ -135,7 +136,7 @@ def test_a_prismatic_joint_has_the_stiffness_of_a_pinion_that_moves_it(tmp_path)
     robot = Robot.load(write_robot(tmp_path, slider=True, stiffness=2000.0))
     result = check_robot(robot, 20)
     held = result.held
-    assert held.any()  # the premise
+    assert held.any()  # premise: some postures are held
     theta, tension = result.setting.theta[held], result.tension[held]
     raw, k = robot.routes.muscle_jacobian, robot.muscle_stiffness(theta, tension)
     mixed = joint_stiffness(raw(theta), muscle_hessian(raw, theta), k, tension)
@@ -475,7 +476,7 @@ def test_a_remedy_written_into_muscles_yaml_does_what_it_says(tmp_path, case):
         changed = {key: dict(v) if isinstance(v, dict) else v for key, v in top.items()}
         changes = number.findall(line)
         if len(changes) != line.split('→')[0].count(',') + 1:
-            continue  # mass, moment arms and limits are not in muscles.yaml
+            continue  # changes of mass, moment arms and limits are not in muscles.yaml
         for owner, name, value in changes:
             (changed.setdefault(owner, {}) if owner else changed)[name] = float(value)
         changed.setdefault('tension', {})['max'] = 2000.0
@@ -492,7 +493,7 @@ def test_a_limit_is_no_remedy_where_no_limit_holds_the_arm(tmp_path):
     directory = change(write_robot(tmp_path), drop_straighteners)
     lines, _ = remedies_of(directory, 'not_held')
     change(directory, lambda d: d.update(tension={'limit': 10000.0, 'max': 10000.0}))
-    assert check_robot(Robot.load(directory), 60).held.mean() < 0.95  # the premise
+    assert check_robot(Robot.load(directory), 60).held.mean() < 0.95  # premise: not held
     assert all('not enough' in line for line in lines[:-1])
     assert lines[-1] == 'other routes may help: see --suggest'
 
@@ -511,7 +512,7 @@ def test_stiffness_is_no_remedy_if_the_elastic_element_is_too_soft(tmp_path):
     directory = write_robot(tmp_path, series_elastic=SOFT)
     lines, _ = remedies_of(directory, 'not_stiff')
     change(directory, lambda d: d.update(stiffness=1e8))
-    assert 'not_stiff' in kinds(directory)  # the premise
+    assert 'not_stiff' in kinds(directory)  # premise: even stiff modules are not enough
     (remedy,) = lines
     assert remedy.startswith('series_elastic.rate ')
 
@@ -525,7 +526,7 @@ def test_changes_that_suffice_only_together_are_reported_together(tmp_path):
 def test_a_negative_stiffness_is_called_unstable(tmp_path, capsys):
     directory = write_robot(tmp_path, stiffness=300.0)
     lowest = np.nanmin(check_robot(Robot.load(directory)).stiffness)
-    assert lowest < 0.0  # the premise
+    assert lowest < 0.0  # premise: a posture is unstable
     _, printed, _ = verdict(capsys, directory)
     assert 'fault: the arm is unstable in' in printed
     assert f'down to {lowest:.1f} N·m/rad' in printed

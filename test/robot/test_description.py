@@ -47,7 +47,7 @@ ROUTE = ('muscles', 0, 'route')
 POINT = (*ROUTE, 1)
 AT_POINT = '$.muscles[0].route[1]'
 
-#: an edit of muscles.yaml, and what the error names: the place, the value, what is legal
+#: edits of muscles.yaml, and texts of the error: the place, the value and the legal values
 BAD = {
     'unknown key': (put(['sped'], 1.0), ["$: unknown key 'sped'", 'joints, muscles']),
     'unknown key within': (put([*POINT, 'frame'], 1), [AT_POINT, "'frame'", 'link, xyz']),

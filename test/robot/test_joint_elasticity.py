@@ -39,7 +39,8 @@ from musculoskeletal_ae.simulation.load import Load
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.tools.robot_report import summary
 
-#: a spring opposes the bender, and lift and swing are coupled by a soft spring
+#: entries of joint_elasticity: a spring that opposes the bender, and a soft one that couples lift
+#: and swing
 SPRINGS = [
     {'joint': 'bend', 'stiffness': 9.0, 'rest_angle': 0.3, 'damping': 0.4},
     {'joint': 'lift', 'stiffness': 3.0, 'rest_angle': 0.1, 'coupled': {'swing': -1.5}},
@@ -276,7 +277,8 @@ def test_an_update_publishes_learned_springs_and_control_uses_them(springy):
         for torque in (core.robot.kinematics.holding_torque(theta), before)
     )
     assert off < 0.3 * nominal
-    assert springy.kinematics.elasticity is springy.description.joint_elasticity  # not changed
+    # The original stays as it was.
+    assert springy.kinematics.elasticity is springy.description.joint_elasticity
 
 
 def rests(robot, count):

@@ -67,7 +67,7 @@ def test_an_emulated_module_goes_to_its_position_at_its_speed_and_holds_it(tmp_p
     robot = Robot.load(write_robot(tmp_path, actuation='position', speed=0.05))
     arm = make_arm(robot, 0, reality)
     start = arm.sense().length
-    arm.step(1.0)  # without a command
+    arm.step(1.0)  # no command has arrived yet
     assert np.abs(arm.sense().length - start).max() < 1e-3
     goal = start + np.linspace(0.005, 0.015, robot.muscle_count)
     arm.command_length(goal)

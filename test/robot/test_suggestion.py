@@ -23,7 +23,7 @@ def poor_arm(directory, spread=0.03):
     for muscle in document['muscles']:
         for point in muscle['route']:
             point['xyz'] = (point['xyz'] + rng.uniform(-spread, spread, 3)).tolist()
-    # These must be kept: a wrap, a repeated point, values of one muscle, another default.
+    # The suggestion must keep a wrap, a repeated point, values of one muscle and another default.
     document['muscles'][4]['route'].insert(2, WRAP)
     document['muscles'][5]['route'].insert(1, dict(document['muscles'][5]['route'][0]))
     document['muscles'][0]['tension'] = {'limit': 190.0}
@@ -65,16 +65,16 @@ def test_a_poor_arm_becomes_sound_by_via_points_moved_within_reach(tmp_path, cap
     mesh.parent.mkdir()
     mesh.write_bytes(b'solid')
     before = check_robot(Robot.load(arm), 400, seed=9)
-    assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}  # the premise
+    assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}  # premise: faulty
     assert suggest(arm, out, '--reach', reach) == 0
     printed = capsys.readouterr().out
     assert 'better: sound' in printed
     assert 'changes the sign of its main action' not in printed.split(str(out))[1]
-    # In postures that neither the search nor the check above used.
+    # Check the result in postures that neither the search nor the check above used.
     assert check_robot(Robot.load(out), 400, seed=9).faults == ()
     distance = np.linalg.norm(points(out) - points(arm), axis=1)
     assert 0.0 < distance.max() < reach
-    assert np.median(distance) < 1e-8  # most stay where they were
+    assert np.median(distance) < 1e-8  # most points are not moved
     assert without_points(out) == without_points(arm)
     for name in ('robot.urdf', 'moment_arms.csv', 'meshes/hand.stl'):
         assert (out / name).read_bytes() == (arm / name).read_bytes()

@@ -63,7 +63,8 @@ point = st.tuples(*[st.floats(-0.3, 0.3)] * 3)
 
 
 @given(point, point, st.floats(0.001, 0.1))
-@example((0.0, 0.001, 1.4641753369134492e-12), (0.0, 0.25, 0.0), 0.001)  # almost no plane
+# The centre and both ends are almost on one line, so that they hardly define a plane.
+@example((0.0, 0.001, 1.4641753369134492e-12), (0.0, 0.25, 0.0), 0.001)
 def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
     straight = np.linalg.norm(np.subtract(end, start))
     value, leave, arrive = wire(start, end, radius)
@@ -74,7 +75,7 @@ def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
 
 
 def test_a_tendon_over_a_drum_is_the_geodesic():
-    # Half a turn from tangent to tangent, with a rise of 0.2.
+    # The tendon makes half a turn between two tangents and rises by 0.2 m.
     flat = 2 * 0.3 + np.pi * 0.1
     length, leave, _ = wire([0.1, -0.3, 0], [-0.1, -0.3, 0.2], 0.1, (0, 0, 1), [0, 5, 0])
     assert length == pytest.approx(np.hypot(flat, 0.2))
@@ -153,5 +154,5 @@ def test_the_drawn_line_is_as_long_as_the_muscle(robot):
         lines = draw_arm(robot, posture, np.full(robot.muscle_count, 50.0))
         muscles = [line.points for line in lines if line.kind == 'muscles']
         drawn = [np.linalg.norm(np.diff(points, axis=0), axis=1).sum() for points in muscles]
-        # Chords of an eighth of the arc are a little shorter.
+        # The drawn chords, each over an eighth of the arc, are a little shorter than the arc.
         np.testing.assert_allclose(drawn, robot.routes.absolute_lengths(posture), atol=2e-4)
