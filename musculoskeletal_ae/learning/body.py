@@ -33,10 +33,10 @@ from musculoskeletal_ae.signals.friction import end_tension
 
 FEATURES = 60  # number of random features drawn for each muscle
 WIDTH = 0.35  # width of the kernel that the features approximate, as a share of the joint ranges
-#: The directions in feature space that vary least are dropped: about half of them, together this
-#: share of the variance. At the prior's spread that is less than 0.1 mm.
+#: Share of the variance of the features that is dropped with the directions that vary least. These
+#: are about half of all directions, and change a length by less than 0.1 mm at the prior's spread.
 LEFT_OUT = 1e-3
-POSTURES = 500  # number of random postures over which that variance is computed
+POSTURES = 500  # number of random postures over which the variance of the features is computed
 #: largest |μ|, at which the tension at the elastic element is twice the tension at the motor
 LARGEST_FRICTION = 0.7
 LARGEST_LOG = 1.5  # largest |κ|
@@ -68,8 +68,8 @@ class ResidualModel(NamedTuple):
     """
 
     frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
-    phase: Singles  # (K,)
-    basis: Singles  # (K, F)
+    phase: Singles  # phases of the cosines [rad], (K,)
+    basis: Singles  # directions that vary, (K, F)
 
     @classmethod
     def drawn(

@@ -31,7 +31,7 @@ from musculoskeletal_ae.signals.friction import end_tension
 CAPACITY = 4000  # default of the largest number of kept messages
 SPACING = 0.1  # time between kept messages [s]
 LEAST_TIME = 60.0  # duration of the healthy messages that calibrate a detector [s]
-#: number of distinct rests that these messages must include, and of samples that must be learned
+#: number of distinct rests in the messages that calibrate a detector, and of learned samples
 LEAST_SAMPLES = 20
 #: Threshold relative to the largest healthy d, once the body is well known. An unknown load of
 #: 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
@@ -46,16 +46,16 @@ GLITCH_SHARE = 0.002  # largest share of the messages that is excluded as glitch
 GLITCH_RATIO = 3.0  # smallest distance of a glitch, relative to the largest of all other messages
 POSTURES = 200  # number of stored postures that show where the detector was calibrated
 # Messages from which the network learns must be recent, because tendons creep and bed in.
-RECENT_TIME = 3600.0  # largest age of such a message [s]
-RECENT_RESTS = 200  # largest number of rests since such a message
+RECENT_TIME = 3600.0  # largest age of a recent message [s]
+RECENT_RESTS = 200  # largest number of rests since a recent message
 
 
 class Healthy(NamedTuple):
     """Messages of the healthy arm since its body last changed."""
 
     messages: NDArray[np.float32]  # (T, l, s), (N, 3M)
-    time: float  # healthy time from which they were drawn [s]
-    rests: int  # number of distinct rests in that time
+    time: float  # healthy time from which the messages were drawn [s]
+    rests: int  # number of distinct rests in the healthy time
     #: half of the recent messages with all joint angles, from motion and rest, for training
     learned: Observations | None = None
     judging: Observations | None = None  # the other half of these messages, for validation

@@ -29,7 +29,7 @@ from musculoskeletal_ae.signals.limits import LIMITS, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired, Pairing
 
-#: source of θ: sensors of some or all joints, a camera at irregular intervals, or none
+#: sources of θ: sensors of some or all joints, a camera at irregular intervals, or none
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 NO_MESSAGES = 'no muscle_states are received'
 NO_JOINTS = 'muscle_states are received without usable joint angles'
@@ -83,7 +83,7 @@ class SampleCollector:
             robot.joint_count + 3 * len(robot.kinematics.tree.parent), np.nan
         )
         self._longest_pause = max(LIMITS.pause, settings.rest_time)
-        self._skipped = 0.0  # time covered by unused messages since the last used one [s]
+        self._skipped = 0.0  # time covered by unused messages since the last used message [s]
 
     @property
     def body(self) -> BodyState:

@@ -90,7 +90,7 @@ def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
     """Return the prior of a muscle around the geometric model."""
     layout = body.layouts[m]
     spread = PRIOR.spread(layout)
-    # The prior on the offset holds before any creep; creep since then widens it.
+    # The prior of the offset describes the tendon before it crept. Creep since then widens it.
     spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
 

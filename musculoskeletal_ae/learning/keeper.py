@@ -93,7 +93,7 @@ class CheckpointKeeper:
         self._torque, self._knows_tension = HealthyTorque(robot), robot.knows_tension
         self._samples = samples
         self._is_validating = is_validating
-        self._time = 0.0  # sum of the messages' dt [s]
+        self._time = 0.0  # time of the last message, as the sum of all `dt` [s]
         self._state = None if directory is None else StateStore(directory, robot)
 
     # -- messages and events --------------------------------------------------------------------
@@ -104,7 +104,7 @@ class CheckpointKeeper:
         """Process a plausible message, `dt` [s] after the previous one, and measured θ (D,)."""
         self._time += dt
         self.validation.message(message.model_tension, message.length, self._time, theta)
-        # Without tensions there is no torque by which to detect contact.
+        # The healthy torque is used for contact detection. It cannot be computed without tensions.
         if self.mae is not None and not is_anomaly and self._knows_tension:
             self._torque.step(message.motor_tension, message.length, dt)
 

@@ -96,8 +96,8 @@ class Learner:
             )
         self.robot = robot
         self.enabled = True
-        #: time of the last poll [s], and of the last one that found new usable data
-        self._polled_at = self._progress_at = math.inf
+        self._polled_at = math.inf  # time of the last poll [s]
+        self._progress_at = math.inf  # time of the last poll that found new usable data [s]
         self._used_at = -math.inf  # time of the newest usable message at the last poll [s]
         self.trainer = trainer(robot, preset, seed)
         own_preset = self.trainer.preset
@@ -114,7 +114,7 @@ class Learner:
         self.offset_check = OffsetCheck(self.body.offsets)
         self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
         self._time = -math.inf  # time of the last message [s]
-        self._jumps = 0  # jumps of lengths so far
+        self._jumps = 0  # number of jumps of lengths so far
         if self.samples:
             # Continue after the body-state versions of the saved samples, so that none repeats.
             self._use_body(replace(self.body, version=self.samples.body_version + 1))

@@ -39,8 +39,9 @@ class OffsetCheck:
         """Accept the first offsets, because there is nothing to compare them with."""
         self._offsets = self._believed = offsets
         self._since = math.inf
-        # θ (NaN if it was not measured), T_end and l with the previous and with the new offsets.
+        #: θ (NaN if it was not measured), T_end and l of recent messages with the previous offsets
         self._before: deque[tuple[Array, Array, Array]] = deque(maxlen=COUNT)
+        #: the same quantities with the new offsets
         self._now: deque[tuple[Array, Array, Array]] = deque(maxlen=COUNT)
         self.is_believed, self.problem = True, ''
 

@@ -44,23 +44,23 @@ class Unknowns(NamedTuple):
 class Residuals(NamedTuple):
     """Residuals and derivatives at one point."""
 
-    length: Array  # (N, M)
-    muscle_jacobian: Array  # G, (N, M, D)
+    length: Array  # residuals of the lengths [m], (N, M)
+    muscle_jacobian: Array  # G [m/rad], (N, M, D)
     by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
-    torque: Array  # (N, D)
+    torque: Array  # residuals of the torques τ [N·m], (N, D)
     torque_by_body: Array  # −∂τ/∂w, (N, D, W)
     torque_by_springs: Array  # −∂τ/∂(α, β) of the S joints with springs, (N, D, 2S)
     load: Array  # sum of the muscles' absolute torques at each joint, median [N·m], (D,)
-    angle: Array  # (N, D); 0 where the angle was not measured
-    gravity: Array  # (N, 3J)
-    gravity_by_posture: Array  # (N, 3J, D)
+    angle: Array  # residuals of the angles [rad], (N, D); 0 where no angle was measured
+    gravity: Array  # residuals of the directions of gravity, (N, 3J)
+    gravity_by_posture: Array  # derivative of the directions of gravity by θ, (N, 3J, D)
 
 
 class Bent(NamedTuple):
     """Cache of Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
 
     theta: Array  # postures of the last evaluation [rad], (N, D)
-    stiffness: Array  # [N·m/rad], (N, D, D)
+    stiffness: Array  # Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
 
     @classmethod
     def unknown(cls, count: int, joint_count: int) -> Bent:
@@ -128,7 +128,7 @@ class PostureModel:
         torque_by_body = np.zeros((count, places, self.parameter_count))
         for m in range(length.shape[1]):
             tension, direction = observed.tension[:, m], observed.direction[:, m]
-            turns = np.flatnonzero(self._crossed[m])  # other joints do not change its length
+            turns = np.flatnonzero(self._crossed[m])  # only these joints change the length
             parts = np.append(0, 1 + turns)
             rows = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))

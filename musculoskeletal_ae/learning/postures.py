@@ -69,7 +69,7 @@ TYPICAL_STEP = 0.3  # typical step of a posture [rad]
 
 
 class Weights(NamedTuple):
-    """Robust weights of all residuals, divided by their variances."""
+    """Weights of all residuals: robust weights ω, divided by the variances."""
 
     length: Array  # (N, M)
     torque: Array  # (N, D)

@@ -130,7 +130,7 @@ class RestDetector:
     def reset(self) -> None:
         """Clear the window, for example after a jump of the clock."""
         self._window.clear()
-        self._time = 0.0  # [s]
+        self._time = 0.0  # time of the last reading, as the sum of all `dt` [s]
         self._read_at = 0.0  # time of the last usable message [s]
         self._periods = 0.0, 0.0  # last two periods between usable messages [s]
         self._rest: OpenRest | None = None  # None while the arm moves

@@ -125,7 +125,7 @@ class Arm(Shell):
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def follow_length_commands(self, follow: Callable[[Array], object]) -> None:
-        """Pass l_target [m] (M,) to `follow`, from commands to the motors if there are any."""
+        """Pass l_target [m] (M,) to `follow`; with ros2_control, convert motor commands to it."""
         if not self.motors.command_topic:
             self.follow_muscles('muscle_length_command', follow)
             return

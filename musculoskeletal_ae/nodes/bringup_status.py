@@ -26,7 +26,7 @@ from musculoskeletal_ae.report import Report
 class BringupStatus(Shell):
     """Prints the estimation error, A, and the numbers of samples and checkpoints."""
 
-    # Printing blocks while a terminal is paused by Ctrl-S or a pager is full, which is no fault.
+    # The node is not watched for progress, because printing blocks while a terminal is paused.
     is_watched = False
 
     def __init__(self, **options: Any) -> None:

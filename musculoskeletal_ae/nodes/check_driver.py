@@ -40,7 +40,7 @@ if TYPE_CHECKING:  # slow imports, which --help does not need
 JOINTS = 'joint_states'
 DISCOVERY_TIME = 1.0  # time in which other nodes are discovered [s]
 SILENCE = 1.0  # time without messages after which the motion test ends [s]
-TICK = 0.02  # period of a timer, which shows by a late tick that this process was paused [s]
+TICK = 0.02  # period of a timer [s]; a late tick shows that this process was paused
 
 
 def _say(text: object) -> None:
@@ -156,7 +156,7 @@ class CheckDriver:
         self.muscles = follow
 
         def ended() -> bool:
-            # Checked again here, because a busy machine may discover another node late.
+            # Check again that no other node commands the arm, because discovery may be late.
             return self.alone(1) and (winding.done or time.monotonic() - last > SILENCE)
 
         self.spin_until(ended, math.inf)

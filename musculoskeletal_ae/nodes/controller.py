@@ -108,7 +108,7 @@ class Controller(Shell):
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
-        # Checks message ages and keeps publishing commands when no sensor message arrives.
+        # The timer checks message ages, and publishes commands while no sensor messages arrive.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
@@ -122,8 +122,8 @@ class Controller(Shell):
         self.core.configure(replace(self.core.settings, **{name: value}))
 
     def _check_stiffness(self, value: Any) -> Any:
-        # Runs before the other parameters of the same request are set, because their setters may
-        # end a motion that a rollback would not restore.
+        # Check this before the other parameters of the same request are set, because their setters
+        # may end a motion, which a rollback would not restore.
         checked = replace(self.core.settings, joint_stiffness=value)
         checked.desired_stiffness(self.robot.kinematics.radian)
         return value
@@ -141,7 +141,7 @@ class Controller(Shell):
         # The limiter turns tensions into lengths for modules that follow positions.
         by_tension = value in BY_TENSION and not self.robot.follows_position
         if by_tension and followed[LENGTH] and not followed[TENSION]:
-            # The driver would pay the muscles out, as it does without commands.
+            # Refuse the method, because a driver that gets no commands pays the muscles out.
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
             problem = f'{value!r}: the driver follows muscle_length_command only'
             raise MusculoskeletalError(

@@ -53,7 +53,8 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
-        # After a restart, the learner's first network restores the isolation of muscles.
+        # `keep_isolated` is called because the learner's first network after a restart of this node
+        # restores the isolated muscles; later networks must not change them.
         self.candidates = Candidates(self, self._use, self.core.keep_isolated)
         self._advertise()
         self.sources.watch(*OWN_TOPICS)
@@ -63,8 +64,8 @@ class Estimator(Shell):
         self.published_offsets: LengthOffsets | None = None
         self.detected.publish(Bool(data=self.published_anomaly))
         self.needed.append('muscle_states')
-        self.posture: tuple[float, ...] = ()  # parameter zero_posture
-        self.muscles_to_isolate: tuple[int, ...] = ()  # parameter isolate_muscles
+        self.posture: tuple[float, ...] = ()  # value of the parameter zero_posture
+        self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
         self.follow_parameter('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
             # Without known offsets, no node uses the measured lengths before calibration.

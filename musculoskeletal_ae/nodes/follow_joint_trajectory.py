@@ -80,7 +80,7 @@ class FollowJointTrajectory:
         return CancelResponse.ACCEPT
 
     def _rest(self) -> None:
-        with suppress(MessageError):  # the controller has already stopped
+        with suppress(MessageError):  # raised if the controller has already stopped
             self._core.trajectory(None)
 
     def step(self, get_state: Callable[[], Any]) -> None:

@@ -44,7 +44,7 @@ class HardwareEmulator(Arm):
         )
         for warning in self.arm.warnings:
             self.get_logger().warning(warning)
-        # One step loads compiled code, which would delay the first messages otherwise.
+        # Load compiled code by one step now. Otherwise it would delay the first messages.
         self.arm.step(0.01)
         self.marker_pose_rate = self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()

@@ -104,7 +104,7 @@ class Learner(Shell):
         (self.core.replace if self.running else self.core.begin)(mae)
 
     def _name(self, muscles: Sequence[int]) -> None:
-        if self.running:  # a parameter file must not relearn at every start
+        if self.running:  # otherwise a parameter file would cause relearning at every start
             self.core.relearn(muscles)
 
     # -- messages -------------------------------------------------------------------------------
@@ -146,7 +146,7 @@ class Learner(Shell):
         data = self.core.poll(self.now())
         if data is not None:
             self.publisher.publish(bytes_message(data))
-        if bool(self.core.trouble) != self.troubled:  # report at once
+        if bool(self.core.trouble) != self.troubled:  # report the change without delay
             self.troubled = not self.troubled
             self._report()
 

@@ -66,7 +66,7 @@ class ProgressWatch:
 
     def stop(self) -> None:
         """Stop watching."""
-        if not self._thread.is_alive():  # never started
+        if not self._thread.is_alive():  # `start` was not called
             return
         self._is_stopped.set()
         self._thread.join()
@@ -80,7 +80,7 @@ class ProgressWatch:
             if self._is_stopped.wait(self._look_period):
                 return
             now = time.monotonic()
-            # A longer interval means that the process was suspended; it counts in part only.
+            # A longer interval means that the process was suspended. Count only a part of it.
             self._quiet += min(now - before, 2.0 * self._look_period)
             before = now
             if self._quiet > self._longest:

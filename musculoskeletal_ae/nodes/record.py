@@ -33,9 +33,8 @@ FLUSH_PERIOD = 0.5
 LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DRAIN_TIME = 0.5  # time after Ctrl-C for recording messages that have already arrived [s]
-# The recording is announced after the following times.
-DISCOVERY_TIME = 0.5  # time in which existing publishers are discovered [s]
-CONNECTION_TIME = 2.0  # longest time in which they are connected [s]
+DISCOVERY_TIME = 0.5  # time in which publishers are discovered before a recording is announced [s]
+CONNECTION_TIME = 2.0  # longest wait for connections to the discovered publishers [s]
 
 
 class Record(Node):
@@ -47,7 +46,7 @@ class Record(Node):
         self.received = 0
         #: latched messages that arrived before the first /clock, by topic
         self._early: dict[str, tuple[Topic, bytes, dict[str, int]]] = {}
-        self.timeless = 0  # number of other messages that arrived before the first /clock
+        self.timeless = 0  # number of messages lost because they arrived before the first /clock
         self._sim_time = self.get_parameter('use_sim_time').value
         #: subscriptions, by the topic's name in the interface
         self._subscriptions_of: dict[str, Subscription] = {}
@@ -148,7 +147,8 @@ def _record(options: Namespace, arguments: list[str]) -> int:
         node = Record(writer, options.topics)
         with Spinner(node) as spinner:
             with suppress(KeyboardInterrupt):
-                # The announcement promises that messages published from now on are recorded.
+                # Wait for connections first: the announcement promises that messages published from
+                # then on are recorded.
                 spinner.spin_until(lambda: False, DISCOVERY_TIME)
                 spinner.spin_until(lambda: node.is_connected, CONNECTION_TIME)
                 print(f'recording to {out}; Ctrl-C ends it', file=sys.stderr, flush=True)

@@ -35,7 +35,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
         node.create_subscription(MarkerArray, topic, take, SENSOR)
     first, spinner = node.resolve_topic_name(topics[0]), Spinner(node)
     spinner.spin_until(lambda: drawn, options.timeout)
-    # The publisher of the preferred topic may be discovered later, or send its next markers later.
+    # Wait longer for the preferred topic: its publisher may be discovered later, or send later.
     spinner.spin_until(lambda: topics[0] in drawn, DISCOVERY_TIME if drawn else 0.0)
     if drawn and node.count_publishers(first):
         spinner.spin_until(lambda: topics[0] in drawn, options.timeout)

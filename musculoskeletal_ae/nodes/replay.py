@@ -56,10 +56,11 @@ FIRST_REPORT_TIME = 2.0 * PERIOD  # longest wait for a first report of the subsc
 REPORT_TIME = 5.0 * PERIOD  # longest wait for two reports after sending a trajectory [s]
 SENDINGS = 3  # number of attempts to send a trajectory
 WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
-SEND_WAIT = 10.0  # the same for a single trajectory, which needs a subscriber [s]
+SEND_WAIT = 10.0  # default of this wait for a trajectory, which needs a subscriber [s]
 ACKNOWLEDGE_TIME = 2.0  # longest wait until reliable readers have acknowledged the messages [s]
 CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
-SHORTEST_CLOCK_PERIOD = 0.001  # shortest wall time between two of them that nodes can handle [s]
+#: shortest wall time between two messages on /clock that nodes can handle [s]
+SHORTEST_CLOCK_PERIOD = 0.001
 
 
 class Replay(Node):
@@ -70,7 +71,7 @@ class Replay(Node):
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
-        self.length = (self._stop - self._start) / 1e9  # [s]
+        self.length = (self._stop - self._start) / 1e9  # duration of the played part [s]
         self._before = (self._start - bag.start) / 1e9  # skipped time at the start of the bag [s]
         latched, reliable = latched_topics(bag), QoSProfile(depth=DEPTH)
         self._publisher: dict[str, Publisher] = {}
@@ -81,7 +82,8 @@ class Replay(Node):
         if options.clock:
             self._recorded_time = self.create_publisher(Clock, '/clock', QoSProfile(depth=1))
         self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
-        self._next_tick = self._next_service = self._next_report = 0.0  # on the steady clock [s]
+        # Times of the next /clock message, service round and report on the steady clock [s].
+        self._next_tick = self._next_service = self._next_report = 0.0
         self._sought: int | None = None  # recorded time to seek to [ns]
         description = 'position in the bag; set it to seek [s]'
         descriptor = ParameterDescriptor(description=description)
@@ -264,7 +266,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
     """
     publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
     answers = _Answers(node, publisher.topic_name)
-    # Discovery may list a subscriber before or after the connection to it is made.
+    # Wait for both, because discovery may list a subscriber before or after it is connected.
     spinner.spin_until(lambda: publisher.get_subscription_count() and answers.listeners, wait)
     if not publisher.get_subscription_count():
         listeners = ', '.join(sorted(answers.listeners))

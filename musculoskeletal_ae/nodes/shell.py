@@ -74,7 +74,7 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-if TYPE_CHECKING:  # importing it loads the bag writer
+if TYPE_CHECKING:  # a slow import, because it loads the bag writer
     from musculoskeletal_ae.nodes.stop_recording import StopRecording
 
 #: clock for message ages and watchdogs; independent of /clock
@@ -103,7 +103,8 @@ class Shell(Node):
     core: Any = None  # the object that computes, without ROS
     is_time_critical = True  # whether a delay of this node delays commands
     is_watched = True  # whether the process ends if it makes no progress for 10 s
-    recording: StopRecording | None = None  # records every new message before it is used
+    #: recorder of every message that arrives, before the message is used; None to record nothing
+    recording: StopRecording | None = None
     #: topics of `AUTHORS` whose messages this node accepts from several publishers
     accepted_from_all: frozenset[str] = frozenset()
 
@@ -132,7 +133,7 @@ class Shell(Node):
         self.rate: float = self.parameter('rate')  # rate of the muscle modules [Hz]
         settings = MotorSettings(**{name: self.parameter(name) for name in MOTORS})
         self.motors = MotorInterface(settings, self.robot.muscles)
-        #: topics of a ros2_control robot, by the names of those whose place they take
+        #: topics of a ros2_control robot, by the names of the topics that they replace
         self._wires = {STATES: self.motors.state_topic, MOTOR_COMMAND: self.motors.command_topic}
         for name in ('motor_state_topic', 'motor_command_topic'):
             with _naming_parameter(name):
@@ -141,11 +142,10 @@ class Shell(Node):
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
         self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
-        self._latched: dict[
-            str, tuple[Any, Callable[[], Any]]
-        ] = {}  # subscription, and how to renew it
+        #: subscription of each latched topic, and a function that subscribes again
+        self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}
         self.sources = Sources(self, self.full_name, self._reception.turns, self._subscribe_anew)
-        self.rejected = self._reception.rejected  # messages, by topic and reason
+        self.rejected = self._reception.rejected  # number of messages, by topic and reason
         #: offsets and isolated muscles that the estimator has published
         self.body = BodyState.healthy(self.robot.muscle_count)
         self.add_on_set_parameters_callback(self._set_parameters)
@@ -225,7 +225,8 @@ class Shell(Node):
     def _on_incompatible(self, topic: str, who: str, event: Any) -> None:
         policy = QoSPolicyKind(event.last_policy_kind)
         remedy = QOS_REMEDIES.get((who, policy), 'see "Quality of service" in the interface')
-        problem = f'a {who} another {policy.name.lower()} than this node; {remedy}'
+        this_node = 'this node needs' if who == 'publisher offers' else 'this node offers'
+        problem = f'a {who} another {policy.name.lower()} than {this_node}; {remedy}'
         self._reception.reject(topic, 'incompatible QoS', f'incompatible QoS: {problem}')
         self._reception.refuse(f'{topic}: incompatible QoS: {problem}')
 
@@ -610,7 +611,7 @@ class Shell(Node):
             else f'{self.full_name(topic)}, on which no usable message has arrived'
             for topic in missing
         ]
-        # A topic may carry both joint angles and motors.
+        # Remove duplicates, because one topic may carry both joint angles and motors.
         before, self._waiting = self._waiting, '; '.join(dict.fromkeys(reasons))
         if self._waiting != before:
             text = f'waiting for {self._waiting}' if reasons else 'receiving all needed topics'

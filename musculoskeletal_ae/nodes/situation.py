@@ -35,8 +35,8 @@ FORGET_TIME = 5.0
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'  # key of the version in reports
-#: Number of reports after which another network than the estimator's counts as a mismatch. Nodes
-#: report once a second. Networks that the estimator named in as many last reports do not count.
+#: Number of reports after which a node's network counts as a mismatch, if the estimator has named
+#: that network in none of its last REPORTS reports. Nodes report once a second.
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
@@ -108,13 +108,14 @@ class Situation:
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
         #: version of a node's other network and the number of reports that name it, by node
         self._other_networks: dict[str, tuple[str, int]] = {}
-        self._ticked_at, self._slept = math.nan, 0.0  # [s]
+        self._ticked_at = math.nan  # time of the last tick [s]
+        self._slept = 0.0  # total duration of the pauses of this process [s]
 
     def tick(self) -> None:
         """Update ages; call this about once a second, before `trouble` and `level`."""
         now = self._clock()
         elapsed = now - self._ticked_at
-        if elapsed > LONGEST_TICK:  # messages of the pause still wait to be read
+        if elapsed > LONGEST_TICK:  # after a pause, messages still wait to be read
             self._slept += elapsed - TICK
         self._ticked_at = now
         awake = now - self._slept
@@ -203,7 +204,7 @@ class Situation:
         """Return whether `_stops` or `_body` already shows the report of a node."""
         if node.level == DiagnosticStatus.OK or 'fault' in node.values:
             return False
-        if SEVERAL in node.values:  # shown if the stop names the same publishers
+        if SEVERAL in node.values:  # already shown if the controller's stop names these publishers
             control = self._values('controller')
             is_stopped = control.get('stop cause') == StopCause.SECOND_PUBLISHER.identifier
             return is_stopped and node.values[SEVERAL] in control.get('stop', '')

@@ -54,7 +54,7 @@ TURNS = 3  # number of turns that prove two publishers of one name
 LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
 NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
 TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]
-UNNAMED = '_NODE_NAME_UNKNOWN_'  # name that the graph returns for such a publisher's node
+UNNAMED = '_NODE_NAME_UNKNOWN_'  # name that the graph returns for a node that it does not know
 
 
 class Publisher(NamedTuple):
@@ -183,7 +183,7 @@ class Sources:
             MessageError: If it may come from another node than the intended publisher.
         """
         authorship = self._authorships[topic]
-        if is_latched:  # such messages are rare and may move the arm at once
+        if is_latched:  # look now, because latched messages are rare and may move the arm at once
             self._look(topic)
         if authorship.intruders or (is_latched and not authorship.is_certain):
             if is_latched:
@@ -221,7 +221,7 @@ class Sources:
         return f'stop all of them except {" and ".join(sorted(authors))} of this arm'
 
     def _shown(self, topic: str) -> str:
-        """Return the name of a topic, or of the one that takes its place, in our namespace."""
+        """Return the name of a topic, or of the one that replaces it, without our namespace."""
         return self._resolve(topic).removeprefix(f'{self._node.get_namespace().rstrip("/")}/')
 
     def _look(self, topic: str) -> None:

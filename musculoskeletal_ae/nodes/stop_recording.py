@@ -56,7 +56,7 @@ class StopRecording:
         self._resolve, self._topics = resolve, topics
         self._directory = directory or Path(get_logging_directory())
         self._recent: deque[Heard] = deque()
-        self._recent_size = 0  # [bytes]
+        self._recent_size = 0  # size of the recent messages [bytes]
         self._latched: dict[str, Heard] = {}  # last latched messages before `_recent`
         self._writing: threading.Thread | None = None
         self.left_out = 0  # number of messages that were too large

@@ -80,7 +80,7 @@ class View(Node):
     def __init__(self, robot: Robot, options: Namespace) -> None:
         super().__init__('view', start_parameter_services=False)
         try:
-            # `import_heavy`, because importing trimesh may swallow Ctrl-C.
+            # Use `import_heavy`, because importing trimesh may swallow Ctrl-C.
             page = import_heavy('musculoskeletal_ae.view.page')
         except ImportError as error:
             raise MusculoskeletalError(
@@ -164,10 +164,11 @@ class View(Node):
         for _ in range(len(self.pending) + 1 if self.pending else 0):
             self.answers.spin_once(timeout_sec=0.0)
         waiting, self.pending = self.pending, []
-        for since, future, answered in waiting:  # an executor would be one request late
+        # Call the callbacks here, because an executor would call them one request late.
+        for since, future, answered in waiting:
             if future.done():
                 answered(future.result())
-            elif time.monotonic() - since < PATIENCE:  # else the node has ended without a response
+            elif time.monotonic() - since < PATIENCE:  # otherwise assume that the node has ended
                 self.pending.append((since, future, answered))
 
     # -- the loop -------------------------------------------------------------------------------
@@ -225,7 +226,7 @@ class View(Node):
         suspects = [self.situation.suspect] * self.situation.detected
         groups = self._places(suspects), self._isolated(), self._places(self.ruptured)
         kinds = np.zeros(self.robot.muscle_count, dtype=int)
-        for kind, muscles in enumerate(groups, 1):  # as in body.Kind
+        for kind, muscles in enumerate(groups, 1):  # the numbers are values of `body.Kind`
             kinds[muscles] = kind
         return kinds
 
@@ -250,7 +251,7 @@ class View(Node):
         ]
         trouble = self.page.with_buttons(situation.trouble())
         isolated = f'isolated: {self.robot.names(self._isolated())}'
-        if len(self._isolated()) and isolated not in trouble:  # the estimator does not report them
+        if len(self._isolated()) and isolated not in trouble:  # not part of the estimator's report
             lines.append(isolated)
         shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
         values = error, anomaly, situation.distance, situation.limit

@@ -3,7 +3,7 @@
 
 from typing import Literal
 
-# §III-A: units of the encoder's hidden layers; the decoder's are the reverse.
+# §III-A: numbers of units in the hidden layers of the encoder; the decoder has the reverse order.
 HIDDEN = (200, 30)
 # Our choice: the descent through the decoder needs a smooth activation function, such as tanh.
 ACTIVATION: Literal['tanh', 'silu'] = 'tanh'
@@ -27,7 +27,7 @@ DATA = 10  # C_data: number of stored samples that are drawn at random for each 
 # §III-E: the proposed control.
 CONTROL_WEIGHTS = (1.0, 1.0, 0.01)  # w₁ of ‖T‖, w₂ of the posture, w₃ of the torque
 CONTROL_LARGEST_STEP = 0.5  # γ_max
-CONTROL_CANDIDATES = 10  # C_batch, called N_batch in the text
+CONTROL_CANDIDATES = 10  # C_batch, which the paper's text calls N_batch
 CONTROL_EPOCHS = 10  # C_epoch
 # The paper does not state the unit of τ to which w₃ and w₆ apply. We chose N·mm; converted to N·m,
 # w₃ is 10 and w₆ is 1. If the paper's weights applied to N·m, the torque would hardly count: the

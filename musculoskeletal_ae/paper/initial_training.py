@@ -68,7 +68,7 @@ def train(
         seed: Seed of the states, weights, masks and the order of the samples.
         steps: Total number of mini-batches.
         progress: Called after every mini-batch.
-        hidden: Units of the encoder's hidden layers.
+        hidden: Numbers of units in the encoder's hidden layers.
     """
     rng = np.random.default_rng(seed)
     count = min(INITIAL_SAMPLES, steps * INITIAL_BATCH)

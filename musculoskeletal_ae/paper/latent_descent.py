@@ -35,7 +35,7 @@ class StepSearch(NamedTuple):
     """Constants of the descent."""
 
     largest_step: float  # γ_max
-    candidates: int  # N, called C_batch in the list of constants
+    candidates: int  # N, which the paper's list of constants calls C_batch
     epochs: int  # C_epoch
 
 

@@ -28,7 +28,7 @@ def new_network(
         joints: D.
         muscles: M.
         seed: Random seed of the weights.
-        hidden: Units of the encoder's hidden layers; the decoder's are the reverse.
+        hidden: Numbers of units in the encoder's hidden layers; the decoder has the reverse order.
     """
     values = joints + 2 * muscles
     with torch.random.fork_rng(devices=[]):

@@ -78,8 +78,8 @@ class Finding(NamedTuple):
     """A fault or warning about a robot, with its remedy."""
 
     kind: str  # an identifier, such as 'wrong_sign'
-    message: str  # names the muscles and joints
-    remedy: str = ''  # '' for 'not_held' and 'not_stiff': `remedies` computes theirs
+    message: str  # text that names the muscles and joints
+    remedy: str = ''  # text; '' for 'not_held' and 'not_stiff', for which `remedies` computes it
     joint: int = -1  # joint that is weakest most often, for 'not_held' and 'not_stiff'
 
 
@@ -179,7 +179,7 @@ def judge(setting: Setting) -> RobotCheck:
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
-    # A module that follows a position also holds a muscle at T_bias.
+    # Modules that follow positions also hold a muscle at T_bias, so that it counts as taut.
     is_taut = robot.follows_position | (tension[held] > bias + SLACK_MARGIN)
     taut = np.where(is_taut, k, 0.0)
     full, sided = (
@@ -312,7 +312,7 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
     }
     median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
     one_way = np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE
-    # A spring turns the joint back from where a muscle pulls it.
+    # A joint with a spring needs muscles on one side only, because the spring turns it back.
     has_muscle = ~(lacks['+'] & lacks['-']).any(axis=0)
     one_way &= ~(robot.kinematics.elasticity.is_sprung & has_muscle)
     for joint in np.flatnonzero(one_way).tolist():
@@ -381,7 +381,7 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Yield joints whose moment arms are short compared with the emulated and learned errors."""
-    # A joint without muscles is reported as a one-way joint.
+    # Skip joints without muscles, which are reported as one-way joints.
     longest = np.abs(moment_arms).max(axis=(0, 1))
     small = np.flatnonzero((longest > LEAST_COUNTED_ARM) & (longest < SHORT_ARM)).tolist()
     if small:

@@ -123,21 +123,21 @@ class RobotDescription:
     model: pin.Model  # model of the whole URDF
     joints: tuple[str, ...]  # names of the joints, in the order of θ
     muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
-    routes: tuple[Route, ...]  # one for each muscle
+    routes: tuple[Route, ...]  # one route for each muscle
     series_elastic: SeriesElastic
     #: K_stiff of muscle stiffness control [N/m], (M,); infinite for modules that follow positions
     stiffness: Array
     tension: TensionRange
-    #: whether the modules follow l_target itself, and the resulting tension is not regulated
+    #: whether the modules follow l_target itself instead of regulating tension
     follows_position: bool
     knows_tension: bool  # whether the modules measure tension
     speed: Array  # speed of modules that follow positions [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,)
     release: Array
-    end_effectors: tuple[str, ...]  # links; `end_effector` is the first
+    end_effectors: tuple[str, ...]  # names of links; `end_effector` is the first of them
     couplings: dict[str, Coupling]  # coupling of each joint that follows another one
     joint_elasticity: JointElasticity  # springs and dampers of the joints
-    warnings: tuple[str, ...]  # accepted, but questionable entries
+    warnings: tuple[str, ...]  # texts about questionable entries that were accepted
 
     @property
     def end_effector(self) -> str:
@@ -418,7 +418,7 @@ def _read_wrap(entry: RouteEntry) -> Wrap:
     side = None if entry.side is None else np.array(entry.side)
     if axis is not None:
         axis = axis / float(np.linalg.norm(axis))
-    assert entry.radius is not None  # the format requires it of wraps
+    assert entry.radius is not None  # checked by `RouteEntry`
     own = None if entry.side_link == entry.link else entry.side_link
     return Wrap(entry.link, np.array(entry.xyz), entry.radius, axis, side, own)
 
@@ -448,8 +448,8 @@ def _read_end_effectors(
             raise fail(f'{place}: expected a link that the joints move, {legal}; got {name!r}')
     if places:
         return tuple(places.values())
-    # The link that most joints move; among several, the one after most fixed joints, and then the
-    # one listed last in the file.
+    # Return the link that most joints move. Among several, return the one after most fixed joints,
+    # and among several of these the last one in the file.
     tips, last = _fixed_above(model), {link: i for i, link in enumerate(order)}
     return (max(links, key=lambda link: (links[link], tips[link], last[link])),)
 

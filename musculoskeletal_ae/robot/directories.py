@@ -13,7 +13,7 @@ def shipped_robots() -> dict[str, Path]:
     """Return the directories of the shipped robots by name."""
     here = Path(__file__).resolve()
     roots = [here.parents[2] / 'config']
-    # Installed by colcon: <prefix>/lib/pythonX.Y/site-packages/musculoskeletal_ae/robot/…
+    # colcon installs this file as <prefix>/lib/pythonX.Y/site-packages/musculoskeletal_ae/robot/…
     roots += [up / 'share' / 'musculoskeletal_ae' / 'config' for up in here.parents]
     shipped: dict[str, Path] = {}
     for root in roots:

@@ -22,8 +22,8 @@ SPREADS = np.repeat([0.002, 0.01], 3)
 #: standard deviations that leave the orientation free
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
 ITERATIONS = 30  # largest number of steps
-LEAST_DAMPING = 1e-6  # relative to the diagonal of JᵀJ
-MOST_DAMPING = 1e6  # relative to the diagonal of JᵀJ
+LEAST_DAMPING = 1e-6  # smallest damping, relative to the diagonal of JᵀJ
+MOST_DAMPING = 1e6  # largest damping, relative to the diagonal of JᵀJ
 #: prior standard deviation of a step, which damps joints that the pose does not determine [rad]
 STEP_SPREAD = 0.1
 LEAST_GAIN = 1.0  # decrease of the minimised sum below which the search ends

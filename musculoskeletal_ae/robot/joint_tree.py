@@ -30,9 +30,9 @@ PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismati
 class JointPoses(NamedTuple):
     """Poses of pinocchio's joints in the root link's frame for N postures; index 0 is that link."""
 
-    rotation: Array  # (N, J, 3, 3)
+    rotation: Array  # rotation matrices, (N, J, 3, 3)
     translation: Array  # joint origins [m], (N, J, 3)
-    axis: Array  # (N, J, 3); zero at index 0
+    axis: Array  # joint axes, (N, J, 3); zero at index 0
 
 
 #: largest number of coefficients of a coupling's polynomial; two chained couplings of degree 4 have
@@ -46,7 +46,7 @@ class Coupling(NamedTuple):
     master: str  # after `resolved`, a joint that is not coupled itself
     ratio: float
     offset: float  # [rad] or [m]
-    higher: tuple[float, ...] = ()  # coefficients of the second power and those above
+    higher: tuple[float, ...] = ()  # coefficients of the second and all higher powers
 
     @classmethod
     def of_terms(cls, master: str, terms: Sequence[float]) -> Coupling:

@@ -65,7 +65,7 @@ class RouteEntry(Strict, frozen=True):
                 raise ValueError(f'axis, radius, side and side_link {legal}')
             return
         if self.divisor is not None:
-            raise ValueError('divisor: expected at a point, where a branch begins, not at a wrap')
+            raise ValueError('divisor: expected at a point where a branch begins; remove it here')
         if self.side_link is not None and self.side is None:
             raise ValueError("side_link needs side; key 'side' is missing")
         if self.radius is None:
@@ -111,7 +111,10 @@ class MuscleEntry(Strict, frozen=True):
             raise ValueError('route: expected a point before and after each wrap')
         begins = [entry.divisor is not None for entry in self.route]
         if any(wrap and begin for wrap, begin in zip(is_wrap, begins[1:])):
-            raise ValueError('route: expected no wrap before a point with a divisor')
+            raise ValueError(
+                'route: expected no wrap before a point with a divisor, because a wrap lies '
+                'between two points of one branch'
+            )
 
 
 class CouplingEntry(Strict, frozen=True):

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 ARC = 9  # number of points drawn along the arc of a wrapped tendon
 #: number of rows of one batched evaluation, which limits its memory to a few tens of megabytes
 CHUNK = 4096
-MOST_SERIAL_CHUNKS = 4  # largest number of chunks that a single thread evaluates; two share more
+MOST_SERIAL_CHUNKS = 4  # number of chunks above which two threads share the evaluation
 
 
 def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Array], Array]:
@@ -127,7 +127,7 @@ class Routes:
         """
         from musculoskeletal_ae.robot.wrapping import wrapped_segments
 
-        assert self.objects is not None  # callers have checked
+        assert self.objects is not None  # callers check this
         start, end = points[:, self.first[self.wrapping]], points[:, self.second[self.wrapping]]
         turned, moved = (np.ascontiguousarray(part) for part in poses[:2])
         return wrapped_segments(self.objects, turned, moved, start, end)

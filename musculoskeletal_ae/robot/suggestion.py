@@ -68,7 +68,8 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
     def change_of(x: Array) -> Array:
         x = x.reshape(unchanged.shape)
         change = reach * x / np.sqrt(1.0 + np.sum(x**2, axis=1, keepdims=True))
-        return np.trunc(change / RESOLUTION) * RESOLUTION  # rounded towards zero: within reach
+        # Round towards zero, so that every displacement stays within reach.
+        return np.trunc(change / RESOLUTION) * RESOLUTION
 
     def cost(x: Array) -> float:
         missing, size = lacks(change_of(x)), np.linalg.norm(change_of(x), axis=1).mean() / reach
@@ -140,14 +141,14 @@ def write(robot: Robot, change: Array, out: Path) -> None:
         muscle['route'] = [written(item) for item in route]
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None)
     out.mkdir(parents=True, exist_ok=True)
-    # Written first, so that it exists even if copying fails.
+    # Write muscles.yaml first, so that it exists even if copying fails.
     (out / 'muscles.yaml').write_text(text, encoding='utf-8')
     # Copy meshes from anywhere in the directory, but not the output, which may lie there too.
     skipped = {out.resolve(), (here / 'muscles.yaml').resolve()}
 
     def not_copied(folder: str, names: list[str]) -> list[str]:
         paths = {name: Path(folder, name) for name in names}
-        # This excludes pipes and broken links.
+        # Copy only files and directories, but no pipes and broken links.
         copyable = [name for name, path in paths.items() if path.is_file() or path.is_dir()]
         return [name for name in names if name not in copyable or paths[name].resolve() in skipped]
 

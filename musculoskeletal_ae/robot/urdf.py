@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.joint_tree import Coupling
 
 #: largest number of links and joints; recursive parsers overflow their stack at thousands of links
 MOST_PARTS = 2000
-#: largest depth of nested elements, which the parser of MuJoCo and pinocchio does not exceed either
+#: largest depth of nested elements, which is also the limit of the parser of MuJoCo and pinocchio
 DEEPEST = 500
 #: elements below <robot> that only a preprocessor understands, besides xacro's own elements
 PREPROCESSED = 'include', 'macro', 'property'

@@ -44,11 +44,11 @@ class WrapObjects(NamedTuple):
     joint: Ints  # joint of the tree that carries the object, (S,)
     centre: Array  # [m], (S, 3)
     axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
-    #: the side point [m], NaN for none, (S, 3): relative to the centre if the object's own joint
-    #: carries it, else in the frame of the joint that does
+    #: side point [m], (S, 3); NaN if there is none. It is relative to the centre if the object and
+    #: the side point have the same joint, otherwise in the frame of `side_joint`.
     side: Array
     side_joint: Ints  # joint of the tree that carries the side point, (S,)
-    radius: Array  # [m], 0 for no object, (S,)
+    radius: Array  # [m], (S,); 0 for a segment without an object
 
 
 def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:

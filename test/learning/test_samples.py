@@ -61,7 +61,7 @@ def test_a_moving_joint_or_tendon_is_no_rest():
 
 @pytest.mark.parametrize('before', [0.1, 0.7, 3.0, 12.3])
 def test_a_rest_does_not_depend_on_what_was_before_it(before):
-    def theta(t):  # moves, rests from 0.5 s to 1.4 s, and moves
+    def theta(t):  # the joint moves, rests from 0.5 s to 1.4 s, and moves again
         return max(0.0, 0.5 - t) + max(0.0, t - 1.4)
 
     def rest(detector, before):

@@ -262,7 +262,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     assert_same(read(tmp_path, arm26)[0], loaded)
 
 
-# -- one learner a directory ----------------------------------------------------------------------
+# -- one learner per directory --------------------------------------------------------------------
 
 
 def test_a_directory_serves_one_learner_at_a_time(tmp_path, arm26):
@@ -340,7 +340,8 @@ def test_a_directory_that_became_read_only_is_an_error_until_it_is_not(begun, st
     def read_only(*_):
         raise OSError(errno.EROFS, 'Read-only file system')
 
-    with monkeypatch.context() as patch:  # file modes do not restrict the superuser
+    # Replace the function that writes, because file modes do not restrict the superuser.
+    with monkeypatch.context() as patch:
         patch.setattr(states, 'write_whole', read_only)
         accept(learner, stage, 1)
         assert 'Read-only' in learner.report().message

@@ -301,7 +301,7 @@ def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
     def known():
         return learner.node.core.mae.isolated
 
-    isolated.publish(String(data=''))  # from an estimator that has just started
+    isolated.publish(String(data=''))  # as published by an estimator that has just started
     graph.wait(lambda: learner.node.has_heard_isolated, 'what it says')
     assert known() == (4,)
     for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
