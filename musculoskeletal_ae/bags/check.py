@@ -20,7 +20,7 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 # A column counts as misplaced only if another muscle fits it this many times better, because bodies
 # differ from their model and neighbouring muscles are similar.
 _BETTER_FIT = 2.5
-_LEAST_MOTION = 0.005  # [m]; a column whose length varies less is not checked
+_LEAST_MOTION = 0.005  # a column whose length varies less is not checked [m]
 _MOST_SAMPLES = 2000
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
@@ -47,7 +47,7 @@ def check_bag(
 
     Args:
         path: The bag.
-        robot: A shipped robot or a directory; None: report which of the shipped robots fit.
+        robot: A shipped robot or a directory, or None to report which of the shipped robots fit.
         namespace: The namespace to check; required only if the bag has several.
         motors: How the motors of a ros2_control robot are connected.
     """

@@ -32,13 +32,13 @@ from musculoskeletal_ae.bags.storage import (
 from musculoskeletal_ae.exceptions import BagError
 
 MAGIC = b'\x89MCAP0\r\n'  # first and last bytes of a file
-LARGEST_RECORD = 64 << 20  # [bytes] of a record or a decompressed chunk
+LARGEST_RECORD = 64 << 20  # largest size of a record or a decompressed chunk [bytes]
 # A file may decompress to at most MOST_EXPANDED bytes plus LARGEST_EXPANSION times its size. A
 # malicious file of a few kB could otherwise take hours to read.
 MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100
 
 _JUMP = 'record again, without --loop, a second /clock or another jump of time'
-_LONGEST_QOS = 10_000  # [characters] of YAML
+_LONGEST_QOS = 10_000  # largest length of the QoS profiles, as YAML [characters]
 
 
 class _Span(NamedTuple):

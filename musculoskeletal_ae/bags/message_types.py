@@ -18,7 +18,8 @@ TYPESTORE.max_sequence_length = 1 << 26
 CDR = 'cdr'  # the message encoding of ROS 2
 MSG = 'ros2msg'  # the encoding of definitions in .msg format
 _LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}  # by the first two bytes of a CDR message
-_LONGEST_DEFINITION = 1 << 16  # [bytes], several times longer than that of any type here
+#: largest size of a definition [bytes]; those of the types here are several times shorter
+_LONGEST_DEFINITION = 1 << 16
 
 
 @cache

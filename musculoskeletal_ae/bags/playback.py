@@ -30,10 +30,10 @@ LONGEST_LAG = 1.0  # [s]
 TAUGHT_TOPIC = 'estimated_joint_states'
 # Standard deviation of the smoothing [s]; a hand moves more slowly, noise varies faster.
 SMOOTHING = 0.15
-SPACING = 0.1  # [s] between points
-LEAD_TIME = 3.0  # [s] to reach the first posture
-SHORTEST_MOTION = 0.5  # [s]
-LONGEST_GAP = 1.0  # [s] between two messages; the motion within a longer gap is unknown
+SPACING = 0.1  # time between two points of the trajectory [s]
+LEAD_TIME = 3.0  # duration of the motion to the first posture [s]
+SHORTEST_MOTION = 0.5  # shorter motions are refused [s]
+LONGEST_GAP = 1.0  # the motion between two messages that are further apart is unknown [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
@@ -42,7 +42,7 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
     Args:
         bag: The recording.
         start: Where to begin, from the start of the bag [s].
-        duration: How long to play [s]; None: to the end.
+        duration: How long to play [s], or None to play to the end.
     """
     length = (bag.end - bag.start) / 1e9
     if start > length:

@@ -27,8 +27,8 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-MOST_HELD = 64 << 20  # [bytes] of messages held in memory to sort them
-_OVERHEAD = 100  # [bytes] counted for a message in addition to its data
+MOST_HELD = 64 << 20  # largest size of the messages held in memory to sort them [bytes]
+_OVERHEAD = 100  # size counted for a message in addition to its data [bytes]
 
 
 @dataclass
@@ -81,7 +81,7 @@ class Bag:
     def messages(
         self, topics: Collection[str] | None = None, start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages of topics (None: all) from start to stop [ns, log time], both included.
+        """Yield messages of topics, by default all, from start to stop [ns, log time], inclusive.
 
         They are sorted by log time; messages of equal time keep the order of the file.
         """

@@ -31,7 +31,7 @@ DAMAGED = 'use a copy or another recording'
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
-_LONGEST_NAME = 256  # [characters]
+_LONGEST_NAME = 256  # largest length of a topic's name [characters]
 
 
 @contextmanager
@@ -58,7 +58,7 @@ class BagTopic:
     name: str  # absolute, as recorded
     type: str
     qos: list[Qos] = field(default_factory=list)  # offered profiles
-    encoding: str = CDR  # of its messages
+    encoding: str = CDR  # encoding of its messages
     schema: Schema | None = None  # the recorded definition, which is only copied
     problem: str = ''  # why its messages cannot be used; '' if they can
     message_count: int = 0

@@ -32,9 +32,9 @@ from musculoskeletal_ae.validity import (
 )
 
 # Conditions for a topic whose log times are bunched.
-FEW = 20  # shorter topics are not checked
-BUNCHED = 50_000_000  # [ns]; the delays of its messages differ by more than this
-MANY = 0.3  # at least this share of its messages was written together with the one before
+FEW = 20  # topics with fewer messages are not checked
+BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
+MANY = 0.3  # at least this fraction of its messages was written together with the one before
 
 
 class Series(NamedTuple):

@@ -23,7 +23,7 @@ DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
-#: of a robot that publishes muscle_states
+#: topics of a robot that publishes muscle_states
 NO_MOTORS = MotorSettings()
 
 
@@ -219,7 +219,8 @@ def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
 def _compare_type(bag: Bag, name: str, expected: str) -> None:
     topic = bag.topics[name]
     if topic.type != expected:
-        problem = f'topic {name} has the type {topic.type[:80]!r}, not {expected!r}'
-        raise BagError(bag.path, problem, 'rename the topic before recording')
+        problem = f'topic {name} has the type {topic.type[:80]!r}; expected {expected!r}'
+        remedy = f'choose other topics, or record it again under a name other than {name}'
+        raise BagError(bag.path, problem, remedy)
     if topic.problem:
         raise BagError(bag.path, f'topic {name} {topic.problem}', 'choose other topics')

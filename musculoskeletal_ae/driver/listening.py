@@ -36,22 +36,24 @@ TEMPERATURES = -20.0, 130.0  # [°C] possible range
 BEYOND = 0.1, 1.0  # [m] that l may exceed its range, with and without length calibration
 BEYOND_JOINT = 0.3  # [rad] that θ may exceed the joint limits
 # Tolerance of T − T_bias while nothing is commanded, for errors of the sensor and its zero.
-RESTING_TENSION, RESTING_SHARE = 15.0, 0.5  # [N], share of T_bias; the smaller one applies
-PULLS = 0.3, 3.0  # range of T / T_bias at rest
-USUAL = 10.0, 60.0  # [°C] range of modules at rest
+#: tolerance of T at rest [N], and relative to T_bias; the smaller one applies
+RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
+PULLS = 0.3, 3.0  # usual range of T / T_bias at rest
+USUAL = 10.0, 60.0  # usual temperatures of modules at rest [°C]
 UNIT_TOLERANCE = 0.3  # relative deviation from T_bias of a T in another unit
-TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # [N]
-HOTTEST_AT_REST = 55.0  # [°C] of modules without commands; 55 °C are 131 °F
+TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
+HOTTEST_AT_REST = 55.0  # highest temperature of modules without commands [°C]; it is 131 °F
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of both shipped
 # arms (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by 0.31 to 1.55
 # times the model's changes. Where another muscle fits 2.5 times better, the misfit is below 8.5 mm.
-ZERO_TOLERANCE = 0.045  # [m] of the length offset
-SLOPES = 0.2, 2.2  # range of the change of l divided by that of the model
-MISPLACED = 0.012  # [m] misfit to its own muscle from which a column can be misplaced
-BETTER = 2.5  # times that another muscle must fit better
-MOVED = 0.04  # [m] range of l from which its sign and slope can be checked
-JOINTS_BETTER = 0.8  # share of the misfit that may remain if angles instead of lengths are wrong
-MOVED_JOINT = 0.2  # [rad] range of θ from which its sign can be checked
+ZERO_TOLERANCE = 0.045  # largest length offset of a healthy arm [m]
+SLOPES = 0.2, 2.2  # legal range of the change of l, divided by that of the model
+MISPLACED = 0.012  # misfit to its own muscle from which a column can be misplaced [m]
+BETTER = 2.5  # another muscle must fit better by this factor
+MOVED = 0.04  # range of l from which its sign and slope can be checked [m]
+#: fraction of the misfit that may remain if angles instead of lengths are wrong
+JOINTS_BETTER = 0.8
+MOVED_JOINT = 0.2  # range of θ from which its sign can be checked [rad]
 MOST_SAMPLES = 400
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
@@ -84,9 +86,9 @@ class Listening:
         Args:
             robot: The geometric model.
             rate: Expected rate of muscle_states [Hz].
-            posture: θ [rad] (D,) in which the arm is held; None: use joint_states.
+            posture: θ [rad] (D,) in which the arm is held, or None to use joint_states.
             zeroed: Whether the lengths are calibrated; if not, each may have any constant offset.
-            motors: How the motors of a ros2_control robot are connected; None: muscle_states.
+            motors: How the motors of a ros2_control robot are connected, or None for muscle_states.
         """
         self._robot, self._zeroed, self._pace = robot, zeroed, Pace(rate)
         self._motors = motors or MotorInterface(MotorSettings(), robot.muscles)
@@ -107,7 +109,7 @@ class Listening:
         return self._pace.count
 
     def muscles(self, message: object, now: float, sent: float = math.nan, number: int = 0) -> None:
-        """Take a message of muscle_states, or of the motors.
+        """Record a message of muscle_states, or of the motors.
 
         Args:
             message: The message.
@@ -125,7 +127,7 @@ class Listening:
             self._read.append((states, self._theta))
 
     def joints(self, message: object) -> None:
-        """Take a message of joint_states."""
+        """Record a message of joint_states."""
         with self._rejecting('joint_states'):
             self._not_finite.update(joints_not_finite(message, self._robot.joints))
             theta = read_posture(message, self._robot.joints, some=True)

@@ -10,8 +10,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.verdict import Verdict
 
-RELEASE, MEAN = 0.6, 0.3  # [s] wait after a release; time over which readings are averaged
-RELEASE_SPEED = 0.03  # [m/s] at which a target returns
+RELEASE = 0.6  # wait after a release [s]
+MEAN = 0.3  # time over which readings are averaged [s]
+RELEASE_SPEED = 0.03  # speed at which a target returns [m/s]
 
 Wait = Generator[None, None, None]  # each step takes one message
 
@@ -24,7 +25,7 @@ class MotionTest(ABC):
     """Moves one muscle at a time, with one command per message, and checks the responses."""
 
     def __init__(self, verdict: Verdict, muscles: Sequence[int]) -> None:
-        """Prepare to test muscles; no muscles: all. The verdict receives the results."""
+        """Prepare to test muscles, by default all. The verdict receives the results."""
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._muscles = robot, muscles or range(robot.muscle_count)
         self.trying = ''  # current step, for messages

@@ -13,10 +13,10 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.verdict import Verdict
 
-RATE_TOLERANCE = 0.2  # relative
-LONGEST_GAP = 0.2  # [s], the controller's `max_age`
-OWN_PAUSE = 0.05  # [s]; shorter pauses of this process are ignored
-LEAST_LOST = 0.05  # share of lost messages from which they are reported
+RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
+LONGEST_GAP = 0.2  # longest gap between two messages [s]; the controller's `max_age`
+OWN_PAUSE = 0.05  # shorter pauses of this process are ignored [s]
+LEAST_LOST = 0.05  # a larger fraction of lost messages is reported
 
 
 class _Message(NamedTuple):

@@ -21,12 +21,13 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
 STEP = 0.003  # first step inwards, by which latency is measured [m]
-SPEED = 0.01  # [m/s] at which the target continues inwards
+SPEED = 0.01  # speed at which the target continues inwards [m/s]
 FURTHEST = 0.015  # farthest that the target moves inwards [m]
-OUTWARDS = 0.005  # [m]
+OUTWARDS = 0.005  # distance by which the target moves outwards [m]
 FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
-SHARES = 0.7, 1.4  # range of the motion of l divided by that of l_target
-RUN_AWAY_TENSION, RUN_AWAY = 60.0, 0.03  # [N] above the highest tension, [m] away from l_target
+SHARES = 0.7, 1.4  # legal range of the motion of l, divided by that of l_target
+RUN_AWAY_TENSION = 60.0  # excess over the highest tension that ends a test [N]
+RUN_AWAY = 0.03  # distance of l from l_target that ends a test [m]
 
 
 class Positioning(MotionTest):
@@ -39,7 +40,7 @@ class Positioning(MotionTest):
 
         Args:
             verdict: Receives the results.
-            muscles: Indices of the muscles; empty: all.
+            muscles: Indices of the muscles to test. Without any, all muscles are tested.
             highest: Tension at which a muscle is wound in no further [N]; None: ABOVE_BIAS above
                 T_bias, but at most tension.limit.
 

@@ -34,7 +34,7 @@ class Fault(NamedTuple):
     """A fault of the driver."""
 
     check: str
-    muscles: tuple[int, ...]  # indices; all for a fault of the whole driver
+    muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver
     observation: str
     change: str  # what to change in the driver
 
@@ -49,7 +49,7 @@ class Verdict:
         self.notes: list[str] = []  # remarks, and checks that were not possible
 
     def passed(self, check: str, *muscles: int) -> None:
-        """Record that muscles (none: all) passed a check, unless they have failed it."""
+        """Record that muscles, by default all, passed a check, unless they have failed it."""
         for m in muscles or range(self.robot.muscle_count):
             if self._state[m, CHECKS.index(check)] == OPEN:
                 self._state[m, CHECKS.index(check)] = OK
@@ -59,8 +59,8 @@ class Verdict:
 
         Args:
             what: Name of the fault in FAULTS.
-            muscles: Its muscles; none: all.
-            values: The values for the placeholders in its texts.
+            muscles: Indices of the affected muscles. Without any, all muscles are affected.
+            values: Values for the placeholders in the fault's texts.
         """
         texts = FAULTS[what]
         if muscles:

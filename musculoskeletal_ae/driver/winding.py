@@ -31,23 +31,27 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-ABOVE_BIAS = 40.0  # [N] default of the highest demanded tension, above T_bias
-LEAST_ABOVE_BIAS = 20.0  # [N]; responses to lower demands cannot be distinguished from noise
-SETTLE, HOLD = 1.5, 0.5  # [s] durations
-SPEED = 0.01  # [m/s] at which a target continues inwards while the arm gives way
-FURTHEST = 0.025  # [m] by which a muscle is wound in at most
-SLACK = 0.01  # [m] by which l_target is then set beyond l
-RUN_AWAY_TENSION = 60.0  # [N] above the demand at which a muscle is released
-RUN_AWAY = 0.05  # [m] of shortening at which a muscle is released
-MOMENT = 0.1  # [s] for which a falling arm may exceed RUN_AWAY_TENSION
-LATEST = 0.1  # [s] from a command to the first response
-TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1  # [N], share of the demand; the larger one applies
-LENGTH_ERROR = 2.0e-4  # [m] noise and resolution of l, two standard deviations
-SLOPES = 0.7, 1.4  # range of the change of T divided by that of the demand
-RESPONSE = 4.0, 0.0006  # [N], [m] above noise that count as a response
-CLIP = 20.0, 0.05  # demand beyond tension.max [N], tolerance beyond it (share)
-MIRROR_TOLERANCE = 0.008  # [m] around −l, where a muscle with the wrong sign of l gets tight
-MOST_BEYOND = 0.3  # highest demand beyond tension.max, as a share of it
+ABOVE_BIAS = 40.0  # default of the highest demanded tension, above T_bias [N]
+#: responses to lower demands above T_bias cannot be distinguished from noise [N]
+LEAST_ABOVE_BIAS = 20.0
+SETTLE = 1.5  # time in which the arm comes to rest after a motion [s]
+HOLD = 0.5  # time for which a demand is held [s]
+SPEED = 0.01  # speed at which a target continues inwards while the arm gives way [m/s]
+FURTHEST = 0.025  # largest distance by which a muscle is wound in [m]
+SLACK = 0.01  # distance by which l_target is then set beyond l [m]
+RUN_AWAY_TENSION = 60.0  # excess over the demand at which a muscle is released [N]
+RUN_AWAY = 0.05  # shortening at which a muscle is released [m]
+MOMENT = 0.1  # time for which a falling arm may exceed RUN_AWAY_TENSION [s]
+LATEST = 0.1  # longest time from a command to the first response [s]
+#: tolerance of T [N], and relative to the demand; the larger one applies
+TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
+LENGTH_ERROR = 2.0e-4  # two standard deviations of noise and resolution of l [m]
+SLOPES = 0.7, 1.4  # legal range of the change of T, divided by that of the demand
+RESPONSE = 4.0, 0.0006  # changes of T [N] and l [m] above noise that count as a response
+CLIP = 20.0, 0.05  # demand beyond tension.max [N], and tolerance relative to tension.max
+#: distance from −l within which a muscle with the wrong sign of l gets tight [m]
+MIRROR_TOLERANCE = 0.008
+MOST_BEYOND = 0.3  # highest demand beyond tension.max, relative to tension.max
 
 
 class _Reading(NamedTuple):
@@ -69,7 +73,7 @@ class Winding(MotionTest):
 
         Args:
             verdict: Receives the results.
-            muscles: Indices of the muscles; empty: all.
+            muscles: Indices of the muscles to test. Without any, all muscles are tested.
             highest: Highest demanded tension [N]; None: ABOVE_BIAS above T_bias.
 
         Raises:

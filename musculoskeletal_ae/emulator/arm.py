@@ -27,13 +27,15 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.robot import Robot
 
-SLIDING_DISTANCE = 0.0005  # [m] of sliding over which tendon friction builds up
+SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]
 # Joints.
-ARMATURE = 0.004  # [kg·m²] rotor and bearing inertia of a joint module; chosen
-STICKING_ANGLE = 0.003  # [rad] over which joint friction builds up (of the pinion if prismatic)
-VISCOUS = 0.5  # [N·m·s/rad]
-STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # joint limits [N·m/rad], [N·m·s/rad]
-STOP_LOAD = 40.0  # [N·m] load by weight and muscles at T_bias above which stops are stiffer
+ARMATURE = 0.004  # rotor and bearing inertia of a joint module [kg·m²]; chosen by hand
+STICKING_ANGLE = (
+    0.003  # angle over which joint friction builds up (of the pinion if prismatic) [rad]
+)
+VISCOUS = 0.5  # viscous friction of a joint [N·m·s/rad]
+STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # of the joint limits [N·m/rad], [N·m·s/rad]
+STOP_LOAD = 40.0  # load by weight and muscles at T_bias above which stops are stiffer [N·m]
 
 
 #: Constants of one individual for the compiled step: series elastic elements, tendons and sensors

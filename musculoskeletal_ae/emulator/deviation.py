@@ -26,11 +26,13 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.robot.robot import Robot
 
-ATTACHMENT, FARTHEST = 0.1, 0.005  # share of the typical moment arm; [m]
-SLACK, LONGEST = 0.05, 0.002  # share of the typical moment arm; [m]
-MASS = 0.1  # σ of the logarithm
-ZERO = 0.01  # of tension sensors, share of T_limit
-POSTURES = 200  # over which moment arms are averaged
+ATTACHMENT = 0.1  # σ of a displacement, relative to the typical moment arm
+FARTHEST = 0.005  # largest σ of a displacement [m]
+SLACK = 0.05  # σ of the slack, relative to the typical moment arm
+LONGEST = 0.002  # largest σ of the slack [m]
+MASS = 0.1  # σ of the logarithm of a mass
+ZERO = 0.01  # σ of the offset of tension sensors, relative to T_limit
+POSTURES = 200  # number of postures over which moment arms are averaged
 
 
 def effects(robot: Robot) -> Effects:

@@ -26,36 +26,46 @@ class Effects:
     kinks: float = 0.01  # detour of a tendon round bones' heads and other muscles [m]
     slip_over: float = 0.0057  # jump when a tendon slips over a ridge, in 5 % of postures [m]
     give: float = 5e-5  # displacement of a route point under its load [m/N]
-    joint_friction: float = 0.02  # share of a joint's largest load by weight and muscles at T_bias
-    links: float = 0.0  # multiple of σ: lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
+    joint_friction: float = (
+        0.02  # relative to a joint's largest load by weight and muscles at T_bias
+    )
+    links: float = (
+        0.0  # multiple of these σ: lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
+    )
     springs: float = 0.25  # σ of the logarithm of the stiffness of each joint's spring
-    spring_rest: float = 0.08  # σ of the angle at which it is at rest [rad]; prismatic: times RACK
+    spring_rest: float = (
+        0.08  # σ of the rest angle of each spring [rad]; prismatic joints: times RACK [m]
+    )
     # Series elastic elements, made of rubber
     stiffness: float = 0.4  # largest relative deviation from the data sheet
     laws: float = 1.0  # share of the muscles whose law differs from the data sheet
-    hysteresis: float = 0.2  # width of the loop, share of the elongation
-    creep: float = 0.05  # per decade of time, share of the elongation
+    hysteresis: float = 0.2  # width of the loop, relative to the elongation
+    creep: float = 0.05  # creep per decade of time, relative to the elongation
     # Tendons
-    recovery: float = 0.45  # delayed share of the stretch: most within 40 min, all within 12 h
+    recovery: float = (
+        0.45  # delayed share of the stretch; most of it comes within 40 min, all within 12 h
+    )
     bedding: float = 0.005  # lengthening of a tendon in its first hours [m]
     knot: float = 0.0034  # slip of one knot, once [m]
     guide_friction: float = 0.4  # relative tension loss along the route at mid-range
     stiction: float = 0.34  # relative increase of friction at the start of a motion
     # Sensors
-    tension_gain: float = 0.05  # σ
-    tension_zero: float = 5.0  # σ [N]
-    tension_bend: float = 0.02  # non-linearity, share of the full scale
-    tension_drift: float = 0.2  # of the zero with temperature [N/K]
+    tension_gain: float = 0.05  # σ of the relative error of the gain
+    tension_zero: float = 5.0  # σ of the offset [N]
+    tension_bend: float = 0.02  # non-linearity, relative to the full scale
+    tension_drift: float = 0.2  # drift of the offset with temperature [N/K]
     spool_gain: float = 0.05  # relative error of the spool's radius
     spool_layer: float = 0.1  # relative increase of the radius by the second layer of tendon
-    eccentricity: float = 0.0008  # of the spool [m]
+    eccentricity: float = 0.0008  # eccentricity of the spool [m]
     spool_slip: float = 0.0011  # slip of the tendon on its spool, once in five hours [m]
-    length_drift: float = 0.001  # σ [m/h]
-    joint_zero: float = np.radians(2.0)  # σ [rad]; prismatic joints: times RACK [m]
-    joint_bend: float = 0.01  # non-linearity, share of the joint's range
-    backlash: float = np.radians(1.0)  # of the joint sensor [rad]; prismatic: times RACK [m]
+    length_drift: float = 0.001  # σ of the drift of the offset [m/h]
+    joint_zero: float = np.radians(2.0)  # σ of the offset [rad]; prismatic joints: times RACK [m]
+    joint_bend: float = 0.01  # non-linearity, relative to the joint's range
+    backlash: float = np.radians(
+        1.0
+    )  # backlash of the joint sensor [rad]; prismatic joints: times RACK [m]
     # Messages
-    delay: float = 0.02  # of joint angles, and of lengths and tensions [s]
+    delay: float = 0.02  # delay of joint angles, and of lengths and tensions [s]
     jitter: float = 0.005  # range of the delay [s]
     dropouts: float = 0.001  # share of each module's messages that are lost
 

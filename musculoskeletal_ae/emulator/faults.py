@@ -16,22 +16,22 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES
 
-SPEED_LIMIT = 0.25  # [m/s] of a muscle module's motor; chosen
-SPIKE_SHARE = 0.05  # share of the readings in which one muscle has a spike
+SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
+SPIKE_SHARE = 0.05  # fraction of the readings in which one muscle has a spike
 
 
 class Kind(NamedTuple):
     """Properties of a kind of fault, and the meaning of its size."""
 
     meaning: str
-    size: float = 0.0  # default
+    size: float = 0.0  # default size
     largest: float = 0.0  # largest legal size; 0 if the kind has no size
     unit: str = ''
     of_muscle: bool = True
     of_quantity: bool = False
 
 
-#: size of a spike or bias by quantity (theta: joint angles): default, largest, unit
+#: size of a spike or bias of each quantity (theta: joint angles): default, largest, unit
 SIZES = {'length': (0.05, 1.0, 'm'), 'tension': (100.0, 1e4, 'N'),
          'temperature': (60.0, 1e3, '°C'), 'theta': (0.1, 3.2, 'rad')}  # fmt: skip
 KINDS = {
@@ -67,7 +67,7 @@ class Fault(NamedTuple):
 
     kind: str
     quantities: tuple[str, ...]
-    which: Ints  # muscles, or joints where the quantity is theta
+    which: Ints  # indices of the muscles, or of the joints if the quantity is theta
     size: float
 
 

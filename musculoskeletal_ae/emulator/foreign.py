@@ -28,14 +28,14 @@ from musculoskeletal_ae.robot.jumps import MOST_DRAWS, jumping
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
-GUIDES_EVERY = 5  # steps
-HISTORY = 64  # steps, the largest delay of a sensor
-HOUR = 3600.0  # [s]
-BEDDING_TIME = 2.0 * HOUR  # [s]
-NUDGE = 1e-7  # [rad]
-SLIP_TIME = 5.0 * HOUR  # [s] mean time between two slips of a tendon on its spool
-OTHER_LIMITS = 0.02  # tolerated difference of a file's joint limits, share of the joint's range
-OTHER_ROUTE = 0.02  # [m] tolerated difference of a file's route lengths
+GUIDES_EVERY = 5  # number of steps between two updates of the guides
+HISTORY = 64  # largest delay of a sensor, as a number of steps
+HOUR = 3600.0  # duration of an hour [s]
+BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens [s]
+NUDGE = 1e-7  # change of a posture in which MuJoCo's wrapping fails [rad]
+SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
+OTHER_LIMITS = 0.02  # tolerated difference of a file's joint limits, relative to the joint's range
+OTHER_ROUTE = 0.02  # tolerated difference of a file's route lengths [m]
 
 
 class ForeignBody:
@@ -151,7 +151,7 @@ class LateSensors:
         self._zero = radian * draw.normal('joint_zero', joints)
         self._bend = draw.about('joint_bend', joints, signed=True)
         self._backlash = radian * draw.about('backlash', joints)
-        self._delays = draw.about('delay', 2)  # of joint sensors and of muscle modules [s]
+        self._delays = draw.about('delay', 2)  # delay of joint sensors, and of muscle modules [s]
         self._history = np.zeros((HISTORY, joints + 3 * robot.muscle_count))
         self._steps = 0
 

@@ -196,7 +196,9 @@ class Arm(ABC):
     def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
         """Build the modules; `length_bias` [m] (M,) are the offsets of their length sensors."""
         self.robot, self._length_bias = robot, length_bias
-        self.command_timeout = 0.5  # [s] without a command until the modules go safe
+        self.command_timeout = (
+            0.5  # time without a command until the modules go to their safe state [s]
+        )
         self._rng = np.random.default_rng([seed, 0x5E45])
         self._heat_rng = np.random.default_rng([seed, 0x4EA7])
         self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))

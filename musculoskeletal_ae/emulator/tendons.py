@@ -22,21 +22,22 @@ from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, MuscleSt
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot
 
-# Chosen constants that are not sizes of effects.
-SLIDING = 0.0003  # [m] of sliding over which friction builds up
-BREAKING = 0.0005  # [m] of sliding that ends stiction
-STICKING = 0.5  # [s] at rest after which stiction is back
-LOOP = 0.003  # [m] of elongation over which rubber changes from one side of its loop to the other
-RIDGE = 5.0  # [%] of a route's lengths that lie beyond the ridge
-BACK = 0.003  # [m] before the ridge at which the tendon slips back
-GUIDES = 1.0  # [rad] bend of the tendon between its motor and its first route point
-SPOOL = 0.01  # [m] radius
+# Modelling constants, chosen by hand. The magnitudes of the effects are in `effects.py`.
+SLIDING = 0.0003  # sliding distance over which friction builds up [m]
+BREAKING = 0.0005  # sliding distance that ends stiction [m]
+STICKING = 0.5  # time at rest after which stiction is back [s]
+#: elongation over which rubber changes from one side of its hysteresis loop to the other [m]
+LOOP = 0.003
+RIDGE = 5.0  # percentage of a route's lengths that lie beyond the ridge [%]
+BACK = 0.003  # distance before the ridge at which the tendon slips back [m]
+GUIDES = 1.0  # bend of the tendon between its motor and its first route point [rad]
+SPOOL = 0.01  # radius of the spool [m]
 # Time constants [s]: four of creep, at a constant rate over four decades of time, and two of a
 # tendon's delayed stretch.
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
-LATE = np.array([0.75, 0.25])  # share of each of the last two
-KNOTS = 200  # of the table of a law
-GIVING = 0.1  # [s] time constant with which a route point follows its load
+LATE = np.array([0.75, 0.25])  # fractions of the delayed stretch that follow the last two of them
+KNOTS = 200  # number of entries of the table of an elastic law
+GIVING = 0.1  # time constant with which a route point follows its load [s]
 
 
 class Springs:

@@ -31,9 +31,9 @@ class Tree(NamedTuple):
     """Joints in pinocchio's order; joint 0 is the root link."""
 
     parent: Ints  # (J,)
-    rotation: Array  # fixed placement in the parent, (J, 3, 3)
-    translation: Array  # [m], (J, 3)
-    axis: Array  # in the joint's frame, (J, 3)
+    rotation: Array  # fixed orientation in the parent's frame, (J, 3, 3)
+    translation: Array  # fixed position in the parent's frame [m], (J, 3)
+    axis: Array  # axis in the joint's frame, (J, 3)
     prismatic: Bools  # (J,)
 
 
@@ -42,20 +42,20 @@ class WrappedRoutes(NamedTuple):
 
     tree: Tree
     point_joint: Ints  # tree joint that carries each point, (P,)
-    point: Array  # in that joint's frame [m], (P, 3)
+    point: Array  # position of each point in that joint's frame [m], (P, 3)
     first: Ints  # start point of each segment, (S,)
     second: Ints  # end point of each segment, (S,)
     muscle: Ints  # muscle of each segment, (S,)
     weight: Array  # factor of each segment's length and tension, (S,)
-    objects: WrapObjects  # object that each segment wraps around; radius 0 if none
+    objects: WrapObjects  # object that each segment wraps around; radius 0 if there is none
 
 
 class Placed(NamedTuple):
     """Poses of joints, route points and tendons in the root link's frame; `place` fills them in."""
 
-    rotation: Array  # of joints, (J, 3, 3)
-    translation: Array  # of joints [m], (J, 3)
-    axis: Array  # of joints, (J, 3)
+    rotation: Array  # orientation of each joint, (J, 3, 3)
+    translation: Array  # position of each joint [m], (J, 3)
+    axis: Array  # axis of each joint, (J, 3)
     world: Array  # route points [m], (P, 3)
     absolute: Array  # lengths of the routes [m], (M,)
     leave: Array  # unit vector along the tendon at the start of each segment, (S, 3)

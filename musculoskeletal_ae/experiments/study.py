@@ -135,19 +135,25 @@ class Measured(NamedTuple):
     traces: dict[str, Any]  # data of the plots
 
 
-def round_numbers(value: Any) -> Any:
+def round_numbers(value: Any, path: str = '') -> Any:
     """Return a value with its floats rounded to `DIGITS` digits, ready for JSON.
+
+    Args:
+        value: A number, a text, or nested dictionaries and lists of them.
+        path: Position of the value within the results, for the error message.
 
     Raises:
         MusculoskeletalError: If a number is not finite, which JSON cannot represent.
     """
     if isinstance(value, Mapping):
-        return {key: round_numbers(part) for key, part in value.items()}
+        return {key: round_numbers(part, f'{path}.{key}') for key, part in value.items()}
     if isinstance(value, list):
-        return [round_numbers(part) for part in value]
+        return [round_numbers(part, f'{path}[{n}]') for n, part in enumerate(value)]
     if isinstance(value, float):
         if not math.isfinite(value):
-            raise MusculoskeletalError('a result of an experiment is not a finite number')
+            raise MusculoskeletalError(
+                f'the result {path.removeprefix(".")} is {value}; expected a finite number'
+            )
         return float(f'{value:.{DIGITS}g}')
     return value
 

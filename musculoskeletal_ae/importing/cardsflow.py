@@ -80,19 +80,25 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                     at = source.place(body)[1].actInv(at)
                 if kind in ROUND:
                     if not route or isinstance(route[-1], Wrap):
-                        source.note('dropped', f'muscle {name}: a {kind} via point after no point')
+                        source.note(
+                            'dropped',
+                            f'muscle {name}: a {kind} via point without a point before it',
+                        )
                         continue
                     radius = float(numbers(via.get('radius'), 1, f'{where} radius')[0])
                     axis = np.eye(3)[2] if kind == 'CYLINDRICAL' else None
                     route.append(Wrap(body, at, radius, axis, None))
-                    source.note('chosen', f'muscle {name}: it wraps the short way around')
+                    source.note('chosen', f'muscle {name} wraps the short way around the object')
                     continue
                 if kind != 'FIXPOINT':
-                    source.note('approximated', f'muscle {name}: a {kind} via point is a point')
+                    source.note(
+                        'approximated',
+                        f'muscle {name}: a {kind} via point was imported as a fixed point',
+                    )
                 route.append(RoutePoint(body, at))
         if route and isinstance(route[-1], Wrap):
             route.pop()
-            source.note('dropped', f'muscle {name}: a wrap before no point')
+            source.note('dropped', f'muscle {name}: a wrap without a point after it')
         source.routes[name] = tuple(route)
     if model == 'model.urdf':
         _measure(source)

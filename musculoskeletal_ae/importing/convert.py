@@ -158,12 +158,12 @@ def play(robot: Robot, file: Path) -> int:
     start = time.process_time()
     arm.step(PLAYED)
     needed = (time.process_time() - start) / PLAYED
-    message = f'played: a second of the model takes {needed:.2g} s of a core'
+    message = f'simulation speed: one second of the model takes {needed:.2g} s of CPU time'
     if needed <= REAL_TIME:
-        print(f'{message}: it runs in real time')
+        print(f'{message}, which is fast enough for real time')
         return 0
     slower = needed / REAL_TIME
-    print(f'{message}: about {slower:.2g} times slower than real time; the nodes run on its clock')
+    print(f'{message}, about {slower:.2g} times too slow for real time; the nodes use its clock')
     return SLOW
 
 

@@ -57,12 +57,13 @@ def _suggested(robot: Robot, args: Namespace) -> int:
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
     far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
     if not before:
-        print('moving via points cannot remedy these faults; nothing is written')
+        print('moving via points cannot remedy these faults; nothing was written')
         return 1
     if after:
-        print(f'no sound arm was found within {1e3 * args.reach:g} mm;', end=' ')
+        reach = f'{1e3 * args.reach:g} mm'
+        print(f'moving each via point by at most {reach} does not make the robot sound;', end=' ')
         if after >= before:
-            print('no candidate is better, and nothing is written')
+            print('no candidate has fewer faults than the robot, and nothing was written')
             return 1
         print('the best candidate is', end=' ')
     write(robot, change, args.out)

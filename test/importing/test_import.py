@@ -293,8 +293,8 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
     cardsflow.write_text(text.replace('</viaPoint></link></myo', f'</viaPoint>{wrap}</link></myo'))
     result = import_robot(cardsflow, tmp_path / 'out')
     assert (result.robot.muscles, result.comparison) == (('front', 'back'), ({}, {}, {}))
-    assert 'dropped: muscle front: a wrap before no point' in result.notes
-    assert 'dropped: muscle front: a SPHERICAL via point after no point' in result.notes
+    assert 'dropped: muscle front: a wrap without a point after it' in result.notes
+    assert 'dropped: muscle front: a SPHERICAL via point without a point before it' in result.notes
     cardsflow.write_text('<cardsflow/>')
     with pytest.raises(SourceError, match=r'it has no muscle with a route$'):
         read_source(cardsflow)
