@@ -48,6 +48,10 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream,
 
 #: largest time between two messages that detectors count [s]; a longer pause counts as this
 LONGEST_PERIOD = 0.1
+#: after a longer pause between two messages [s], the detectors start to collect evidence anew. What
+#: happened in the pause is unknown: the driver may have received no commands, or the whole computer
+#: may have stood still. The controller stops the arm after the same time (`max_age`).
+INTERRUPTION = 0.2
 JOINTS_AGE = 0.05  # [s] age up to which measured joint angles are used with a message
 SHIFTED = 0.02  # [m] change of an estimated offset above which it is published again
 
@@ -292,6 +296,8 @@ class Estimator:
         if self.mae is None:
             return None
         self.stepped_at = now
+        if elapsed > INTERRUPTION:
+            self.health.reset()
         if elapsed > SILENCE:
             self.contact.reset()
         return self._estimate(sample, elapsed, now)

@@ -9,7 +9,7 @@ import pytest
 
 from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
-from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD, Estimator
+from musculoskeletal_ae.estimation.estimator import INTERRUPTION, Estimator
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.status import SILENCE
@@ -130,13 +130,19 @@ def test_an_old_command_makes_no_muscle_a_suspect(robot, mae, slack):
     assert any(estimate.detected for estimate in stepped.step(slack, 2))
 
 
-def test_a_pause_between_messages_does_not_count_as_time_without_tension(robot, mae, slack):
+@pytest.mark.parametrize('pause', [10.0, 1.5 * INTERRUPTION])
+def test_messages_before_a_pause_are_no_evidence_of_a_muscle_without_tension(
+    robot, mae, slack, pause
+):
+    """On a computer that stands still again and again, a module may not have received commands."""
     stepped = EstimatorBench(robot, mae)
-    for _ in range(round(DEAD_TIME / LONGEST_PERIOD)):
-        stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
-        assert not stepped.step(slack, dt=10.0)[0].detected
-    stepped.core.commanded(stepped.now + 10.0, length=slack.length - 0.003)
-    assert any(estimate.detected for estimate in stepped.step(slack, 2, dt=10.0))
+    for _ in range(10):
+        stepped.core.commanded(stepped.now + pause, length=slack.length - 0.003)
+        assert not stepped.step(slack, dt=pause)[0].detected
+        few = stepped.step(slack, round(0.3 * DEAD_TIME / DT))
+        assert not any(estimate.detected for estimate in few)
+    stepped.core.commanded(stepped.now, length=slack.length - 0.003)
+    assert any(estimate.detected for estimate in stepped.step(slack, round(DEAD_TIME / DT)))
 
 
 def message_of(values):
