@@ -195,7 +195,7 @@ class CalibratedBody:
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 
     def crept(self, age: Array) -> Array:
-        """Return the creep of each muscle since each sample [m], (N, M); `age` is a, (N,)."""
+        """Return the creep of each muscle since each sample [m], (N, M), for ages a (N,)."""
         rates = [p[at.creep] for p, at in zip(self.parameters, self.layouts, strict=True)]
         return age[:, None] * np.array(rates)
 

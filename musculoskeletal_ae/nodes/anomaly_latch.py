@@ -43,7 +43,7 @@ class AnomalyLatch:
             self._ask()
 
     def _ask(self) -> None:
-        """Ask the estimator; drop an earlier request, which a restarted one never answers."""
+        """Ask the estimator; drop an earlier request, which a restarted estimator never answers."""
         if self._future is not None:
             self._client.remove_pending_request(self._future)
         self._future = self._client.call_async(Trigger.Request())

@@ -48,7 +48,7 @@ class Markers:
     """Publishes ARM/markers while the topic has a subscriber."""
 
     def __init__(self, node: Shell, arm: str, lines: Callable[[], list[Line]]) -> None:
-        """Draw the lines that `lines` returns; an empty list publishes nothing."""
+        """Draw the lines that `lines` returns; if there are none, publish nothing."""
         self._node, self._lines = node, lines
         self._bones = BONE_COLOURS.get(arm, HARDWARE_COLOUR)
         self._publisher = node.create_publisher(MarkerArray, f'{arm}/markers', RELIABLE)

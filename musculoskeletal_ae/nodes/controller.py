@@ -56,7 +56,7 @@ from musculoskeletal_ae.validity import (
 
 
 class Controller(Shell):
-    """Node shell of control."""
+    """Passes messages, parameters and services to the core controller; publishes its commands."""
 
     # Several publishers of muscle_states stop the arm, but paying out still needs the readings.
     accepted_from_all = frozenset({'muscle_states'})

@@ -19,7 +19,13 @@ class Diagnostics:
     """Publishes the reports of one node, each as a single status."""
 
     def __init__(self, node: Node, reception: Reception, hardware: str) -> None:
-        """Report for a node and its reception; `hardware` becomes the hardware id of the status."""
+        """Prepare the reports of a node.
+
+        Args:
+            node: The node.
+            reception: Counts of the messages that the node has used and rejected.
+            hardware: Hardware id of the status.
+        """
         self._node, self._reception, self._hardware = node, reception, hardware
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._published_at = time.monotonic()

@@ -48,7 +48,7 @@ OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estim
 
 
 class Estimator(Shell):
-    """Node shell of the estimator: converts messages, and publishes results and changes."""
+    """Passes messages, parameters and services to the core estimator; publishes its results."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)

@@ -59,7 +59,7 @@ class _Group(NamedTuple):
 
 
 class LeanExecutor(SingleThreadedExecutor):
-    """Runs the callbacks of timers, subscriptions, services and clients without overhead.
+    """Runs the callbacks of timers, subscriptions, services and clients with little overhead.
 
     rclpy handles everything else in a *full round*. Asynchronous callbacks, other tasks and actions
     trigger a full round at once. QoS events wait for the next one, at most a second.

@@ -31,7 +31,7 @@ PACE_TIME = 5.0  # time over which the real-time factor is averaged [s]
 
 
 class HardwareEmulator(Arm):
-    """Node shell of the emulated arm."""
+    """Passes commands and faults to the emulated arm; publishes its measurements."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('hardware_emulator', **options)

@@ -33,7 +33,7 @@ JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 
 class Learner(Shell):
-    """Node shell of online learning."""
+    """Passes messages, parameters and services to the core learner; publishes its networks."""
 
     is_time_critical = False
 

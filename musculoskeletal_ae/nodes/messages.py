@@ -32,7 +32,7 @@ LATCHED = QoSProfile(
 
 
 def array_message(values: Array, *labels: str) -> Float64MultiArray:
-    """Return a multi-array of values (…) with one label per dimension."""
+    """Return a multi-array message of values, with one label for each dimension."""
     layout = _layout(values.shape, labels)
     return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
 

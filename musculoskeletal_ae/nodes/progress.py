@@ -90,7 +90,7 @@ class ProgressWatch:
 
 
 def _is_patient() -> bool:
-    """Whether the main thread is in code that may take long."""
+    """Return whether the main thread is in code that may take long."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
         if frame.f_globals.get('__name__', '').partition('.')[0] in SLOW_MODULES:

@@ -280,7 +280,7 @@ class Shell(Node):
     # -- parameters -----------------------------------------------------------------------------
 
     def parameter(self, name: str) -> Any:
-        """Return a parameter's checked value; lists as tuples, without empty names.
+        """Return the checked value of a parameter; a list becomes a tuple without empty names.
 
         Raises:
             MusculoskeletalError: If the value is not legal.
@@ -597,7 +597,7 @@ class Shell(Node):
         return Report('error', f'{report.message}; {text}', values)
 
     def _is_silent(self, topic: str) -> bool:
-        """Whether a stream was received or is published, but no usable message arrives."""
+        """Return whether no usable messages arrive on a stream that was used or is published."""
         reception = self._reception
         if topic not in STREAMS or reception.silence(topic) <= SILENCE:
             return False

@@ -29,7 +29,7 @@ TEMPERATURE = 25.0  # reported temperature of all modules [°C]
 
 
 class Sim(Arm):
-    """Node shell of the simulation."""
+    """Passes commands and wrenches to the simulation of the learned body; publishes its states."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('sim', **options)

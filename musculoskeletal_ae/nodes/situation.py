@@ -250,7 +250,7 @@ class Situation:
         ]
 
     def silent_nodes(self) -> dict[str, float]:
-        """Return the needed nodes that have stopped reporting, and the time since [s]."""
+        """Return the time since the last report of each needed node that has become silent [s]."""
         now = self._ticked_at - self._slept
         return {
             name: now - node.heard_at

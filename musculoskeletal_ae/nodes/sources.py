@@ -123,7 +123,7 @@ class Twins:
     """
 
     def __init__(self, name: str, identity: str) -> None:
-        """Watch reports with status name `name`; our own contain `identity`."""
+        """Watch reports with this status name; the reports of our own node contain `identity`."""
         # With the length prefix of CDR, `/controller` does not match within `/left/controller`.
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()

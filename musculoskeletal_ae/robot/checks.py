@@ -265,7 +265,7 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     for line, text, cells in read_csv(file, COLUMNS, refusal):
         where = f'{file}: line {line}'
         if len(cells) != len(COLUMNS):
-            expected = ','.join(COLUMNS)
+            expected = f'3 values ({",".join(COLUMNS)})'
             raise RobotDescriptionError(f'{where}: expected {expected}, got {text.strip()!r}')
         row = [*cells[:2], cells[2].replace('−', '-')]
         for column, cell, names in zip(COLUMNS, row, legal, strict=True):

@@ -152,7 +152,7 @@ class RobotDescription:
 
     @property
     def joint_notes(self) -> list[str]:
-        """Lines that name coupled joints, those held fixed, and modules that follow positions."""
+        """Lines about coupled joints, the kind of muscle modules, and joints held fixed."""
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if self.follows_position:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
@@ -466,7 +466,7 @@ def _fixed_above(model: pin.Model) -> dict[str, int]:
 
 
 def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
-    """Return how many of these joints move each link."""
+    """Return how many of the joints in `names` move each link."""
     return {
         str(link.name): sum(model.names[i] in names for i in model.supports[link.parentJoint])
         for link in body_frames(model)

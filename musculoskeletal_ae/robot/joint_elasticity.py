@@ -44,7 +44,7 @@ class JointElasticity:
 
     @property
     def rest(self) -> Array:
-        """The posture at which no spring exerts torque [rad], (D,); 0 for joints without one."""
+        """The posture at which no spring exerts torque [rad], (D,); 0 for joints without any."""
         rest: Array = np.linalg.pinv(self.stiffness, hermitian=True) @ self.preload
         return rest
 

@@ -148,7 +148,7 @@ class JointElasticityEntry(Strict, frozen=True):
 
 
 class MuscleFile(Strict, frozen=True):
-    """The whole file."""
+    """The content of muscles.yaml."""
 
     joints: Names
     muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]

@@ -40,7 +40,11 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
 
     @cache
     def attempt(*steps: int) -> tuple[float, str]:
-        """Return the share of postures with these steps of the changes (0: none), and a text."""
+        """Apply steps of the changes; return the share of held or stiff postures, and a text.
+
+        Args:
+            steps: Number of the step of each change, from 1; 0 for no change.
+        """
         setting, texts = check.setting, list[str]()
         for (what, factors), step in zip(CHANGES.items(), steps, strict=True):
             if step:

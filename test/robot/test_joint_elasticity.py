@@ -203,7 +203,7 @@ def test_a_joint_has_one_entry_and_a_pair_one_term(tmp_path):
     lift = {'joint': 'lift', 'stiffness': 1.0, 'coupled': {'bend': 0.1}}
     with pytest.raises(RobotDescriptionError, match="'bend' is listed twice"):
         Robot.load(write_robot(tmp_path, joint_elasticity=[bend, bend]))
-    with pytest.raises(RobotDescriptionError, match='is given twice; give it once'):
+    with pytest.raises(RobotDescriptionError, match='are coupled twice; remove one entry'):
         Robot.load(write_robot(tmp_path, joint_elasticity=[bend, lift]))
 
 
