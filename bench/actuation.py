@@ -36,10 +36,11 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
-EXPLORED, HELD_OUT = 300.0, 60.0  # [s]
-TARGETS, HELD = 5, 4.0  # [s] for each
+EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held-out motion [s]
+TARGETS, HELD = 5, 4.0  # number of targets, and time for each of them [s]
 RUPTURES = 3
-MOVING, LATEST = 4.0, 10.0  # [s] before a rupture, and until its isolation
+MOVING = 4.0  # duration of motion before a rupture [s]
+LATEST = 10.0  # longest time from a rupture to its isolation [s]
 #: kinds of modules: actuation and tension_source of muscles.yaml
 KINDS = {
     'stiffness': {'actuation': 'stiffness'},
@@ -60,10 +61,10 @@ class Result(NamedTuple):
     before: float
     after: float
     control: float
-    isolated: float  # share of the ruptures after which a muscle was isolated
+    isolated: float  # fraction of the ruptures after which a muscle was isolated
     named: float
     finding_time: float  # mean time to the finding [s]
-    highest: float  # as a multiple of the limit
+    highest: float  # highest tension, relative to tension.limit
     wrong: float
     samples: float
 

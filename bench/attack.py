@@ -39,20 +39,21 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-JITTER = 0.03  # [s] delay between computing and publishing a command on a loaded machine
-RELIEF = 0.3  # [s] before a command, in which an excess tension justifies fast paying out
-SILENT = 10.0  # [s] longest legal time between two reports of a node under attack
+JITTER = 0.03  # delay between computing and publishing a command on a loaded machine [s]
+RELIEF = 0.3  # an excess tension justifies fast paying out for this time [s]
+SILENT = 10.0  # longest legal time between two reports of a node under attack [s]
 GROWTH = 1.2  # largest legal ratio of a node's memory to that at age YOUNG
-YOUNG = 300.0  # [s] age of a node from which its memory is compared
-ABOVE, MOMENT = 1.1, 0.5  # tension / tension.limit, and the longest legal time above it [s]
-STILL = 0.002  # [m] by which a stopped arm may be wound in
-MOST_MEMORY = 500.0  # [MB] of any node at any time
+YOUNG = 300.0  # age of a node from which its memory is compared [s]
+#: tension relative to tension.limit, and the longest legal time above it [s]
+ABOVE, MOMENT = 1.1, 0.5
+STILL = 0.002  # distance by which a muscle of a stopped arm may be wound in [m]
+MOST_MEMORY = 500.0  # largest legal memory of a node at any time [MB]
 
 
 class Size(NamedTuple):
     """Number of trials, over all seeds."""
 
-    attacks: int | None  # known attacks; None: all of them
+    attacks: int | None  # number of known attacks, or None for all of them
     events: int
     messages: int
     node_kills: int
@@ -64,7 +65,7 @@ class Size(NamedTuple):
 FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
 QUICK = Size(2, 8, messages=2000, node_kills=2, learner_kills=0, files=42, episodes=1)
 SEEDS = 0, 1, 2, 3, 4
-EVENTS_IN_A_ROW = 50  # between two recoveries of the arm
+EVENTS_IN_A_ROW = 50  # number of random events between two recoveries of the arm
 
 
 class Row(NamedTuple):
@@ -79,8 +80,8 @@ class Steps(NamedTuple):
     """Changes between successive commands of the controller."""
 
     count: int
-    largest_in: float  # winding in, in one tick [m]
-    largest_out: float  # paying out [m]
+    largest_in: float  # largest winding in within one tick [m]
+    largest_out: float  # largest paying out within one tick [m]
     too_fast: list[str]
 
 

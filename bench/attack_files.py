@@ -26,8 +26,8 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # [s] of CPU time for one file
-MOST_MEMORY = 300  # [MB] that one file may add to the process's peak
+LONGEST = 5.0  # longest legal CPU time for one file [s]
+MOST_MEMORY = 300  # memory that one file may add to the process's peak [MB]
 NASTY = (0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {})
 KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
@@ -38,7 +38,7 @@ class Attempt(NamedTuple):
     kind: str
     outcome: str
     seconds: float  # CPU time
-    memory: float  # [MB] added to the peak
+    memory: float  # memory added to the peak of the process [MB]
 
     @property
     def broken(self) -> bool:

@@ -66,8 +66,8 @@ SERVICES = {
     'rcl_interfaces/srv/ListParameters': ListParameters,
 }
 OWN = QoSProfile(depth=1000)
-JUDGE_PERIOD = 0.25  # [s] between checks of the status line
-PATIENCE = 90.0  # [s] to wait for any expected event
+JUDGE_PERIOD = 0.25  # time between two checks of the status line [s]
+PATIENCE = 90.0  # longest wait for an expected event [s]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
@@ -80,7 +80,7 @@ LENGTHS = (0, 1, 2, 6, 18, 1000)
 class Command(NamedTuple):
     """One command that the controller published."""
 
-    time: float  # of publishing, by the publisher's clock [s]
+    time: float  # time of publishing by the publisher's clock [s]
     number: int  # sequence number of the message
     life: int  # number of controller restarts before it
     topic: str
@@ -96,7 +96,7 @@ class Process:
         with log.open('ab') as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
         self.started = time.monotonic()
-        self.memory: list[tuple[float, float]] = []  # age [s], resident [MB]
+        self.memory: list[tuple[float, float]] = []  # age [s] and resident memory [MB]
 
     def alive(self) -> bool:
         """Whether the process still runs."""
@@ -137,25 +137,28 @@ class Attack:
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
         self.sent: set[int] = set()  # digests of hostile values
-        self.genuine: dict[str, Any] = {}  # last message of the system, by topic
+        self.genuine: dict[str, Any] = {}  # last message that the system itself sent, by topic
         self.commands: list[Command] = []
         self.life = 0
-        self.loads: list[tuple[float, Array]] = []  # time [s], measured T [N] (M,)
+        self.loads: list[tuple[float, Array]] = []  # time [s] and measured T [N] (M,)
         self.levels: dict[str, tuple[float, DiagnosticStatus]] = {}
-        self.silences: dict[str, float] = {}  # longest between two reports of a node [s]
+        self.silences: dict[str, float] = {}  # longest time between two reports of a node [s]
         self.tried: Counter[str] = Counter()
         self.findings: dict[str, list[str]] = {}
         self.samples = 0
         self.situation = Situation(self.namespace)
-        self.status: list[tuple[float, str, str]] = []  # time [s], level and text
+        self.status: list[
+            tuple[float, str, str]
+        ] = []  # time [s], level and text of the status line
         self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
         #: intervals [s] in which other nodes may send commands, or sensor data are wrong
         self.foreign: list[tuple[float, float]] = []
         self.lying: list[tuple[float, float]] = []
         self.strangers: list[Process] = []  # duplicate nodes that the attack started
         self.watches_processes = True  # whether the end of a process is a finding
-        self._learner, self._other_learners = '', set[str]()  # identities in reports
-        self._lying_since = 0.0  # [s] since when sensors are wrong; 0: they are not
+        self._learner = ''  # identity of the system's own learner, from /diagnostics
+        self._other_learners = set[str]()  # identities of duplicates that the attack started
+        self._lying_since = 0.0  # time since which sensors are wrong, or 0 if they are not [s]
         self._topics: dict[str, str] = {}
         self._services: dict[str, str] = {}
         self._looked = self._judged = 0.0

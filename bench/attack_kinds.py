@@ -28,9 +28,9 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 
 MOMENTS = 'holding', 'exploring'
-LASTING = 4.0  # [s] duration of an attack
-REPORT_TIME = 2.0  # [s] after which the status line has to report a problem
-OFFSET = 0.08  # [m] of false length offsets
+LASTING = 4.0  # duration of an attack [s]
+REPORT_TIME = 2.0  # time after which the status line has to report a problem [s]
+OFFSET = 0.08  # size of false length offsets [m]
 STEPS = {step.identifier: step for step in Step}
 
 
@@ -40,7 +40,7 @@ class Scene:
     def __init__(self, attack: Attack) -> None:
         """Use a running system and the hostile node of `attack`."""
         self.attack, self.rng = attack, attack.rng
-        self.what = ''  # present attack, for findings
+        self.what = ''  # description of the present attack, which findings name
 
     # -- the course of an attack ----------------------------------------------------------------
 

@@ -46,7 +46,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 # Never used for learning.
 HELD_OUT_SEED = 9001
-EVERY = 10  # samples
+EVERY = 10  # every tenth message is evaluated
 
 
 class Row(NamedTuple):

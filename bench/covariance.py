@@ -37,8 +37,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT = 60.0  # [s]
-STEPS = 400, 1200  # of each update
+HELD_OUT = 60.0  # duration of the held-out motion [s]
+STEPS = 400, 1200  # number of training steps of each update
 #: what the learner receives of the joint angles, by its source of θ
 VIEWS: dict[str, JointView] = {
     SENSOR: lambda _learner, _n, _true, read: read,

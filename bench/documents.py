@@ -39,8 +39,8 @@ PAGES = (
 )
 BACKGROUND = 'Ctrl-C ends it'
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
-START_PATIENCE = 1800  # [s] for the first status line, installation included
-COMMAND_PATIENCE = 900  # [s] for all other commands of a page
+START_PATIENCE = 1800  # longest wait for the first status line, installation included [s]
+COMMAND_PATIENCE = 900  # longest duration of all other commands of a page [s]
 NAME = 'musculoskeletal_ae'
 INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'
 FUNCTIONS = f"""
@@ -84,7 +84,7 @@ class Command(NamedTuple):
 
     line: str
     is_background: bool
-    skipped_because: str  # '' if it is run
+    skipped_because: str  # reason for which the command is skipped; '' if it is run
 
 
 def commands(page: Path) -> list[Command]:

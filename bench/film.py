@@ -37,13 +37,17 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test' / 'view'))
 from browser import Browser  # noqa: E402 - the tests' own browser
 
-SIZE, SCALE, COLOURS = (1280, 720), 0.75, 128  # of the page, and of its pictures
+SIZE = 1280, 720  # size of the page [pixels]
+SCALE, COLOURS = 0.75, 128  # scale and number of colours of the pictures
 SCALED = round(SCALE * SIZE[0]), round(SCALE * SIZE[1])
-LEARNING, MOVING_ON = 60.0, 25.0  # [s] before the rupture, and after the isolation
-EVERY, EVERY_LATER = 1.0, 0.4  # [s] between pictures while learning, and around the rupture
-FRAME, LAST = 110, 1500  # [ms] that a picture of the film is shown, and the last one
-SETTLE = 3.0  # [s] from the first status until the whole page is drawn
-PATIENCE = 600.0  # [s] to wait for the start and for each event of the film
+LEARNING = 60.0  # duration of the film before the rupture [s]
+MOVING_ON = 25.0  # duration of the film after the isolation [s]
+EVERY = 1.0  # time between two pictures while the arm learns [s]
+EVERY_LATER = 0.4  # time between two pictures around the rupture [s]
+FRAME = 110  # time for which a picture of the film is shown [ms]
+LAST = 1500  # time for which the last picture is shown [ms]
+SETTLE = 3.0  # time from the first status until the whole page is drawn [s]
+PATIENCE = 600.0  # longest wait for the start and for each event of the film [s]
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:

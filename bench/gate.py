@@ -43,7 +43,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
-LOAD, MINUTE = 3.6, 60.0  # [kg], [s]
+LOAD, MINUTE = 3.6, 60.0  # mass of the payload [kg]; duration of a minute [s]
 
 MESSAGES = {
     'step of l in 10 ms [m]': SIGNAL_LIMITS.step,

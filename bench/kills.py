@@ -30,10 +30,10 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-LONGEST = 6.0  # [s] latest kill; a child starts, trains and saves within this time
-SPACING = 0.02  # [s] between samples
-STEPS = 20  # of training per update; short updates give many states to be killed in
-DEADLINE = 60.0  # [s] for a child to start
+LONGEST = 6.0  # time of the latest kill [s]; a child starts, trains and saves within it
+SPACING = 0.02  # time between two samples [s]
+STEPS = 20  # training steps of an update; short updates give many states to be killed in
+DEADLINE = 60.0  # longest time in which a child may start [s]
 
 
 def samples(robot: Robot, life: int) -> Iterator[Sample]:

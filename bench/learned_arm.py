@@ -21,7 +21,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-SELDOM, STEPS = 20.0, 400  # [s] between updates, steps of each: as accurate as the node, and faster
+#: time between two updates [s], and training steps of each: as accurate as the node, but faster
+SELDOM, STEPS = 20.0, 400
 
 
 class Seldom(Trainer):
@@ -43,7 +44,7 @@ class LearnedArm(NamedTuple):
     """An individual's network, the network that drives it, and the data that it learned from."""
 
     mae: Mae
-    driver: Mae  # network of the geometric model
+    driver: Mae  # network of the geometric model, which computes the commands
     exploring: Recording
 
 

@@ -28,7 +28,7 @@ BODIES: dict[str, tuple[int | str, ...]] = {
     '17x40': (4, 4, 'neck'),
     '39x74': (3, 3, 3, 3, 3, 'held'),
 }
-BELOW = 0.8  # [m] from one pair of arms to the next
+BELOW = 0.8  # vertical distance from one pair of arms to the next [m]
 WRIST = """<r>
   <joint name="wrist_flexion" type="revolute"><parent link="forearm"/><child link="carpus"/>
     <origin xyz="0 0 -0.20"/><axis xyz="1 0 0"/>
@@ -39,13 +39,13 @@ WRIST = """<r>
   <joint name="wrist_deviation" type="revolute"><parent link="carpus"/><child link="hand"/>
     <origin xyz="0 0 0"/><axis xyz="0 1 0"/>
     <limit lower="-0.45" upper="0.45" effort="8" velocity="6"/></joint></r>"""
-#: by number of tendons: name, and angle on the forearm [degrees] from front to left
+#: name and angle on the forearm [degrees], from front to left, of each tendon, by their number
 WRIST_WIRES = {
     4: {'extensor_carpi_radialis': 45, 'extensor_carpi_ulnaris': 135,
         'flexor_carpi_ulnaris': 225, 'flexor_carpi_radialis': 315},
     3: {'extensor_carpi': 90, 'flexor_carpi_ulnaris': 210, 'flexor_carpi_radialis': 330},
 }  # fmt: skip
-WRIST_RADIUS = 0.044  # [m]
+WRIST_RADIUS = 0.044  # distance of the tendons from the axis of the wrist [m]
 NECK = """<r>
   <joint name="neck_pitch" type="revolute"><parent link="torso"/><child link="neck_pitch_link"/>
     <origin xyz="0 0 0.10"/><axis xyz="0 1 0"/>

@@ -31,7 +31,7 @@ from musculoskeletal_ae.paper.simulation import SEARCH
 from musculoskeletal_ae.robot.robot import Robot
 
 SENT, IN_SIMULATION, MEASURED = 'sent', 'in the simulation', 'measured'
-UNITS = {'N·m': 1.0, '0.1 N·m': 10.0, 'N·cm': 100.0, 'N·mm': 1000.0}  # [1/(N·m)]
+UNITS = {'N·m': 1.0, '0.1 N·m': 10.0, 'N·cm': 100.0, 'N·mm': 1000.0}  # factors [1/(N·m)]
 
 
 class Reading(NamedTuple):
@@ -41,7 +41,7 @@ class Reading(NamedTuple):
     length: str = SENT
     epochs: int = SEARCH.epochs
     clips: bool = True  # whether θ and T are kept within their limits
-    preset: str = 'paper'  # whose networks
+    preset: str = 'paper'  # preset of the networks
 
     @property
     def text(self) -> str:

@@ -33,8 +33,10 @@ from musculoskeletal_ae.robot.robot import Robot
 ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
-EXPLORING = 60.0  # [s] of exploration for the samples of an update
-FLAME_RATE, STARTING, SETTLING = 200.0, 60.0, 15.0  # [Hz], [s], [s]
+EXPLORING = 60.0  # duration of the exploration that yields the samples of an update [s]
+FLAME_RATE = 200.0  # rate of muscle_states while a profile is recorded [Hz]
+STARTING = 60.0  # longest wait for the first command [s]
+SETTLING = 15.0  # time from the start of the nodes to the recording of a profile [s]
 
 #: times of the first measured version (commit be0daee) on an idle machine with two cores
 BEFORE_CORE = {
@@ -43,7 +45,8 @@ BEFORE_CORE = {
     f'the same, each of {timings.MANY} in one batch': 6.7,
 }  # fmt: skip
 TORCH_BEFORE = 118.0  # time of the first row in torch on that machine [µs]
-#: rate [Hz]: latency at 50 %, 99 %, largest [ms]; all nodes [% of a core]; with learner to 200 Hz
+#: values at each rate [Hz]: latency at 50 %, 99 % and largest [ms], and CPU time of all nodes [% of
+#: a core]. The learner runs at rates up to 200 Hz.
 BEFORE_WIRE = {100.0: ('3.4 / 9.4 / 19', 138), 200.0: ('2.4 / 8.6 / 17', 172),
                500.0: ('0.6 / 6.1 / 12', 166)}  # fmt: skip
 BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'controller': 145,

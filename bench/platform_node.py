@@ -23,8 +23,8 @@ from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = 'arm26'
-PATIENCE = 120.0  # [s] on a busy machine
-LARGEST_DIFFERENCE = 1e-9  # [rad]
+PATIENCE = 120.0  # longest wait on a busy machine [s]
+LARGEST_DIFFERENCE = 1e-9  # largest legal difference of two estimates [rad]
 START = 'from musculoskeletal_ae.executables import estimator; raise SystemExit(estimator())'
 
 

@@ -8,8 +8,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-TICK, PAGE = os.sysconf('SC_CLK_TCK'), os.sysconf('SC_PAGE_SIZE')  # [1/s], [bytes]
-PATIENCE = 20.0  # [s]
+TICK = os.sysconf('SC_CLK_TCK')  # unit of CPU times in /proc [1/s]
+PAGE = os.sysconf('SC_PAGE_SIZE')  # unit of memory sizes in /proc [bytes]
+PATIENCE = 20.0  # longest wait for the end of a process [s]
 
 
 def cpu(pid: int) -> float:

@@ -51,8 +51,10 @@ class Split(NamedTuple):
     name: str
     training: Run  # rest samples
     test: Run  # all rows
-    rests: list[Run]  # the same rest samples by run, for the statics; empty: without the statics
-    full: Run | None = None  # all rows of the training runs, for polynomials of all rows
+    #: the same rest samples by run, to which the statics are fitted; if empty, they are not fitted
+    rests: list[Run]
+    #: all rows of the training runs, to which polynomials are also fitted; or None
+    full: Run | None = None
 
 
 def _rows(run: Run, rows: Any) -> Run:
@@ -64,7 +66,8 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
     """Split the soft neck: training with one payload, or with two and test with the third."""
     none, half, whole = recording.runs
     own = none.at_rest(HALF)
-    # Rows of the poses in between, from the end of one rest to that of the next.
+    # Rows of every second pose, which are not used for training. A pose extends from the end of
+    # the previous rest to the end of its own.
     pose = np.searchsorted(none.rests[:, 1], np.arange(len(none.length)), side='right')
     others = (pose % 2 == 1) & (pose < len(none.rests))
     yield Split('0 g → other poses, 0 g', own, _rows(none, others), [], _rows(none, ~others))

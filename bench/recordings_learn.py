@@ -114,7 +114,8 @@ class Statics:
     #: log K [N·m/rad], log k [N/m], log γ, p [m], λ: prior means and spreads
     MEAN = np.array([0.0, np.log(3000.0), 0.0, 0.001, 1.0])
     SPREAD = np.array([1.0, 1.5, 0.1, 0.002, 0.5])
-    TILT, NOISE = 0.02, 0.015  # [rad] of the IMU's orientation, and of a rest sample
+    #: standard deviations of the prior of the IMU's orientation, and of a rest sample [rad]
+    TILT, NOISE = 0.02, 0.015
     ROUNDS = 15
 
     def __init__(self, robot: Robot, rests: list[Run]) -> None:

@@ -39,7 +39,7 @@ URDF = """<robot name="{name}">
   <link name="head"/>
 </robot>
 """
-REST = 0.2  # [s] at the end of a pose over which a rest sample is the mean
+REST = 0.2  # time at the end of a pose over which a rest sample is averaged [s]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Run:
     name: str
     load: float  # payload [kg]
     length: Array  # l, paid-out tendon since the start [m], (N, M)
-    effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0): unknown
+    effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
     theta: Array  # θ, which an independent sensor measured [rad], (N, D)
     rests: Array  # first row of each rest, and the row after its last one, (R, 2)
 
@@ -68,10 +68,10 @@ class SoftLink:
     """A soft link with tendons parallel to it, as a robot of two joints."""
 
     name: str
-    azimuths: tuple[float, ...]  # of the tendons [rad]
+    azimuths: tuple[float, ...]  # azimuth of each tendon [rad]
     radius: tuple[float, ...]  # distance of each tendon from the middle [m]
     height: float  # length of the link [m]
-    mass: float  # of its tip [kg]
+    mass: float  # mass of the tip of the link [kg]
     limit: float  # largest bend [rad]
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
@@ -203,7 +203,7 @@ def soft_neck(files: Files) -> Recording:
 
 def soft_arm(files: Files) -> Recording:
     """Read the control runs of the soft arm: motors [rad], currents [mA], IMU, 50 per second."""
-    spool, distance = 0.0093, 0.0382  # [m]
+    spool, distance = 0.0093, 0.0382  # radius of the spool, and distance of the tendons [m]
     runs = []
     for name in files.names(r'graphs/Control/.*/Masa_f?\d+/.*\.csv'):
         rows = [line.split(',') for line in files.text(name).split('\n')]

@@ -51,8 +51,8 @@ from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 
 SMALLEST, INDIVIDUAL, UNSEEN = '2x6', 0, 5000
-HELD_OUT = 300.0  # [s]
-#: number of a row: heading in the table
+HELD_OUT = 300.0  # duration of the held-out motion [s]
+#: heading of each row in the table, by its number
 COLUMNS = {
     'nominal': '② nominal [rad a joint]',
     'before': 'before [rad a joint]',

@@ -62,12 +62,12 @@ PAPER = 'Musashi      0.32–0.41        up to 40            0.41  0.15–0.19  
 class Row(NamedTuple):
     """Results of one individual."""
 
-    least_squares: float  # on the nominal geometry [rad]
+    least_squares: float  # error of least squares on the nominal geometry [rad]
     off: float  # largest |l − f_geo| over the shoulder's sweep, l as the sensor reads it [mm]
-    before: float  # preset `paper` [rad]
-    after: float  # of its last network, accepted or not
+    before: float  # error of preset `paper` before learning [rad]
+    after: float  # error of its last network, accepted or not [rad]
     simulated: float  # tension error of its simulator after learning [N]
-    refused: float  # share of the networks that failed validation
+    refused: float  # fraction of the networks that failed validation
 
 
 def measured(

@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-LOAD = -50.0  # [N] in z, as in the paper's simulation
+LOAD = -50.0  # force on the hand in z, as in the paper's simulation [N]
 
 
 def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:

@@ -42,12 +42,12 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PART = 300.0  # [s] of robot time per recording
-REPORT = 1800.0  # [s] of robot time
-#: [s] until which the error may still vary, because the network has just begun to learn
+PART = 300.0  # robot time of each recording [s]
+REPORT = 1800.0  # robot time between two reports [s]
+#: time until which the error may still vary [s], because the network has just begun to learn
 SETTLED = 1800.0
 TOLERATED = 1.2
-#: [s] from which memory is compared; before, imports, the store and the reservoir fill it
+#: time from which memory is compared [s]; before, imports, the store and the reservoir fill it
 FILLED = 7200.0
 SLOWER = 1.5  # largest legal ratio of update times, last quarter to first
 

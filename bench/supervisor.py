@@ -13,7 +13,7 @@ from hypothesis.stateful import run_state_machine_as_test
 
 from musculoskeletal_ae.options import Parser, whole
 
-STEPS = 100  # events in one sequence
+STEPS = 100  # number of events in one sequence
 
 
 def main(argv: list[str]) -> int:

@@ -45,10 +45,11 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.robot import Robot
 
-ALLOWED, LONGEST = 1.1, 0.5  # times the limit; [s]
-EXPLORED = 60.0  # [s]
-TARGETS, HELD = 4, 4.0  # of each method; [s] for each
-HELD_OUT = 60.0  # [s]
+#: legal tension relative to tension.limit, and longest legal time above it [s]
+ALLOWED, LONGEST = 1.1, 0.5
+EXPLORED = 60.0  # duration of the exploration [s]
+TARGETS, HELD = 4, 4.0  # number of targets of each method, and time for each target [s]
+HELD_OUT = 60.0  # duration of the held-out motion [s]
 HEAD = (
     f'{"seed":>5} {"what":<12} {"max/limit":>9} {"longest":>8} {"above":>7} {"above":>7} '
     f'{"stops":>5} {"samples":>7} {"error":>7}\n'
@@ -60,7 +61,7 @@ HEAD = (
 class Excess(NamedTuple):
     """Measures of how far and how long tensions exceeded their limit."""
 
-    highest: float  # as a multiple of the limit
+    highest: float  # highest tension, relative to tension.limit
     longest: float  # longest uninterrupted time above ALLOWED times the limit [s]
     allowed: float  # largest total time of a muscle above ALLOWED times the limit [s]
     limit: float  # largest total time of a muscle above the limit [s]

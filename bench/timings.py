@@ -36,7 +36,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-MANY, LONGEST = 4096, 0.05  # arms, [s] of a round
+MANY, LONGEST = 4096, 0.05  # number of arms in a batch; longest duration of a round [s]
 ALL_TORCH = 'compared with all of it in torch'
 
 

@@ -48,7 +48,7 @@ KINDS = {
     'plain node, torch': ('hardware_emulator', 'plain'),
     'messages alone': tuple(f'bare_{name}' for name in (*NODES, 'learner')),
 }
-WARM_UP = 8.0  # [s] until the first message counts
+WARM_UP = 8.0  # time until the first message counts [s]
 PLAIN = """
 import contextlib, sys, numpy as np, rclpy, torch
 from rclpy.node import Node
@@ -77,7 +77,8 @@ rclpy.init()
 with contextlib.suppress(KeyboardInterrupt):
     rclpy.spin(Plain())
 """
-#: node: trigger of publishing (a message, or its rate), published topic, other subscriptions
+#: for each node: the topic whose messages trigger publishing ('' for a timer), the published
+#: topics, and the other subscribed topics
 BARE = {
     'bare_hardware_emulator': ('', 'muscle_states joint_states', 'muscle_length_command'),
     'bare_estimator': (
@@ -200,8 +201,8 @@ class Wire(NamedTuple):
     """Results of a system of nodes."""
 
     latency: tuple[float, ...]  # median, 99th percentile, largest [ms]
-    late: float  # [%]
-    missed: float  # [%]
+    late: float  # percentage of late messages [%]
+    missed: float  # percentage of missed messages [%]
     cpu: dict[str, float]  # CPU time of each node [% of a core]
 
     def __str__(self) -> str:

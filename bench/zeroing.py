@@ -39,10 +39,12 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-LEAST, MOST = 0.05, 0.13  # [m]
-MINUTES, HELD_OUT, AFTER = 10.0, 300.0, 30.0  # [s] but for the first
-LONGEST = 120.0  # [s] time limit of a calibration
-SETTLING = 20.0  # [s] until the arm hangs still
+LEAST, MOST = 0.05, 0.13  # range of the absolute length offsets [m]
+MINUTES = 10.0  # duration of the exploration [min]
+HELD_OUT = 300.0  # duration of the held-out motion [s]
+AFTER = 30.0  # duration of the motion after a calibration [s]
+LONGEST = 120.0  # longest duration of a calibration [s]
+SETTLING = 20.0  # time until the arm hangs still [s]
 #: error of the stated posture [rad], added to the angle of each joint
 STATED = 0.0
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
