@@ -25,7 +25,7 @@ from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import Wrap, branches
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import JointPoses
-from musculoskeletal_ae.robot.kinematics import Kinematics, link_placement
+from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames, link_placement
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
@@ -357,15 +357,20 @@ def from_file(robot: Robot, file: Path) -> Any:
 
 
 def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
-    """Return the end effector's pose in its own link and in all links rigidly connected to it."""
+    """Return the end effector's pose in its own link and in all links rigidly connected to it.
+
+    The first links are the end effector itself and those that carry it.
+    """
     model, name = robot.description.model, robot.description.end_effector
     joint, hand = link_placement(model, name)
-    frame, links = model.getFrameId(name, pin.FrameType.BODY), dict[str, pin.SE3]()
+    frame, carriers = model.getFrameId(name, pin.FrameType.BODY), list[Any]()
     while frame > 0 and model.frames[frame].parentJoint == joint:
-        link = model.frames[frame]
-        if link.type == pin.FrameType.BODY:
-            links[str(link.name)] = link.placement.inverse() * hand
-        frame = link.parentFrame
+        carriers.append(model.frames[frame])
+        frame = model.frames[frame].parentFrame
+    links = dict[str, pin.SE3]()
+    for link in [*carriers, *body_frames(model)]:
+        if link.type == pin.FrameType.BODY and link.parentJoint == joint:
+            links.setdefault(str(link.name), link.placement.inverse() * hand)
     return links
 
 

@@ -341,7 +341,7 @@ def test_an_unknown_reality_is_refused_with_the_legal_ones(robot):
 ELBOW = """<mujoco>{options}<worldbody>
   <site name="o" pos=".05 0 0"/><site name="o2" pos="-.05 0 0"/>
   <body name="mount" pos="0 0 1">{held}<geom name="g1" size=".02"/>
-    <body name="arm"><joint name="elbow" axis="0 1 0" range="-60 60"/>
+    <body name="arm"><joint name="elbow" {anchor}axis="0 1 0" range="-60 60"/>
       <geom type="capsule" size=".02 .1" pos="0 0 -.1"/>
       <site name="i" pos=".03 0 -.1"/><site name="i2" pos="-.03 0 -.1"/>
       <body {hand}pos="0 0 -.2"><geom size=".02"/></body></body></body>
@@ -349,7 +349,7 @@ ELBOW = """<mujoco>{options}<worldbody>
   <contact><pair geom1="g1" geom2="g2"/></contact>
   <tendon><spatial name="front"><site site="o"/><site site="i"/></spatial>
     <spatial name="back"><site site="o2"/><site site="i2"/></spatial></tendon></mujoco>"""
-AS_IT_IS = {'options': '', 'held': '', 'hand': 'name="hand" '}
+AS_IT_IS = {'options': '', 'held': '', 'anchor': '', 'hand': 'name="hand" '}
 HINGE = '<joint name="held" axis="1 0 0" range="-60 60"/>'
 
 
@@ -360,6 +360,7 @@ HINGE = '<joint name="held" axis="1 0 0" range="-60 60"/>'
         {'options': '<compiler fusestatic="true"/>', 'hand': ''},
         {'hand': ''},
         {'held': HINGE},  # the body is fixed if the joint is omitted
+        {'anchor': 'pos="0 0 .03" ', 'hand': ''},  # the joint is not at the origin of its body
     ],
 )
 def test_an_mjcf_file_has_the_lengths_of_the_robot_imported_from_it(tmp_path, change):
