@@ -4,50 +4,52 @@
     min over δ, κ, o   Σ_n (l_net(θ_n, T_n) − l(θ_n, T_n; δ, κ, o))² / σ²
                        + Σ (δ/s_δ)² + Σ (κ/s_κ)² + (o/s_o)²
 
-l is the length of the calibrated body of `learning/body.py` without its residual model. Its
-parameters are displacements δ of the route points, factors e^κ of the elastic constants, and a
-length offset o. Each muscle is fitted separately, by the Gauss–Newton method with decreasing
-damping. The residual is the part of the network that such a body cannot represent.
+    l(θ, T; δ, κ, o) = f(θ; p + δ) − f(0; p + δ) − L_e(f, T; c e^κ) + o
+
+f is the length of the route with displaced points p + δ, wrapping included; κ are logarithmic
+changes of the elastic constants c, and o is a length offset. Each muscle is fitted separately, by
+the Levenberg–Marquardt method. The residual is the part of the network that such a body cannot
+represent.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.routes import Routes
+from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-STATES = 1500  # number of random states in the fit
-NOISE = 3e-4  # σ of the network's lengths [m]
-ATTACHMENT, ELASTIC, OFFSET = 0.02, 0.5, 0.05  # s_δ [m], s_κ, s_o [m]
-DAMPING = (
-    10.0,
-    1.0,
-    0.1,
-    0.01,
-    0.0,
-    0.0,
-    0.0,
-    0.0,
-)  # damping of each round, relative to the diagonal
+STATES = 1000  # number of random states in the fit
+#: σ [m]: the network's lengths are about 0.5 mm off, and alike in some forty neighbouring states
+NOISE = 3e-3
+ATTACHMENT, ELASTIC, OFFSET = 0.01, 0.5, 0.05  # s_δ [m], s_κ, s_o [m]
+LARGEST_LOG = 1.5  # bound on |κ|
+ROUNDS = 30
+EASIER, HARDER = 0.3, 5.0  # factors of the damping after a better and a worse step
+DAMPING, MOST_DAMPED = 1e-2, 1e4  # at the start, and where the search ends; shares of the diagonal
+ENOUGH = 1e-4  # the search ends at a smaller relative improvement
 
 
 @dataclass(frozen=True)
 class FittedBody:
     """The fitted body and its residual."""
 
-    body: CalibratedBody
+    shift: Array  # displacement of each route point in the frame of its joint [m], (P, 3)
+    elastic: SeriesElastic  # elastic constants of the muscles
     residual: Array  # root mean square residual of each muscle's length [m], (M,)
 
-    @property
-    def shift(self) -> Array:
-        """Displacement of each route point in the frame of its joint [m], (P, 3)."""
-        shift = np.zeros((len(self.body.robot.routes.point), 3))
-        for layout, parameters in zip(self.body.layouts, self.body.parameters, strict=True):
-            shift[layout.points] = parameters[layout.attachment].reshape(-1, 3)
-        return shift
+
+class _States(NamedTuple):
+    """Lengths that one muscle shall have in N states."""
+
+    poses: JointPoses  # of θ, with θ = 0 as an additional last row
+    tension: Array  # [N], (N,)
+    length: Array  # [m], (N,)
 
 
 def fit(robot: Robot, mae: Mae, seed: int = 0) -> FittedBody:
@@ -55,29 +57,81 @@ def fit(robot: Robot, mae: Mae, seed: int = 0) -> FittedBody:
     rng = np.random.default_rng([seed, 0xE2])
     theta = robot.random_postures(STATES, rng)
     tension = rng.uniform(robot.tension.bias, robot.tension.limit, (STATES, robot.muscle_count))
-    wanted = mae.lengths(theta, tension)
-    body = CalibratedBody(robot, seed=seed)
-    poses = body.poses(theta)
-    parameters, residual = [], np.zeros(robot.muscle_count)
-    for m, layout in enumerate(body.layouts):
-        fitted = np.r_[layout.attachment, layout.elastic, layout.offset]
-        spread = np.full(layout.size, np.inf)
-        spread[layout.attachment], spread[layout.elastic] = ATTACHMENT, ELASTIC
-        spread[layout.offset] = OFFSET
-        prior = NOISE**2 / spread[fitted] ** 2
-        smooth, direction = np.zeros((STATES, layout.size - layout.rest.start)), np.zeros(STATES)
-        for damping in DAMPING:
-            length, jacobian = body.linearised(poses, smooth, tension[:, m], direction, m)
-            part = jacobian[:, fitted]
-            error, own = wanted[:, m] - length, body.parameters[m]
-            normal = part.T @ part + np.diag(prior)
-            normal += damping * np.diag(np.diag(normal))
-            own = own.copy()
-            own[fitted] += np.linalg.solve(normal, part.T @ error - prior * own[fitted])
-            body = body.with_parameters(
-                [own if k == m else old for k, old in enumerate(body.parameters)]
-            )
-        length, _ = body.linearised(poses, smooth, tension[:, m], direction, m)
-        residual[m] = float(np.sqrt(np.mean((wanted[:, m] - length) ** 2)))
-        parameters.append(body.parameters[m])
-    return FittedBody(body.with_parameters(parameters), residual)
+    length = mae.lengths(theta, tension)
+    at_zero = np.zeros((1, robot.joint_count))
+    poses = robot.kinematics.tree.joint_poses(np.concatenate([theta, at_zero]))
+    shifts, constants, residual = [], [], []
+    for m, route in enumerate(robot.description.routes):
+        states = _States(poses, tension[:, m], length[:, m])
+        muscle = _Muscle(Routes(robot.kinematics, [route]), robot.series_elastic.of(m))
+        parameters, error = muscle.fitted(states)
+        shifts.append(muscle.shift(parameters))
+        constants.append(muscle.elastic(parameters))
+        residual.append(float(np.sqrt(np.mean(error**2))))
+    values = zip(*(vars(each).values() for each in constants), strict=True)
+    elastic = SeriesElastic(*(np.array(value) for value in values))
+    return FittedBody(np.concatenate(shifts), elastic, np.array(residual))
+
+
+class _Muscle:
+    """One muscle; its parameters are δ (three for each route point), κ (3) and o, in a vector."""
+
+    def __init__(self, routes: Routes, elastic: SeriesElastic) -> None:
+        self._routes, self._elastic = routes, elastic
+        sizes = 3 * len(routes.point), 3, 1
+        self._spread = np.repeat([ATTACHMENT, ELASTIC, OFFSET], sizes)
+
+    def shift(self, parameters: Array) -> Array:
+        """Return δ [m], (P, 3)."""
+        return parameters[:-4].reshape(-1, 3)
+
+    def elastic(self, parameters: Array) -> SeriesElastic:
+        """Return the elastic constants, of shape ()."""
+        factors = np.exp(np.clip(parameters[-4:-1], -LARGEST_LOG, LARGEST_LOG))
+        nominal = vars(self._elastic).values()
+        return SeriesElastic(*(value * f for value, f in zip(nominal, factors, strict=True)))
+
+    def fitted(self, states: _States) -> tuple[Array, Array]:
+        """Return the parameters, and the errors that remain [m], (N,)."""
+        parameters, damping = np.zeros(len(self._spread)), DAMPING
+        prior = (NOISE / self._spread) ** 2
+        length, jacobian = self._linearised(parameters, states)
+        error = states.length - length
+        loss = error @ error
+        for _ in range(ROUNDS):
+            normal = jacobian.T @ jacobian + np.diag(prior)
+            slope = jacobian.T @ error - prior * parameters
+            damped = normal + damping * np.diag(np.diag(normal))
+            tried = parameters + np.linalg.solve(damped, slope)
+            length, jacobian_there = self._linearised(tried, states)
+            error_there = states.length - length
+            loss_there = error_there @ error_there + prior @ tried**2
+            if loss_there >= loss:
+                damping *= HARDER
+                if damping > MOST_DAMPED:
+                    break
+                continue
+            is_flat = loss - loss_there < ENOUGH * loss
+            parameters, jacobian, error, loss = tried, jacobian_there, error_there, loss_there
+            damping *= EASIER
+            if is_flat:
+                break
+        return parameters, error
+
+    def _linearised(self, parameters: Array, states: _States) -> tuple[Array, Array]:
+        """Return the muscle's lengths [m], (N,), and their derivatives by the parameters."""
+        point = self._routes.point + self.shift(parameters)
+        whole, by_point = self._routes.moved(states.poses, point)
+        absolute, by_shift = whole[:, 0], by_point.reshape(len(whole), -1)
+        elastic, tension, offset = self.elastic(parameters), states.tension, parameters[-1]
+        elongation = elastic.elongation(absolute[:-1], tension)
+        length = absolute[:-1] - absolute[-1] - elongation + offset
+        stretch = 1.0 - elastic.length_slope(tension)
+        by_elastic = [
+            tension / (elastic.force + tension) / elastic.rate,
+            np.log1p(tension / elastic.force) / elastic.rate,
+            -elastic.wire_stretch * absolute[:-1] * tension,
+        ]
+        by_shift = stretch[:, None] * by_shift[:-1] - by_shift[-1]
+        columns = [by_shift, np.stack(by_elastic, axis=1), np.ones((len(tension), 1))]
+        return length, np.concatenate(columns, axis=1)

@@ -25,11 +25,12 @@ from musculoskeletal_ae.emulator import mjcf
 from musculoskeletal_ae.emulator.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.fit import FittedBody, fit
+from musculoskeletal_ae.exporting.fit import fit
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 POSTURES = 1000  # postures in which the model and the network are compared
 DAMPING = 0.05  # [N·m·s/rad] of a joint, or times joint_gear; chosen for a stable simulation
@@ -102,7 +103,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
     fitted = fit(robot, mae, seed)
     moved = Robot(replace(robot.description, routes=_moved(robot, fitted.shift)))
     moved = moved.with_elasticity(mae.elasticity)
-    springs = _springs(fitted)
+    springs = _springs(robot, fitted.elastic)
     spec = _spec(moved, mae, springs)
     try:
         spec.compile()
@@ -134,13 +135,12 @@ class Springs(NamedTuple):
     error: Array  # largest error of the elongation between T_bias and T_limit [m]
 
 
-def _springs(fitted: FittedBody) -> Springs:
-    body, robot = fitted.body, fitted.body.robot
+def _springs(robot: Robot, elastic: SeriesElastic) -> Springs:
     low, high, at_zero = robot.tension.bias, robot.tension.limit, robot.routes.length_at_zero
     mid = 0.5 * (low + high)
     rows = []
     for m in range(robot.muscle_count):
-        law = body.elastic(m)
+        law = elastic.of(m)
         tension = np.linspace(low[m], high[m], 50)
         elongation = law.elongation(np.full(50, at_zero[m]), tension)
         middle = float(law.elongation(at_zero[m], mid[m]))

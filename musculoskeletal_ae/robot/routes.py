@@ -208,6 +208,33 @@ class Routes:
         """Return f_geo,abs(θ) [m], shape (..., M), for θ (..., D)."""
         return self._segments(theta)[0] @ self._sum.T
 
+    def moved(self, poses: JointPoses, point: Array) -> tuple[Array, Array]:
+        """Return the absolute lengths of routes with other points, and their gradients.
+
+        Args:
+            poses: Poses of the joints in N postures.
+            point: Points in the frames of their joints [m], (P, 3).
+
+        Returns:
+            Lengths [m], (N, M), and the derivative of the length of each point's muscle by the
+            point in the frame of its joint, (N, P, 3).
+        """
+        points = self.placed(poses, point)
+        line = points[:, self.second] - points[:, self.first]
+        lengths = np.linalg.norm(line, axis=-1)
+        leave = line / np.maximum(lengths, 1e-9)[..., None]
+        arrive = -leave
+        if self.objects is not None:
+            own = self.wrapping
+            lengths[:, own], leave[:, own], arrive[:, own] = self._wrapped(poses, points)
+        # A point begins at most one segment, and ends at most one.
+        by_point, weight = np.zeros_like(points), self.weight[:, None]
+        by_point[:, self.first] -= weight * leave
+        by_point[:, self.second] -= weight * arrive
+        return lengths @ self._sum.T, np.einsum(
+            'npi,npij->npj', by_point, poses.rotation[:, self.joint]
+        )
+
     @_in_chunks
     def detours(self, theta: Array) -> Array:
         """Return the length that wrapping adds to each muscle [m], shape (..., M), θ (..., D)."""

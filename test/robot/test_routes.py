@@ -75,3 +75,20 @@ def test_a_flexor_shortens_when_its_joint_flexes():
     flexor, elbow = robot.muscles.index('brachialis'), robot.joints.index('elbow')
     # Flexion is negative: l decreases with the angle, and the torque −G of a tension is negative.
     assert jacobian[flexor, elbow] > 0.0
+
+
+def test_the_gradient_by_a_point_is_the_derivative_of_length(robot):
+    routes, rng = robot.routes, np.random.default_rng(6)
+    poses = robot.kinematics.tree.joint_poses(robot.random_postures(5, rng))
+    point = routes.point + rng.normal(0.0, 1e-3, routes.point.shape)
+    lengths, by_point = routes.moved(poses, point)
+    moves = rng.normal(size=routes.point.shape)
+    owner = np.zeros(len(point), dtype=int)
+    owner[routes.first], owner[routes.second] = routes.muscle, routes.muscle
+    ahead, behind = (routes.moved(poses, point + h * moves)[0] for h in (1e-7, -1e-7))
+    expected = np.zeros_like(lengths)
+    np.add.at(expected.T, owner, np.einsum('npj,pj->pn', by_point, moves))
+    np.testing.assert_allclose((ahead - behind) / 2e-7, expected, atol=1e-6)
+    theta = robot.random_postures(5, np.random.default_rng(6))
+    at_rest = routes.moved(robot.kinematics.tree.joint_poses(theta), routes.point)[0]
+    np.testing.assert_allclose(at_rest, routes.absolute_lengths(theta), atol=1e-12)
