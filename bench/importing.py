@@ -7,7 +7,9 @@ The files are public models that you have downloaded; none is part of this repos
 prints one row for each file:
 
 - the numbers of joints, muscles, and wrapping muscles,
-- the largest and the median length error over 1000 postures (nan: the source has no lengths),
+- the largest and the median length error over 1000 postures (nan: the source has no lengths).
+  MuJoCo computes the lengths of the source: of an MJCF file as it is, and of a cardsflow.xml from
+  its model.urdf with a site at each via point. Muscles of a cardsflow.xml that wrap are left out,
 - the largest moment arm error over 200 postures, and the number of muscles with a wrong sign there,
 - the verdict of `check_robot` over 100 postures.
 
@@ -18,20 +20,30 @@ hold any posture, it has no targets, and the cell gives the reason.
 """
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
 
+import mujoco
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import control, online_learning
 from musculoskeletal_ae.experiments.study import Study
-from musculoskeletal_ae.importing.convert import check_verdict, import_robot
+from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.importing.cardsflow import ROUND
+from musculoskeletal_ae.importing.convert import check_verdict, import_robot, read_source
+from musculoskeletal_ae.importing.source import Comparison, Source, compare, refuse
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.urdf import parse_xml
 
 INDIVIDUAL = 0
+DRAWN = 'visual', 'collision'  # elements of a URDF that have no effect on lengths
 IMPORTED = (
     'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',
     'wrong signs', 'check_robot',
@@ -39,11 +51,80 @@ IMPORTED = (
 LEARNED = ('before [rad]', 'after', 'oracle', '`proposed`')
 
 
+def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Array]], Any]:
+    """Return a function that lets MuJoCo compute the straight muscles of a cardsflow.xml.
+
+    It takes joint positions by name, each (N,), and returns lengths by muscle [m], each (N,).
+    """
+    urdf = file.with_name('model.urdf')
+    tree, root = (parse_xml(each, read_text(each, refuse)) for each in (urdf, file))
+    settings = ET.SubElement(ET.SubElement(tree, 'mujoco'), 'compiler')
+    settings.attrib.update(fusestatic='false', discardvisual='true')
+    centres = {}
+    for link in tree.findall('link'):
+        for part in [part for part in link if part.tag in DRAWN]:
+            link.remove(part)
+        at = link.find('inertial/origin')
+        text = '0 0 0' if at is None else at.get('xyz', '0 0 0')
+        centres[link.get('name', '')] = [*map(float, text.split())]
+        # Masses have no effect on lengths, but MuJoCo refuses those that are missing or zero.
+        for part in link.findall('inertial'):
+            link.remove(part)
+        weight = ET.SubElement(link, 'inertial')
+        ET.SubElement(weight, 'mass', value='1')
+        moments = {'ixx': '1', 'iyy': '1', 'izz': '1', 'ixy': '0', 'ixz': '0', 'iyz': '0'}
+        ET.SubElement(weight, 'inertia', moments)
+    spec = mujoco.MjSpec.from_string(ET.tostring(tree, encoding='unicode'))
+    bodies = {body.name: body for body in spec.bodies}
+    points = [
+        [(part.get('name', ''), via) for part in muscle.iter('link') for via in part]
+        for muscle in root.iter('myoMuscle')
+    ]
+    straight = [[via.get('type') not in ROUND for _, via in own] for own in points]
+    imported = [i for i, own in enumerate(straight) if sum(own) > 1]
+    measured = []
+    for name, m in zip(source.routes, imported, strict=True):
+        own = points[m]
+        if not all(straight[m]):
+            continue
+        tendon = spec.add_tendon(name=name)
+        for i, (link, via) in enumerate(own):
+            at = np.add(centres.get(link, [0.0] * 3), [*map(float, (via.text or '').split())])
+            body = bodies.get(link, spec.worldbody)
+            tendon.wrap_site(body.add_site(name=f'{name} {i}', pos=at).name)
+        measured.append(name)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+
+    def lengths(values: dict[str, Array]) -> dict[str, Array]:
+        rows = np.empty((len(next(iter(values.values()))), model.ntendon))
+        for n in range(len(rows)):
+            for joint, angles in values.items():
+                data.joint(joint).qpos[0] = angles[n]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_tendon(model, data)
+            rows[n] = data.ten_length
+        return dict(zip(measured, rows.T, strict=True))
+
+    return lengths
+
+
+def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Comparison | None:
+    """Return the comparison with MuJoCo."""
+    if file.name != 'cardsflow.xml' or not file.with_name('model.urdf').exists():
+        return comparison
+    source = read_source(file)
+    source.lengths = lengths_of_cardsflow(file, source)
+    return compare(source, robot)
+
+
 def row(file: Path, out: Path, minutes: float | None) -> list[str]:
     """Import one file, learn the robot if `minutes` is given, and return the cells of its row."""
     name = f'{file.parent.name}/{file.name}'
     try:
         robot, notes, comparison = import_robot(file, out)
+        comparison = compared(file, robot, comparison)
     except MusculoskeletalError as error:
         return [name, str(error)[-160:]]
     parts = comparison if comparison and comparison.lengths else ({'': np.nan},) * 3

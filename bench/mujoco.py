@@ -2,6 +2,7 @@
 """Learns published MuJoCo models, and prints the results for each individual.
 
     python -m bench mujoco NAME=FILE[:joints=A,B][:without=C,D][:end=E] … --out DIR [--minutes 10]
+    python -m bench mujoco NAME=FILE … --out DIR --nodes [--seconds 30]
 
 You have to fetch the models yourself; this repository does not contain them:
 
@@ -22,6 +23,11 @@ columns of a row are
   of these moment arms [mm, median over the muscles],
 - the number of seconds of the model that one core computes in a second, and
 - the duration of the initial training on one core [s].
+
+With --nodes, the bench measures the running system instead, for the first individual of --seeds:
+emulator, estimator, sim, controller and learner exchange messages at 100 Hz while the arm explores.
+The columns are the CPU time of each node [% of a core], and the share of messages of the emulator
+that arrived: below 100 %, the emulator is slower than real time, or the machine is busy.
 """
 
 import time
@@ -33,6 +39,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.wire import KINDS, systems
 from musculoskeletal_ae.control.exploration import holdable_postures
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -44,15 +51,18 @@ from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.options import Parser, seeds
+from musculoskeletal_ae.options import Parser, number, seeds
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
+ALL_NODES = 'with learner'  # of `bench wire`
 HEAD = (
     'model', 'seed', 'joints', 'muscles', 'before [rad]', '`paper`', 'after', 'detected', 'named',
     'trajectory [rad]', 'export [mm]', 'of', 'real time', 'training [s]',
 )  # fmt: skip
+NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
+RATE = 100.0  # [Hz] of muscle_states with --nodes
 LISTS = 'joints', 'muscles', 'without'
 
 
@@ -138,6 +148,17 @@ def attempt(cell: Callable[[], str]) -> str:
         return str(error)[:80]
 
 
+def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> list[str]:
+    """Import a model, run all nodes, and return the cells with the CPU time of each node."""
+    robot: Robot = import_robot(file, args.out / name / 'robot', **chain).robot
+    emulator = f'reality:={file.resolve()}', 'deviates:=true', f'seed:={args.seeds[0]}'
+    directory = str(robot.description.directory)
+    ((_, _, wire),) = systems(directory, [RATE], [ALL_NODES], args.seconds, emulator)
+    cells = [name, str(robot.joint_count), str(robot.muscle_count)]
+    cells += [f'{wire.cpu[node]:.0f}' for node in KINDS[ALL_NODES]]
+    return [*cells, f'{sum(wire.cpu.values()):.0f}', f'{100.0 - wire.missed:.0f} %']
+
+
 def model_rows(
     name: str, file: Path, chain: dict[str, Any], args: Namespace
 ) -> Iterator[list[str]]:
@@ -166,12 +187,18 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='individuals')
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_quick('short initial training and held-out motion, to try things out')
+    text = 'measure the CPU time of each node instead of learning'
+    parser.add_argument('--nodes', action='store_true', help=text)
+    text = 'duration of the measurement with --nodes [s]'
+    parser.add_argument('--seconds', type=number(1.0, 3600.0), default=30.0, metavar='S', help=text)
     args = parser.parse_args(argv)
 
-    print(f'| {" | ".join(HEAD)} |\n{"|---" * len(HEAD)}|', flush=True)
+    head = NODES_HEAD if args.nodes else HEAD
+    print(f'| {" | ".join(head)} |\n{"|---" * len(head)}|', flush=True)
     for name, file, chain in args.models:
         try:
-            for cells in model_rows(name, file, chain, args):
+            model = name, file, chain, args
+            for cells in [nodes_row(*model)] if args.nodes else model_rows(*model):
                 print(f'| {" | ".join(cells)} |', flush=True)
         except MusculoskeletalError as error:
             print(f'| {name} | {error} |', flush=True)

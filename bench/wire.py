@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
@@ -129,16 +129,38 @@ with make_executor() as executor, suppress(KeyboardInterrupt):
 class System:
     """Nodes in separate processes."""
 
-    def __init__(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
-        """Start the nodes; a stop signal during the start ends them."""
+    def __init__(
+        self,
+        robot: str,
+        network: Path,
+        rate: float,
+        names: tuple[str, ...],
+        emulator: Sequence[str] = (),
+    ) -> None:
+        """Start the nodes; a stop signal during the start ends them.
+
+        Args:
+            robot: Name or directory of the robot.
+            network: Checkpoint of all nodes.
+            rate: Rate of muscle_states [Hz].
+            names: Executables.
+            emulator: Further parameters of the emulator, each as NAME:=VALUE.
+        """
         self.nodes: dict[str, subprocess.Popen[bytes]] = {}
         with STOP.reacting(Reaction.REMEMBER):
-            self._start(robot, network, rate, names)
+            self._start(robot, network, rate, names, emulator)
         if STOP.received:
             self.end()
             raise KeyboardInterrupt
 
-    def _start(self, robot: str, network: Path, rate: float, names: tuple[str, ...]) -> None:
+    def _start(
+        self,
+        robot: str,
+        network: Path,
+        rate: float,
+        names: tuple[str, ...],
+        emulator: Sequence[str],
+    ) -> None:
         import rclpy
         from rclpy.qos import qos_profile_sensor_data
         from rclpy.signals import SignalHandlerOptions
@@ -149,7 +171,9 @@ class System:
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
         assignments = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
         for name in assignments:
-            if name != 'hardware_emulator':
+            if name == 'hardware_emulator':
+                assignments[name] += emulator
+            else:
                 assignments[name].append(f'checkpoint:={network}')
             if name in ('controller', 'combined'):
                 # A pause of a busy machine must not stop the emulated arm.
@@ -243,15 +267,22 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
 
 
 def systems(
-    robot: str, rates: Iterable[float], kinds: Iterable[str], seconds: float
+    robot: str,
+    rates: Iterable[float],
+    kinds: Iterable[str],
+    seconds: float,
+    emulator: Sequence[str] = (),
 ) -> Iterator[tuple[float, str, Wire]]:
-    """Measure one robot at all rates [Hz] and kinds; yield rate, kind and results."""
+    """Measure one robot at all rates [Hz] and kinds; yield rate, kind and results.
+
+    `emulator` lists further parameters of the emulator, each as NAME:=VALUE.
+    """
     with tempfile.TemporaryDirectory() as folder:
         network = Path(folder) / 'network.safetensors'
         checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
         for rate in rates:
             for kind in kinds:
-                system = System(robot, network, rate, KINDS[kind])
+                system = System(robot, network, rate, KINDS[kind], emulator)
                 try:
                     yield rate, kind, measure(system, rate, seconds)
                 finally:
