@@ -19,8 +19,9 @@ columns of a row are
   and after learning with preset `default` [rad, norm over the joints],
 - the numbers of ruptures that were detected, and attributed to the right muscle,
 - the error while the arm follows trajectories of 2 s between holdable postures [rad],
-- the error of the moment arms of the exported model relative to the learned network, and the size
-  of these moment arms [mm, median over the muscles],
+- errors of moment arms [mm, median over the muscles]: of the exported model relative to the
+  learned network, of the exported model relative to the individual, and of the file relative to
+  the individual; then the size of these moment arms,
 - the number of seconds of the model that one core computes in a second, and
 - the duration of the initial training on one core [s].
 
@@ -40,6 +41,7 @@ from typing import Any
 import numpy as np
 
 from bench.wire import KINDS, systems
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import holdable_postures
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -58,10 +60,12 @@ from musculoskeletal_ae.robot.robot import Robot
 ALL_NODES = 'with learner'  # of `bench wire`
 HEAD = (
     'model', 'seed', 'joints', 'muscles', 'before [rad]', '`paper`', 'after', 'detected', 'named',
-    'trajectory [rad]', 'export [mm]', 'of', 'real time', 'training [s]',
+    'trajectory [rad]', 'export, network [mm]', 'export, body', 'file, body', 'of', 'real time',
+    'training [s]',
 )  # fmt: skip
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
+ARM_POSTURES = 300
 RATE = 100.0  # [Hz] of muscle_states with --nodes
 LISTS = 'joints', 'muscles', 'without'
 
@@ -119,8 +123,20 @@ def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
     cells += [*rupture_cells(study, seed), attempt(lambda: f'{tracking_error(study, seed):.4f}')]
     out = study.folder / f'model_{seed}'
     report = export(robot, study.network(seed), out)
-    cells += [f'{1e3 * np.median(part):.2f}' for part in (report.arms, report.arm_size)]
+    exported = import_robot(out / 'model.xml', study.folder / f'exported_{seed}').robot
+    bodies = exported.routes, robot.routes
+    from_individual = [arm_errors(study.arm(seed), body.muscle_jacobian) for body in bodies]
+    parts = report.arms, *from_individual, report.arm_size
+    cells += [f'{1e3 * np.median(part):.2f}' for part in parts]
     return [*cells, f'{speed(study.arm(seed)):.1f}', f'{training:.0f}']
+
+
+def arm_errors(arm: Arm, muscle_jacobian: Callable[[Array], Array]) -> Array:
+    """Return the root mean square error of each muscle's moment arms over the workspace, (M,)."""
+    theta = arm.robot.random_postures(ARM_POSTURES, np.random.default_rng(0x308))
+    error = muscle_jacobian(theta) - arm.individual.muscle_jacobian(theta)
+    result: Array = np.sqrt((error**2).sum(axis=2).mean(axis=0))
+    return result
 
 
 def rupture_cells(study: Study, seed: int) -> list[str]:
