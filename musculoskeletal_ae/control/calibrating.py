@@ -15,11 +15,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
 SPEED = 0.05  # fastest change of a length command [m/s]
-DURATION, REST = 1.5, 0.25  # duration of a step, and of the rest after it [s]
-REACH = 0.7  # largest step of each joint [rad]; for prismatic joints times RACK [m]
-INSIDE = 0.1  # distance of goals from the joint limits, as a share of the joint range
+DURATION = 1.5  # duration of a step [s]
+REST = 0.25  # duration of the rest after a step [s]
+REACH = 0.7  # largest change of each joint in a step [rad]; for prismatic joints times RACK [m]
+INSIDE = 0.1  # smallest distance of goals from the joint limits, as a fraction of the joint range
 GOALS = 20  # number of random goals, of which the first holdable one is used
-SHARE = 0.6  # highest tension, as a share of the range from T_bias to T_limit
+SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limit
 
 
 def gentle_limit(robot: Robot) -> Array:
@@ -42,7 +43,7 @@ class Calibrating:
     def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
         self._rng = np.random.default_rng([seed, 0x6E])
         self._ramp: Ramp | None = None
-        self._rested = 0.0  # [s]
+        self._rested = 0.0  # time since the end of the step [s]
         self.use(robot, settings)
 
     def use(self, robot: Robot, _: Settings) -> None:
@@ -64,7 +65,7 @@ class Calibrating:
         return Command(LENGTH, self._ramp.step(inputs.dt))
 
     def leave(self) -> None:
-        """Discard the present step."""
+        """Discard the present motion."""
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:

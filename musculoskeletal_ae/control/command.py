@@ -34,7 +34,7 @@ class Pull(NamedTuple):
 
 
 def msc_compensation(robot: Robot, tension: Array) -> Array:
-    """Return l_target − l for which muscle stiffness control exerts a tension.
+    """Return the l_target − l for which muscle stiffness control exerts the given tension.
 
         l_comp(T) = −(T − T_bias) / K_stiff              (paper, §III-E, eq. 6)
 
@@ -50,7 +50,7 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
 
 
 def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
-    """Return the command of a kind that keeps the present tensions."""
+    """Return a command that keeps the present tensions; `kind` is `LENGTH` or `TENSION`."""
     tension = np.maximum(sample.model_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)

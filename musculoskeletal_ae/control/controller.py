@@ -50,10 +50,12 @@ from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream
 
-WINDOW = 3  # messages in the median filter against glitches
+WINDOW = 3  # number of messages in the median filter against outliers
 RESTORE = 'call estimator/restore to use isolated muscles again'
-AT_ONCE = 1.0  # longest time between an anomaly and the isolation of its suspect [s]
-APPROACHES = 3  # attempts to reach a target with isolated muscles if the arm falls on the way
+#: longest time in which the estimator isolates the suspect of an anomaly, or reacts to a length
+#: jump [s]
+REACTION_TIME = 1.0
+APPROACHES = 3  # number of further attempts to reach a target if an arm with isolated muscles falls
 
 
 @dataclass
@@ -158,16 +160,23 @@ class Suspicion:
         if not has_anomaly or self._isolated is None:
             return None
         muscle, at = self._isolated
-        return muscle if muscle in isolated and at > self._anomaly_at - AT_ONCE else None
+        return muscle if muscle in isolated and at > self._anomaly_at - REACTION_TIME else None
 
 
 def by_follower(settings: Settings) -> bool:
-    """Return whether the follower moves to targets, not ramps of lengths or tensions."""
+    """Return whether the method reaches targets with the follower, rather than in another way.
+
+    The other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
+    """
     return settings.method not in (*BY_TENSION, *length_methods(settings))
 
 
 class Controller:
-    """Connects all parts between a target and a command."""
+    """Computes motor commands from targets, the estimated posture and muscle states.
+
+    It owns the supervisor, the watchdog, the planner, the activities and the limiter, and passes
+    each message and each control step to them. It does not depend on ROS.
+    """
 
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
@@ -184,7 +193,7 @@ class Controller:
         self.activities = Activities(robot, self.settings, seed)
         self.limiter = CommandLimiter(robot, self.settings)
         self.stopping = SafeStop(robot, self.settings, self.limiter)
-        self.sent_at = 0.0  # time at which the last command was published; set by the caller
+        self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
@@ -225,7 +234,7 @@ class Controller:
             self.activities.ramps.solve_again()
 
     def take(self, message: Any, now: float) -> None:
-        """Take a message of muscle_states.
+        """Process a message of muscle_states: check it, filter it and use it from now on.
 
         Raises:
             RejectionError: If the message cannot be used.
@@ -233,7 +242,7 @@ class Controller:
         self._use_sample(self.stream.take(message, now), now)
 
     def muscles(self, states: Array, now: float) -> None:
-        """Take raw l [m], T [N] and temperature [°C], (3, M).
+        """Process raw l [m], T [N] and temperature [°C], (3, M), as `take` does with a message.
 
         Raises:
             RejectionError: If the values are implausible for this arm.
@@ -247,7 +256,7 @@ class Controller:
         self.watchdog.take_sample(sample, now)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
-        """Take the estimated posture θ [rad] (D,).
+        """Check the estimated posture θ [rad] (D,) and control the arm by it from now on.
 
         A repeated estimate, with `is_new` false, does not count as new data for the watchdog.
 
@@ -319,7 +328,7 @@ class Controller:
             self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
-        """Restart the messages' clock after a backward jump."""
+        """Restart all measurements of time and the filter after the messages' clock jumped back."""
         self.watchdog.age.clock_jumped_back()
         self.stream.reset()
 
@@ -412,8 +421,8 @@ class Controller:
             return 'method float: the arm is guided by hand; set another method first'
         if wanted and not (self.robot.knows_tension or self.stream.body.offsets.known):
             return (
-                'the length offsets are unknown, and without tensions (tension_source: none) no '
-                'exploration finds them; call estimator/zero with a stated posture'
+                'the length offsets are unknown, and exploration cannot determine them without '
+                'tensions (tension_source: none); call estimator/zero with a stated posture'
             )
         if wanted and not self.stream.body.used.any():
             return f'all muscles are isolated; {RESTORE}'
@@ -431,7 +440,11 @@ class Controller:
         self.supervisor.on_event(cause, detail)
 
     def reset(self, now: float) -> Condition | None:
-        """End a stop and continue to the last target, unless a stop cause is present; return it."""
+        """End a stop and continue to the last target, unless a stop cause is present.
+
+        Returns:
+            The first stop cause that is present, or None if the stop has ended.
+        """
         return self.supervisor.on_reset(self.conditions(now))
 
     # -- time -----------------------------------------------------------------------------------
@@ -456,10 +469,10 @@ class Controller:
         """
         stream = self.stream
         if stream.body.offsets.is_suspect:
-            return 'the estimator has revoked their offsets'
+            return 'the estimator has revoked the length offsets'
         has_jumped = stream.displaced and not stream.has_displaced_unseen
-        if has_jumped and stream.body.offsets.known and now - self._jumped_at > AT_ONCE:
-            return f'they jumped: {self.robot.names(sorted(stream.displaced))}'
+        if has_jumped and stream.body.offsets.known and now - self._jumped_at > REACTION_TIME:
+            return f'the lengths of {self.robot.names(sorted(stream.displaced))} have jumped'
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:
@@ -469,8 +482,8 @@ class Controller:
             now: Time of the steady clock [s].
             time: Time of the messages [s]; None if it is the same clock.
         """
-        # The rate limit must not count the time from the last step to the publication of its
-        # command.
+        # The rate limit applies to the time between publications. Therefore the time in which the
+        # last command was computed is subtracted.
         computing = max(self.sent_at - self.watchdog.age.stepped_at, 0.0)
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)

@@ -22,9 +22,9 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
-TRIES = 1000
-AT_LIMITS = 0.25  # share of each joint's targets that are at one of its limits
-SMALL = 1e-9  # [N·m]
+TRIES = 1000  # largest number of random postures in which holdable ones are sought
+AT_LIMITS = 0.25  # fraction of each joint's targets that are at one of its limits
+SMALL = 1e-9  # smallest torque by which pressures are divided [N·m]
 PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
 
 
@@ -48,7 +48,7 @@ class Exploration:
         self.use(robot, preset)
 
     def use(self, robot: Robot, preset: str) -> None:
-        """Draw targets that are holdable without the robot's isolated muscles."""
+        """Draw the next steps for another preset, or for a robot with other isolated muscles."""
         self._robot, self._draw = robot, preset_named(preset).exploration()
 
     def __iter__(self) -> Iterator[Step]:
@@ -65,7 +65,16 @@ def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_
 
 
 def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:
-    """Return random T [N] (M,) that press joints of θ [rad] (D,) at a limit against their stop."""
+    """Return random tensions that press the joints that are at a limit against their stops.
+
+    Args:
+        robot: The robot.
+        theta: θ [rad], (D,).
+        rng: Generator of the random tensions.
+
+    Returns:
+        T [N], (M,).
+    """
     limits = robot.tension
     side = (theta == robot.upper).astype(float) - (theta == robot.lower)
     count = PRESSES if side.any() else 1
@@ -85,8 +94,8 @@ def holdable_postures(
         robot: The robot.
         postures: Random postures.
         count: Number of postures to return.
-        others: Further functions for G, as for `muscle_hessian`. A posture has to be holdable with
-            the nominal G and with each of these; T is that of the last one.
+        others: Further functions that return G (N, M, D) for postures (N, D). A posture has to be
+            holdable with the nominal G and with each of these; T is computed with the last one.
 
     Raises:
         RobotDescriptionError: If there are fewer holdable postures.
@@ -107,7 +116,7 @@ def holdable_postures(
 
 
 class Exploring:
-    """The activity of exploring, which executes random steps by ramps of lengths."""
+    """The activity of exploring, which executes random steps with ramps of muscle lengths."""
 
     def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
         self.stream, self.ramps = exploration, ramps

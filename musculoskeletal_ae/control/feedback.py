@@ -14,13 +14,13 @@ REPLAN = 5.0  # change of a relevant tension limit that requires a new plan [N]
 CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times RACK [m]
 #: largest relief [m]: covers length errors and the tension that friction retains in a tendon
 RELIEF = 0.01
-#: Estimated errors up to this size are not corrected [rad], for prismatic joints times RACK [m]. It
-#: is about the error of the estimate. Without it, an arm with friction would creep for ever.
+#: Largest estimated error that is not corrected [rad], for prismatic joints times RACK [m]. It is
+#: about the error of the estimate. Without a dead band, an arm with friction would never rest.
 DEADBAND = 0.03
 #: largest relief of modules that follow positions [m]; covers errors of a network that has not
 #: learned the arm yet, which such modules turn into slack or into tension
-SLACK = 0.03
-BETWEEN = 0.1  # time between two computations of the needless tension [s]
+POSITION_RELIEF = 0.03
+RELIEF_INTERVAL = 0.1  # time between two computations of the needless tension [s]
 SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
 
 
@@ -57,7 +57,8 @@ class RestFeedback:
     because friction already supports the arm there.
 
     Modules that follow positions do not hold T_bias. For them K_stiff is the stiffness of the
-    series elastic element, T may be below T_bias, and |r| ≤ SLACK: a slack tendon is wound in.
+    series elastic element, T may be below T_bias, and |r| ≤ POSITION_RELIEF: a slack tendon is
+    wound in.
 
     Attributes:
         correction: c [rad], (D,).
@@ -105,10 +106,10 @@ class RestFeedback:
         correction = self.correction + gain * dt * beyond
         self.correction = np.clip(correction, -self.largest, self.largest)
         self._unsolved += dt
-        if self._unsolved >= BETWEEN and self._robot.knows_tension:
+        if self._unsolved >= RELIEF_INTERVAL and self._robot.knows_tension:
             robot, bias = self._robot, self._robot.tension.bias
             lowest = np.zeros_like(bias) if robot.follows_position else bias
-            largest = SLACK if robot.follows_position else RELIEF
+            largest = POSITION_RELIEF if robot.follows_position else RELIEF
             share = gain * self._unsolved / robot.tension_per_length(pull.motor)
             self._unsolved = 0.0
             bone = np.clip(pull.bone, lowest, limit)
@@ -119,5 +120,5 @@ class RestFeedback:
         return True
 
     def shift(self, jacobian: Array) -> Array:
-        """Return the length correction G c + r [m] (M,), with G (M, D) at the target."""
+        """Return the length correction G c + r [m], (M,); `jacobian` is G at the target, (M, D)."""
         return jacobian @ self.correction + self.relief

@@ -25,8 +25,8 @@ rest feedback (`feedback.RestFeedback`) continues from c.
 Where no tension is known, T is `Robot.assumed_tension` in every posture, as in the samples from
 which the network was learned (doc/explanation/method.md).
 
-Method `stiffness` minimises ‖T − T_K‖² instead, where T_K is that of `methods.stiffness_command` a
-moment ahead. It uses no feedback, which would change the chosen stiffness.
+Method `stiffness` minimises ‖T − T_K‖² instead, where `methods.stiffness_command` computes T_K for
+the setpoint in AHEAD. It uses no feedback, which would change the chosen stiffness.
 """
 
 from __future__ import annotations
@@ -47,23 +47,26 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
-PROPORTIONAL, INTEGRAL = 0.7, 4.0  # k_p; k_i [1/s]
+PROPORTIONAL = 0.7  # proportional gain k_p of the posture error
+INTEGRAL = 4.0  # integral gain k_i of the posture error [1/s]
 FRICTION = 0.05  # μ if none was learned: a typical value of hand-built arms
-#: share of the rate limit for a trajectory's lengths; the rest is for tensions and feedback
+#: fraction of the rate limit for a trajectory's lengths; the rest is for tensions and feedback
 SHARE = 0.7
-#: most moments at which a network is evaluated; at least one for each piece of 10 000
+#: largest number of moments of a trajectory at which the network is evaluated; even with 10 000
+#: points, each piece of the trajectory has at least one
 MOST_MOMENTS = 12_500
 BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
-#: An arm has fallen if its error exceeds FALLEN [rad], for prismatic joints times RACK [m], for
-#: FALLING [s] after the end of the trajectory.
-FALLEN, FALLING = 0.2, 2.0
+#: error above which an arm with isolated muscles has fallen [rad]; for prismatic joints times RACK
+#: [m]
+FALLEN = 0.2
+FALLING = 2.0  # time after the end of a trajectory from which on the arm can count as fallen [s]
 SETTLING = 0.8  # time after the end for which the feedback of the motion continues [s]
 TURNING = 0.005  # speed of a tendon above which its sliding direction is certain [m/s]
 AHEAD = 0.2  # T_K is computed for this time ahead, and at this interval [s]
 
 
 class Stiffening:
-    """Computes the tensions T_K that method `stiffness` approaches, a moment ahead."""
+    """Computes the tensions T_K that method `stiffness` approaches, for the setpoint in AHEAD."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.use(robot, settings)
@@ -82,7 +85,7 @@ class Stiffening:
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
     ) -> Array:
-        """Return T_K [N] (M,); its rate is limited to what trajectories leave of the rate limit."""
+        """Return T_K [N] (M,), which changes only by the part of the rate limit left by `SHARE`."""
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt
         if solution is None or self._solved >= AHEAD:
@@ -93,7 +96,7 @@ class Stiffening:
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near
             self.solution = solution
-        # Use half of it, because the series elastic elements stretch as well.
+        # Use half of that part, because the series elastic elements stretch as well.
         rates = robot.fastest(settings.rate_limit) * robot.tension_per_length(self._near)
         largest = 0.5 * (1.0 - SHARE) * rates * dt
         self._near = self._near + np.clip(solution.tension - self._near, -largest, largest)
@@ -105,10 +108,11 @@ class Follower:
 
     Attributes:
         trajectory: The present or last trajectory; None before the first and after a stop.
-        next: A trajectory that replaces it later, and the time until then [s].
+        next: The trajectory that will replace it, and the time until then [s]; None if there is
+            none.
         effort: Torque in addition to inverse dynamics [N·m], (D,).
         time: Time since the start of the trajectory [s].
-        over: Time since its end [s].
+        over: Time since the end of the trajectory [s].
         desired: The present setpoint.
         error: Desired − estimated θ [rad], (D,).
         missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
@@ -133,7 +137,9 @@ class Follower:
         self._blend: Ramp | None = None
         self.tension: Array = robot.tension.bias.copy()
         self._motor: Array = self.tension  # planned motor-side tension [N], (M,)
-        self._sliding: Array = np.zeros(robot.muscle_count)  # s of each tendon, (M,)
+        self._sliding: Array = np.zeros(
+            robot.muscle_count
+        )  # sliding direction s of each tendon, (M,)
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.

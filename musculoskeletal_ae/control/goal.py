@@ -28,7 +28,8 @@ def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
         if one.name not in joints:
             raise MessageError('unknown joint', f'{one.name!r}; legal: {", ".join(joints)}')
         if not np.isfinite(one.position):
-            raise MessageError('not finite', f'a tolerance of {one.name}')
+            detail = f'the tolerance of {one.name} is {one.position}; expected a finite number'
+            raise MessageError('not finite', detail)
         if one.position > 0.0:
             bounds[joints.index(one.name)] = one.position
     return bounds
@@ -47,7 +48,8 @@ class FollowedGoal:
             joints: Names of the joints.
             path: Tolerances along the trajectory [rad], (D,).
             goal: Tolerances at its end [rad], (D,).
-            patience: Time after the end to reach the goal tolerances [s]; 0 for no limit.
+            patience: Longest time after the end until the goal tolerances are met [s]; 0 for no
+                limit.
         """
         self._core, self._trajectory = core, core.activities.follower.latest
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
@@ -58,7 +60,9 @@ class FollowedGoal:
         follower, condition = core.activities.follower, core.supervisor.condition
         if condition is not None:
             return INVALID, f'stopped: {condition}'
-        if not core.is_following or follower.latest is not trajectory or trajectory is None:
+        if not core.is_following or trajectory is None:
+            return INVALID, f'ended, because the mode changed to {core.supervisor.mode}'
+        if follower.latest is not trajectory:
             return INVALID, 'replaced by another target'
         if follower.trajectory is not trajectory:
             return None  # the trajectory has not started yet

@@ -24,15 +24,17 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: tolerances [m] and [rad] of the inverse kinematics for a whole pose, and for its position only
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
-FAR, TURNED = 0.005, 0.05  # errors above which a pose counts as unreachable [m], [rad]
+FAR = 0.005  # distance from a pose above which it counts as unreachable [m]
+TURNED = 0.05  # angle to the orientation of a pose above which it counts as unreachable [rad]
 SHORTEST = 0.3  # shortest movement to a single pose [s]
 PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
-# Poses form a path if they arrive within FOLLOWING [s] and require less than FASTEST [m/s]. The
-# interval between poses is averaged with weight MEMORY.
-FOLLOWING, FASTEST, MEMORY = 0.25, 1.0, 0.2
+PATH_INTERVAL = 0.25  # longest interval between two poses that form a path [s]
+PATH_SPEED = 1.0  # highest speed of the hand from pose to pose at which they form a path [m/s]
+INTERVAL_WEIGHT = 0.2  # weight of the newest interval in the average interval of a path
 JOINING = 0.1  # shortest time to join a path [s]
 RETURNING = 2.0 * STOPPING  # time to come to rest at the last pose of a path [s]
-TWIST_TIMEOUT, STARTING = 0.3, 0.1  # duration of a twist, and of the acceleration to it [s]
+TWIST_TIMEOUT = 0.3  # duration of the motion by one twist [s]
+STARTING = 0.1  # duration of the acceleration to a twist [s]
 DAMPING = 0.02  # damping of the inverse Jacobian [m]; limits the speed of joints near singularities
 
 
@@ -55,10 +57,11 @@ class Hand:
             pose: The pose in the root link's frame.
             whole: Whether the orientation counts.
             start: Posture from which the search starts [rad], (D,).
-            nearest: Whether to return the nearest posture if the pose is out of reach.
+            nearest: Whether to return the nearest holdable posture if the hand cannot reach the
+                pose.
 
         Raises:
-            MessageError: If the pose is out of reach and `nearest` is false.
+            MessageError: If the hand cannot reach or hold the pose and `nearest` is false.
         """
         robot = self._robot
         theta, distance, angle, _ = inverse_kinematics(
@@ -66,14 +69,16 @@ class Hand:
         )
         reason = ''
         if distance > FAR or (whole and angle > TURNED):
-            reason = f'{1000.0 * distance:.0f} mm'
+            reason = f'within the joint limits, the hand remains {1000.0 * distance:.0f} mm'
             if whole:
                 reason += f' and {angle:.2f} rad'
-            reason += ' beyond the joint limits or the arm'
+            reason += ' away from the pose'
+        kind = 'out of reach' if reason else 'not holdable'
         theta, lack = nearest_held(robot, mae, start, theta)
         reason = '; '.join(filter(None, (reason, lack)))
         if reason and not nearest:
-            raise MessageError('out of reach', reason)
+            remedy = 'send another pose, or set the parameter unreachable to nearest'
+            raise MessageError(kind, f'{reason}; {remedy}')
         return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
@@ -89,12 +94,12 @@ class Hand:
         here = robot.kinematics.end_effector_pose(start.theta).translation
         where = robot.kinematics.end_effector_pose(theta).translation
         self._last = now, where, theta
-        if last is not None and 0.0 < now - last[0] < FOLLOWING:
+        if last is not None and 0.0 < now - last[0] < PATH_INTERVAL:
             interval, moved = now - last[0], float(np.linalg.norm(where - last[1]))
             behind = float(np.linalg.norm(here - last[1]))
-            if max(moved, behind) < FASTEST * interval:
+            if max(moved, behind) < PATH_SPEED * interval:
                 before = self._interval or interval
-                self._interval = before + MEMORY * (interval - before)
+                self._interval = before + INTERVAL_WEIGHT * (interval - before)
                 velocity = (theta - last[2]) / self._interval
                 # Extrapolate the path for as long as joining it takes, then return to the pose.
                 ahead = max(self._interval, JOINING)
@@ -137,7 +142,8 @@ class Hand:
         # A joint that would exceed its limit stops there; the others continue.
         free = (inside == theta).all(axis=0)
         if missing := lacking(robot, mae, inside[-1]):
-            raise MessageError('out of reach', f'the muscles lack {missing} there')
+            detail = f'at the end of this motion, the muscles lack {missing}'
+            raise MessageError('not holdable', f'{detail}; send a smaller or another twist')
         rates = np.array([1.0, 1.0, 0.0])[:, None] * velocity * free
         return Trajectory.through(
             start, Points(np.arange(len(velocity)), time, inside, rates, 0.0 * rates)

@@ -23,9 +23,9 @@ Modules that follow positions turn a command into tension by stretching the seri
     l_target ≥ l − SHARE (L_e(T_limit) − L_e(T)) + r       while T ≤ T_limit
     l_target ≥ l + L_e(T) − L_e(T_limit) + r               above it
 
-Here T is measured, so that the limit holds in any posture and for any error of the network. They
-receive length commands only: a desired tension becomes the length that moves T towards it by a
-share of the difference (`ADMITTANCE`).
+Here T is measured, so that the limit holds in any posture and for any error of the network. These
+modules receive length commands only: a desired tension becomes the length that corrects the
+fraction `ADMITTANCE` of the tension error.
 
 T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
 (`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
@@ -59,10 +59,11 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
 #: largest difference between the length of a real muscle and that of the model [m]
 LENGTH_MARGIN = 0.03
-#: share of the stretch that remains up to T_limit that a command to a module that follows positions
-#: may use; the rest covers errors of L_e and the age of T
+#: For modules that follow positions: fraction of the remaining stretch up to T_limit that one
+#: command may use. The rest covers errors of L_e and the age of T.
 SHARE = 0.7
-#: share of a difference of tensions that a command to such a module removes
+#: For modules that follow positions: fraction of the tension error that one length command
+#: corrects.
 ADMITTANCE = 0.5
 RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
@@ -188,7 +189,7 @@ class CommandLimiter:
         return self.command
 
     def _by_admittance(self, tension: Array, sample: MuscleSample) -> Command:
-        """Return the lengths that move the measured tensions towards others [N] (M,)."""
+        """Return the lengths that move the measured tensions towards desired ones [N] (M,)."""
         robot, measured = self._robot, np.maximum(sample.motor_tension, 0.0)
         goal = measured + ADMITTANCE * (tension - measured)
         return Command(LENGTH, robot.length_for(sample.length, measured, goal))

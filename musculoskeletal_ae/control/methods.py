@@ -30,26 +30,30 @@ from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
 
-# A third solution with G at the new tension would change the tension by well under a newton.
+# Number of quadratic programmes, each with G at the last tension. A third one would change the
+# tension by well under a newton.
 SOLVES = 2
 
 # Constants of `stiffness`
 # Candidates for the margin of T_low above T_bias [N]; the largest feasible one is used. An external
 # force can reduce a muscle's tension by this margin before the muscle becomes slack.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
-ITERATIONS = 6
+ITERATIONS = 6  # largest number of iterations of Gauss–Newton and of Frank–Wolfe
 # Weight of the least tension relative to the stiffness. A reachable stiffness is missed by about
 # this share.
 LEAST_TENSION_SHARE = 1e-3
-SHARES = (1.0, 0.5, 0.25, 0.125)  # step lengths towards a corner; K is concave in each tension
+# Step lengths of the line search towards a corner of the feasible tensions. The full step need not
+# be the best, because K is concave in each tension.
+SHARES = (1.0, 0.5, 0.25, 0.125)
 FAR = 1e5  # scale of the gradient that makes a quadratic programme practically linear [N²]
 LEVELS = 8  # number of tensions between T_bias and limit at which the elongation is evaluated
 # Step of the finite difference of G [rad]: small relative to changes along a route, large relative
 # to errors of the MAE.
 STEP = 0.05
 
-#: methods that need no tension, by preset; `second` and the paper's `proposed` start from it
+#: methods that need no measured tension, by preset
 WITHOUT_TENSION = {'default': ('geometric', 'first', 'proposed')}
+#: methods that need no measured tension with any other preset, whose `proposed` starts from it
 OTHERS_WITHOUT_TENSION = ('geometric', 'first')
 
 
@@ -57,7 +61,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
     """Check that the robot's modules can do what the method needs.
 
     Raises:
-        MusculoskeletalError: If they cannot; names the reason and the legal methods.
+        MusculoskeletalError: If they cannot; the text names the reason and the legal methods.
     """
     if robot.knows_tension:
         return
@@ -150,8 +154,8 @@ class StiffnessModel(NamedTuple):
     jacobian: Array  # G [m/rad], (M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
     compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
-    module: Array  # K_stiff [N/m], (M,)
-    springs: Array  # of the joints [N·m/rad], (D, D)
+    module: Array  # stiffness K_stiff of the modules [N/m], (M,)
+    springs: Array  # stiffness of the joints' own springs [N·m/rad], (D, D)
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
@@ -214,12 +218,11 @@ def stiffness_command(
 
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
-    K_θ is that of `robot/stiffness.py`, with the springs of the joints. Its G, ∂²l/∂θ² and
+    `robot/stiffness.py` defines K_θ; here it includes the springs of the joints. Its G, ∂²l/∂θ² and
     L_e(T) = −l(θ, T) + const come from ① of the network (paper, §III-E, third: variable stiffness).
-    Tensions in the null space of Gᵀ keep
-    the posture and stiffen the elastic elements. T_low lies above T_bias, because a muscle that MSC
-    holds at T_bias is stiff in one direction only. K is nearly linear in T, so a few quadratic
-    programmes around the last solution suffice.
+    Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. T_low lies
+    above T_bias, because a muscle that MSC holds at T_bias is stiff in one direction only. K is
+    nearly linear in T, so a few quadratic programmes around the last solution suffice.
 
     Args:
         robot: The body, in which isolated muscles have no tension.
@@ -229,7 +232,7 @@ def stiffness_command(
         desired: Desired diagonal entries of K_θ [N·m/rad], (D,). 0 leaves an entry unconstrained;
             values beyond the reachable range of a joint are clipped to it.
         limit: Highest tension that may be planned [N], scalar or (M,).
-        near: Tension of a moment ago [N], (M,), if there is one; then a single round suffices.
+        near: Tension of the last solution [N], (M,), from which one round suffices; or None.
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))

@@ -57,13 +57,13 @@ class Planner:
 
     @property
     def takes_nearest(self) -> bool:
-        """Whether the arm goes to the nearest holdable posture if the target is out of reach."""
+        """Whether the arm goes to the nearest holdable posture if the target is not holdable."""
         return self._settings.unreachable == 'nearest'
 
     def to_posture(self, mae: Mae, start: Setpoint, theta: Array, duration: float) -> Plan:
         """Plan a motion to rest at θ [rad] (D,) through holdable postures.
 
-        `duration` [s] is that of each segment.
+        `duration` is the time for each segment of the path [s].
         """
         way = reach.way(self._robot, mae, start.theta, theta)
         return Plan(self._within_limits(mae, Trajectory.to(start, way, duration)))
@@ -104,7 +104,7 @@ class Planner:
         return same and trajectory is followed
 
     def repeat_pose(self, now: float) -> None:
-        """Note that the last pose was received again at `now` [s]."""
+        """Record that the last pose was received again at `now` [s]."""
         self._hand.again(now)
 
     def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
@@ -137,7 +137,7 @@ class Planner:
             f'{problem} without {isolated}; nearest holdable posture: {robot.posture_text(held)}'
         )
         if not nearest:
-            raise MessageError('out of reach', problem)
+            raise MessageError('not holdable', problem)
         return held, f'{problem}; going there'
 
     def _check_limits(self, points: Points) -> None:

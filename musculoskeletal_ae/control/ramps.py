@@ -29,8 +29,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-# Share of a movement's time in which the command moves. In the remaining time the arm settles and
-# is sampled.
+# Fraction of a movement's duration in which the command changes. In the remaining time, the arm
+# settles and is sampled.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # ratio of peak to mean speed of a ramp
 FIRST = 'first'  # the method that uses T_const

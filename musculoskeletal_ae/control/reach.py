@@ -24,20 +24,23 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-# For prismatic joints, [rad] below are times RACK [m], and [N·m] are divided by RACK [N].
+# Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
+# RACK and become [m], and torques are divided by RACK and become [N].
 NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
 HALVINGS = 6  # bisection steps on the way to a posture that is not holdable
 
 PRICE = 20.0  # cost of missing torque [rad/(N·m)]
-USED = 0.85  # share of the tension range above T_bias that a path may use
-POSTURES, NEIGHBOURS = 300, 12  # postures of the roadmap, and neighbours of each
-LOOKS = 40  # largest number of paths that are evaluated
+USED = 0.85  # fraction of the tension range above T_bias that a path may use
+POSTURES = 300  # number of random postures of the roadmap
+NEIGHBOURS = 12  # number of neighbours of each posture to which the roadmap has edges
+LOOKS = 40  # largest number of paths of which all edges are evaluated
 SPACING = 0.15  # distance between the evaluated postures of an edge [rad]
-AT_STOP, STOP = 0.05, 100.0  # largest distance from a stop [rad], and its largest torque [N·m]
+AT_STOP = 0.05  # distance from a stop below which a joint rests at it [rad]
+STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
-    """Return the joint with the largest missing torque at θ [rad] (D,), or '' if θ is holdable."""
+    """Return a text on the largest missing torque at θ [rad] (D,), or '' if θ is holdable."""
     limits, radian = robot.tension, robot.kinematics.radian
     torque = radian * robot.kinematics.holding_torque(theta)
     jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
@@ -45,16 +48,15 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     joint = int(lacks.argmax())
     if lacks[joint] <= NOTABLE:
         return ''
-    return (
-        f'{lacks[joint] / radian[joint]:.2f} {robot.units[joint].torque} at {robot.joints[joint]}'
-    )
+    torque_text = f'{lacks[joint] / radian[joint]:.2f} {robot.units[joint].torque}'
+    return f'{torque_text} at joint {robot.joints[joint]}'
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
     """Return the last holdable posture on the straight path from `start` to θ [rad], (D,).
 
     Returns:
-        The posture, and the missing torque at θ, or '' if θ is holdable.
+        The posture, and a text on the missing torque at θ, or '' if θ is holdable.
     """
     missing = lacking(robot, mae, theta)
     if not missing:
@@ -64,7 +66,7 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
         share = 0.5 * (low + high)
         is_holdable = not lacking(robot, mae, start + share * (theta - start))
         low, high = (share, high) if is_holdable else (low, share)
-    return start + low * (theta - start), f'the muscles lack {missing} there'
+    return start + low * (theta - start), f'at the target, the muscles lack {missing}'
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:

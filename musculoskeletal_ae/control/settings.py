@@ -15,7 +15,7 @@ MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/r
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of control; `Controller.configure` takes changed ones."""
+    """Settings of control; `Controller.configure` applies changed ones."""
 
     method: str = settable('proposed', 'how a target posture becomes a command', legal=METHODS)
     preset: str = replace(PRESET, settable=True).field()
@@ -29,7 +29,11 @@ class Settings:
     )
     first_duration: float = settable(5.0, 'movement duration', 's', 0.1, 60.0)
     second_duration: float = settable(
-        2.0, 'duration of the second movement of `second`, and after a checkpoint', 's', 0.1, 60.0
+        2.0,
+        'duration of the second movement of `second`, and of the one after a new checkpoint',
+        's',
+        0.1,
+        60.0,
     )
     target_duration: float = settable(
         1.2,
@@ -116,6 +120,6 @@ class Settings:
             return (0.0,) * len(most)
         if len(values) != len(most) or not all(0.0 <= v <= high for v, high in zip(values, most)):
             ends = ', '.join(f'{high:g}' for high in most)
-            legal = f'{len(most)} numbers of at least 0, at most {ends}'
-            raise MusculoskeletalError(f'{list(values)}; legal: {legal} [N·m/rad or N/m], or []')
+            legal = f'{len(most)} numbers of at least 0, at most {ends} [N·m/rad or N/m], or []'
+            raise MusculoskeletalError(f'{list(values)}; legal: {legal}')
         return values

@@ -17,7 +17,8 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
 from musculoskeletal_ae.signals.body_state import KNOWN
 
-LEAST_SHARE = 10.0  # share of its speed below which a slowed trajectory's duration is reported [%]
+#: fraction of the requested speed below which a slowed trajectory is reported by its duration [%]
+LEAST_SHARE = 10.0
 DOING = {
     Activity.IDLE: 'no target',
     Activity.HOLDING: 'holding',
@@ -84,7 +85,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
     if np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {m:.2f} {unit.torque}' for n, m, unit in each)
-        warnings.append('the target needs more torque than the muscles have')
+        warnings.append('the target needs more torque than the muscles can exert')
     if target.unreachable_reason:
         warnings.append(f'out of reach: {target.unreachable_reason}')
     if core.is_following and follower.has_fallen:
@@ -118,7 +119,7 @@ def _heat_warnings(core: Controller, values: dict[str, str]) -> list[str]:
     if not hot:
         return []
     values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
-    return [f'hot: {", ".join(hot)}']
+    return [f'heat limits the tension of {", ".join(hot)}']
 
 
 def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
@@ -152,7 +153,7 @@ def _missing_torque(core: Controller) -> Array:
 
 
 def slowed(follower: Follower) -> str:
-    """Return a text on how much the last trajectory was slowed, or ''."""
+    """Return a text on how much the last trajectory was slowed; '' if it was not."""
     last = follower.latest
     if last is None or last.slowed == 1.0:
         return ''

@@ -27,8 +27,12 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-PAYING_OUT = 1.5  # time for releasing the arm before a suspect is wound in [s]
-LARGEST_RISE, DEPTH, SPEED = 30.0, 0.015, 0.02  # limits for winding in a suspect [N], [m], [m/s]
+PAYING_OUT = 1.5  # duration of the release before a suspect is wound in [s]
+LARGEST_RISE = 30.0  # rise of a suspect's tension at which winding in ends [N]
+#: largest distance by which a suspect is wound in [m]; `Robot.release` for modules that follow
+#: positions
+DEPTH = 0.015
+SPEED = 0.02  # speed at which a suspect is wound in [m/s]
 
 
 class SafeStop:
@@ -79,7 +83,7 @@ class SafeStop:
 
         Args:
             sample: The newest muscle states.
-            dt: Time of the stop since the last call [s].
+            dt: Time since the last call that counts towards the stop [s].
             is_fresh: Whether the sample is still up to date.
             may_wind: Whether the suspect may be wound in.
             releases_at_once: Whether to release the arm without holding the last command.

@@ -46,7 +46,7 @@ class Declaration(NamedTuple):
     steps: tuple[Step, ...]  # the remedy
 
 
-#: steps after all others
+#: steps that come after all others in a remedy for several causes
 LAST = Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY
 
 

@@ -16,7 +16,7 @@ doc/reference/stops.md`. While the arm is *running*, the mode that the controlle
 what the arm does: {activities}. Otherwise the mode is one of {states}. A program compares these \
 identifiers and those of the causes: the latched topic `controller_mode` has the mode, or the \
 mode and the cause as `stopped:operator_stop`. The values `mode` and `stop cause` of the \
-controller in `/diagnostics` name the same.
+controller in `/diagnostics` contain the same identifiers.
 
 ## Modes
 

@@ -54,7 +54,7 @@ class Event(Enum):
     RESET = 'controller/reset without a cause present'
 
 
-#: activities that a latched stop ends, and the activity that follows the stop instead
+#: the activity after a latched stop, for each activity that the stop ends
 AFTER_A_STOP = {
     Activity.MOVING: Activity.HOLDING,
     Activity.EXPLORING: Activity.IDLE,

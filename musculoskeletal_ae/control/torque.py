@@ -14,10 +14,12 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
 
-# Gravity compensation; for prismatic joints, the values apply to a pinion of radius RACK.
-BAND, HOLD = 0.05, 15.0  # [rad], [N·m/rad]
-DAMPING = 1.0  # [N·m·s/rad]
-WALL, WALL_AT = 30.0, 0.05  # [N·m/rad], [rad]
+# Constants of gravity compensation. For prismatic joints, they apply to a pinion of radius RACK.
+HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
+BAND = 0.05  # largest distance of the arm from θ_held [rad]
+DAMPING = 1.0  # damping of each joint [N·m·s/rad]
+WALL = 30.0  # stiffness of the wall near a joint limit [N·m/rad]
+WALL_AT = 0.05  # distance of the wall from the joint limit [rad]
 
 
 class TorqueControl:
@@ -38,8 +40,8 @@ class TorqueControl:
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.missing_torque: Array = np.zeros(robot.joint_count)
         self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
-        self._command: Array = robot.tension.bias
-        self._smooth: Array | None = None  # θ [rad], (D,)
+        self._command: Array = robot.tension.bias  # last tension command [N], (M,)
+        self._smooth: Array | None = None  # low-pass-filtered θ [rad], (D,)
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
@@ -78,8 +80,8 @@ class TorqueControl:
         tension, self.missing_torque = least_tension(
             jacobian, torque, robot.tension.bias, inputs.limit
         )
-        # Change all muscles by the same share: each tension between two that hold the arm holds it,
-        # too.
+        # Change all tensions by the same fraction of their way: any tensions on the line between
+        # two that hold the arm hold it as well.
         change = tension - self._command
         rates = robot.tension_per_length(self._command) * robot.fastest(self._settings.rate_limit)
         fastest = rates * dt

@@ -26,11 +26,13 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
 
-#: largest excess of the joint limits between points [rad]; for prismatic joints times RACK [m]
+#: largest allowed excess over the joint limits between points [rad]; for prismatic joints times
+#: RACK [m]
 BEYOND = 0.02
 STOPPING = 0.3  # time in which a cancelled motion comes to rest [s]
-SAMPLES, WITHIN = 200, 5  # number of evaluated moments, and their smallest number for each piece
-AT_ONCE = 0.01  # time of a point that is requested for time 0 [s]
+SAMPLES = 200  # approximate number of moments at which a whole trajectory is evaluated
+WITHIN = 5  # smallest number of moments at which each piece is evaluated
+AT_ONCE = 0.01  # time that replaces a requested time of 0 [s]
 RESOLUTION = 1e-11  # smallest relative distance between two times that doubles can resolve
 # Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
 # and acceleration at both ends.
@@ -102,11 +104,15 @@ class Trajectory:
             points = points._replace(time=points.time + AT_ONCE)
             kept = points.time >= AT_ONCE
         if not kept.any():
-            raise MessageError('all points have passed', f'it started {passed:.3g} s ago')
+            raise MessageError(
+                'all points have passed', f'the trajectory started {passed:.3g} s ago'
+            )
         velocity, acceleration = (None if part is None else part[kept] for part in points[3:])
         time, position = points.time[kept] - passed, points.position[kept]
         if ((apart := np.diff(time, prepend=0.0)) < RESOLUTION * time).any():
-            raise MessageError('points too close in time', f'{apart.min():.3g} s apart')
+            raise MessageError(
+                'points too close in time', f'two points are only {apart.min():.3g} s apart'
+            )
         left = Points(points.joints, time, position, velocity, acceleration)
         return cls._joined(start, left)
 
@@ -167,12 +173,15 @@ class Trajectory:
         _, theta = self.path
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
         if not np.isfinite(out).all():
-            raise MessageError('leaves the joint limits', 'the curve overflows floating point')
+            raise MessageError(
+                'leaves the joint limits', 'the curve between the points overflows floating point'
+            )
         beyond = out / robot.kinematics.radian
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
-            excess = f'{robot.joints[j]} by {out[j]:.3g} {robot.units[j].theta}'
-            raise MessageError('leaves the joint limits', excess)
+            excess = f'{out[j]:.3g} {robot.units[j].theta}'
+            detail = f'between its points, {robot.joints[j]} exceeds its limits by {excess}'
+            raise MessageError('leaves the joint limits', detail)
 
     @property
     def path(self) -> tuple[Array, Array]:
@@ -209,5 +218,5 @@ class Trajectory:
 
 
 def _halt(start: Setpoint, robot: Robot) -> Array:
-    """Return the posture [rad] (D,) where a motion comes to rest within `STOPPING`."""
+    """Return the posture [rad] (D,) at which a motion comes to rest after `STOPPING`."""
     return np.clip(start.theta + 0.5 * STOPPING * start.velocity, robot.lower, robot.upper)

@@ -25,11 +25,12 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 LONGEST_STEP = 0.1  # largest time step [s]; after a pause, control does not catch up
 OWN_PAUSE = 0.3  # longest time between two steps that counts as age [s]
 SLOWEST = 0.05  # smallest pace of the messages' clock that is compensated
-PACE_SPAN = 1.0  # time constant for comparing the two clocks [s]
-OVERHEATED = 20.0  # excess of temperature_limit at which the arm stops [°C]
-#: A tension above OVERLOAD times tension.limit for OVERLOAD_TIME [s] stops the arm. Until then, the
-#: limiter pays out only that muscle.
-OVERLOAD, OVERLOAD_TIME = 1.1, 0.2
+PACE_SPAN = 1.0  # time constant of the average pace of the messages' clock [s]
+OVERHEATED = 20.0  # excess over temperature_limit at which the arm stops [°C]
+#: ratio of a tension to tension.limit above which the arm stops after OVERLOAD_TIME; until then,
+#: the limiter pays out only that muscle
+OVERLOAD = 1.1
+OVERLOAD_TIME = 0.2  # time after which an overload stops the arm [s]
 
 MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMATE
 
@@ -107,7 +108,7 @@ class Overload:
         self._since: Array = np.full(robot.muscle_count, math.inf)
 
     def take(self, tension: Array, awake: float) -> None:
-        """Take filtered tensions T [N], (M,), at the time `awake` [s]."""
+        """Record which filtered tensions T [N], (M,), exceed the level at the time `awake` [s]."""
         self._since = np.where(tension > self._level, np.minimum(self._since, awake), math.inf)
 
     @property
@@ -122,7 +123,7 @@ class Overload:
         if awake - self._since[m] <= OVERLOAD_TIME:
             return []
         level = f'{self._level[m]:.0f} N for {OVERLOAD_TIME:g} s'
-        detail = f'{self._robot.muscles[m]}: tension above {level}'
+        detail = f'tension of {self._robot.muscles[m]} above {level}'
         return [Condition(StopCause.OVERLOAD, detail)]
 
 
@@ -142,7 +143,7 @@ class HeatLimit:
         self.momentary = self.planned
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
-        """Take muscle states, `elapsed` [s] after the previous ones."""
+        """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
         # The tension sensor of an isolated muscle may be faulty; its module is commanded T_bias.
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest[1], bias)
@@ -188,7 +189,7 @@ class Watchdog:
         self._robot, self._settings = robot, settings
 
     def take_sample(self, sample: MuscleSample, now: float) -> None:
-        """Take plausible muscle states."""
+        """Record that plausible muscle states were received; check them for overload and heat."""
         self.heat.take(self._robot, sample, self.age.received(MUSCLE_STATES, now))
         self.overload.take(sample.motor_tension * sample.usable, self.age.awake(now))
 

@@ -11,7 +11,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 WINDING = 0.03  # winding speed above which a muscle contributes to the measurement [m/s]
 LAGS = 2.0e-3  # weight of the initial guess λ = 0 [m²/s²]
-LARGEST_LAG = 0.1  # [s]
+LARGEST_LAG = 0.1  # upper bound of the measured lag [s]
 SPAN = 0.0095  # shortest time over which a speed is computed, so that noise is small [s]
 
 
@@ -20,9 +20,8 @@ class Winches:
 
         l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
 
-    Modules that follow positions have K_stiff = ∞ and always follow.
-
-    The fit is by least squares over all muscles whose speed exceeds WINDING.
+    Modules that follow positions have K_stiff = ∞, and the equation always holds for them. The fit
+    is by least squares over all muscles whose speed exceeds WINDING.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -47,11 +46,12 @@ class Winches:
         return self.lag * np.maximum(-self._speed, 0.0)
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
-        """Take l [m] and T [N], (M,), and the length command at that time.
+        """Update the fit from l [m], T [N] and the length command of the same time [m], (M,) each.
 
         `dt` [s] is the time since the previous call.
         """
-        # The values are medians of three messages, which lag by one message.
+        # Medians of three messages are one message old. Therefore the time between two of them is
+        # counted only up to the previous call.
         self._since, self._last = self._since + self._last, dt
         if self._length is not None and self._since < SPAN:
             return

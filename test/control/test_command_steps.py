@@ -50,7 +50,7 @@ class Arm(RuleBasedStateMachine):
         self.core.target(dict(zip(ROBOT.joints, ((0.0, 0.0),) * ROBOT.joint_count)))
         if explores:
             self.core.explore(True)
-        #: kind, value as published, and when, of the last command and of the last length command
+        #: kind, published value and time of the last command, and of the last length command
         self.last = self.last_length = None
         self.has_stopped = False
 

@@ -144,7 +144,7 @@ def test_stale_sensor_data_stop_the_arm_and_a_reset_is_refused_while_they_are_st
     bench.blind = {what}
     bench.step(15)
     assert bench.cause == ''
-    assert None not in bench.step(10)  # keeps commanding
+    assert None not in bench.step(10)  # the controller continues to send commands
     assert 'older than 0.2 s' in bench.condition
     assert 'older than' in str(bench.core.reset(bench.now))
     bench.blind = set()
@@ -326,7 +326,7 @@ def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
     bench.target(REST)
     bench.step(200)
-    if chosen['method'] == 'stiffness':  # its tensions are above T_bias
+    if chosen['method'] == 'stiffness':  # this method uses tensions above T_bias
         bench.tension = bench.core.activities.follower.tension
     still = bench.step(200)[-1].value
     bench.theta = REST + 0.05

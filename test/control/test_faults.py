@@ -99,7 +99,7 @@ def loop(settled):
     return copy.deepcopy(settled)
 
 
-#: start of the stop cause under each fault; '': the arm continues
+#: part of the stop cause under each fault; '' if the arm continues
 PROMISES = {
     'drop:0.5': '',
     'drop:1': 'older than',
@@ -110,7 +110,7 @@ PROMISES = {
     f'spike:tension:{MUSCLE}:400': '',
     'spike:temperature': '',
     f'bias:length:{MUSCLE}:0.3': 'muscle_states',
-    f'bias:tension:{MUSCLE}:400': 'tension above',
+    f'bias:tension:{MUSCLE}:400': 'overload: tension of',
     f'bias:temperature:{MUSCLE}:90': 'overheated',
     f'overheat:{MUSCLE}': '',  # the module then exerts T_bias only
     f'overheat:{MUSCLE}:120': 'overheated',

@@ -109,7 +109,13 @@ def test_what_ends_the_trajectory_ends_the_goal(event):
         followed.bench.configure(method='tension')
     (code, reported), steps = followed.run()
     assert (code, steps) == (INVALID, 0)
-    assert ('stopped: controller/stop' if event == 'stop' else 'replaced') in reported
+    reasons = {
+        'trajectory': 'replaced',
+        'target': 'replaced',
+        'stop': 'stopped: controller/stop',
+        'method': 'the mode changed to torque',
+    }
+    assert reasons[event] in reported
 
 
 def test_tolerances_of_unknown_joints_or_not_finite_are_refused_and_zero_means_no_bound():

@@ -48,7 +48,7 @@ NOT_THERE = next(theta for theta in POSTURES if not held(theta))
 @pytest.mark.parametrize('method', METHODS)
 def test_no_method_commands_tension_of_an_isolated_muscle(method, duration):
     bench = Bench(method=method, first_duration=1.0, second_duration=0.5, target_duration=duration)
-    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # also of the isolated muscle
+    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # the isolated muscle has tension, too
     bench.isolate([LOST])
     if method != 'float':
         bench.theta = THERE
@@ -94,7 +94,7 @@ def test_the_sensors_of_an_isolated_muscle_do_not_move_the_arm():
         (150.0, 60.0, f'overheated: {ROBOT.muscles[LOST]}'),  # an isolated motor can still overheat
         (500.0, 60.0, ''),
         (np.nan, 60.0, ''),
-        (90.0, 450.0, ''),  # a tension that it cannot have warms it no further
+        (90.0, 450.0, ''),  # an impossible tension does not warm the motor further
     ],
 )
 def test_an_isolated_muscle_stops_the_arm_for_real_heat_but_not_for_impossible_readings(
@@ -220,13 +220,13 @@ def test_a_prismatic_joint_without_muscles_lacks_force_in_newtons(sliding):
     robot, postures, force = sliding
     reported = [lacking(robot, ExactMae(robot), theta) for theta in postures]
     notable = reach.NOTABLE / RACK
-    assert reported == [f'{f:.2f} N at wrist' if f > notable else '' for f in np.abs(force)]
+    assert reported == [f'{f:.2f} N at joint wrist' if f > notable else '' for f in np.abs(force)]
     assert 0 < np.sum(np.abs(force) > notable) < len(force)
 
 
 def test_a_prismatic_joint_without_muscles_is_led_along_its_stop(sliding):
     robot, postures, force = sliding
-    steep = postures[force < -1.6]  # pressed to the upper stop
+    steep = postures[force < -1.6]  # the weight presses the joint to its upper stop
     apart = np.linalg.norm((steep[:, None] - steep)[..., :3], axis=2)
     start, goal = steep[list(np.unravel_index(apart.argmax(), apart.shape))]
     start[-1], goal[-1] = robot.upper[-1], 0.5 * robot.upper[-1]
@@ -251,7 +251,7 @@ class VerificationBench(Bench):
 def test_a_suspect_is_wound_in_gently_during_verification_and_the_arm_goes_on_afterwards():
     bench = VerificationBench()
     before = bench.wound(round((bench.core.settings.hold_time + PAYING_OUT) / 0.01) - 2)
-    assert (np.diff(before) >= 0.0).all()  # paid out
+    assert (np.diff(before) >= 0.0).all()  # the muscle is only paid out
     after = bench.wound(100)
     assert np.diff(after).min() >= -0.02 * 0.01 - 1e-12
     fell = before[-1] - after[-1]
@@ -313,7 +313,7 @@ def test_a_requested_stop_outlasts_a_verification(first):
 def test_the_end_of_an_anomaly_without_a_suspect_does_not_end_the_stop():
     bench = Bench()
     bench.target(REST)
-    bench.isolate([LOST])  # isolated long before
+    bench.isolate([LOST])  # long before the anomaly
     bench.step(150)
     bench.core.anomaly(True)
     lengths = bench.step(300)[-1].value
@@ -327,10 +327,10 @@ def test_exploration_resumes_after_the_suspect_was_verified():
     bench = Bench()
     bench.core.explore(True)
     bench.step(20)
-    bench.core.anomaly(True)  # in either order
+    bench.core.anomaly(True)  # the two messages may arrive in either order
     bench.isolate([0])
     bench.step(300)
-    bench.isolate([])  # it was healthy
+    bench.isolate([])  # the estimator restores the suspect as healthy
     bench.core.anomaly(False)
     bench.step(5)
     assert bench.core.supervisor.explores

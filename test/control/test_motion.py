@@ -26,7 +26,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 
 STILL = np.zeros((1, 2))
-PEAK_SPEED = 1.875  # peak speed of a quintic over its mean speed
+PEAK_SPEED = 1.875  # ratio of peak to mean speed of a quintic from rest to rest
 
 
 def points(goal, duration=1.0):
@@ -145,9 +145,8 @@ def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(
     assert held.max() > 1.5 * ROBOT.tension.bias[0]
     bench.now += 2.0
     moved(bench, 200)
-    np.testing.assert_allclose(
-        bench.core.activities.follower.tension, held, rtol=0.25
-    )  # friction is unknown
+    # The tolerance covers the unknown tendon friction.
+    np.testing.assert_allclose(bench.core.activities.follower.tension, held, rtol=0.25)
 
 
 @pytest.mark.parametrize('duration', [1.2, 5.0, 30.0])
@@ -363,7 +362,7 @@ def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(be
     assert 'going to the nearest posture' in bench.report().message
 
 
-def test_a_hand_pose_that_the_muscles_cannot_hold_is_out_of_reach(bench, monkeypatch):
+def test_a_hand_pose_that_the_muscles_cannot_hold_is_refused(bench, monkeypatch):
     strong, half = bench.mae.muscle_jacobian, 0.5 * np.abs(OTHER - REST)
 
     def weak(theta, tension):  # in the second half of the motion

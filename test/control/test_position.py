@@ -45,8 +45,8 @@ def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_w
         now = sample(length, tension, ROBOT)
         before = limiter.last(LENGTH, now).value
         sent = limiter.limit(Command(LENGTH, desired), now, limit, DT).value
-        # The speed of the module limits commands, too; only a muscle above T_limit is paid out
-        # faster.
+        # The speed of the modules limits the commands as well. Only a muscle above T_limit is paid
+        # out faster.
         is_tense = tension > LIMIT
         assert (sent - before >= -SPEED_DEFAULT * DT - 1e-12).all()
         assert ((sent - before)[~is_tense] <= SPEED_DEFAULT * DT + 1e-12).all()

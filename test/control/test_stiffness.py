@@ -35,7 +35,8 @@ def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
     jacobian = robot.routes.muscle_jacobian
     k = robot.muscle_stiffness(THETA, tension)
     true = joint_stiffness(jacobian(THETA), muscle_hessian(jacobian, THETA), k, tension)
-    # 1 %: the cubic approximation of the elongation, tendon stretch, and the step of the slope.
+    # The remaining 1 % are the cubic approximation of the elongation, the stretch of the tendon and
+    # the finite difference of G.
     np.testing.assert_allclose(model.joint_stiffness(tension), true, atol=0.01 * np.trace(true))
     np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
 

@@ -18,7 +18,7 @@ from musculoskeletal_ae.control.supervisor import (
 
 ANOMALY, OPERATOR = Condition(StopCause.ANOMALY), Condition(StopCause.OPERATOR)
 STALE = Condition(StopCause.STALE_MUSCLE_STATES)
-STEP = 0.01  # [s]
+STEP = 0.01  # time step [s]
 
 
 def exploring():

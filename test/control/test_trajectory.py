@@ -53,7 +53,7 @@ def test_a_slowed_trajectory_passes_its_points_with_scaled_derivatives(rows, ord
 
 
 def test_points_at_nearly_the_same_time_are_refused():
-    time = np.array([0.001, 3e5, 3e5 + 1e-9])  # [s] between moments of the last piece: none
+    time = np.array([0.001, 3e5, 3e5 + 1e-9])  # doubles cannot resolve the last interval [s]
     points = Points(BOTH, time, np.array([MIDDLE, MIDDLE, MIDDLE + REACH]), None, None)
     with pytest.raises(MessageError, match='points too close in time'):
         Trajectory.through(Setpoint.resting(MIDDLE), points)
@@ -140,7 +140,7 @@ def test_a_curve_whose_values_overflow_is_refused():
 def test_a_refusal_for_a_prismatic_joint_is_in_metres(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))
-    for off, reported in ((0.001, None), (0.01, 'wrist by 0.01 m')):
+    for off, reported in ((0.001, None), (0.01, 'wrist exceeds its limits by 0.01 m')):
         end = np.append(start[:3], robot.upper[3] + off)
         points = Points(np.arange(4), np.ones(1), end[None], still, None)
         trajectory = Trajectory.through(Setpoint.resting(start), points)

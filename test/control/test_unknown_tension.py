@@ -47,7 +47,8 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
     arm = make_arm(ROBOT, 0)
     read = arm.sense()
     assert np.isnan(read.tension).all()
-    for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):  # all ignored
+    # without a tension source, all of them are ignored
+    for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):
         sample = MuscleStream(ROBOT, window=3).take_states(
             np.array([read.length, tension, read.temperature]), 0.0
         )
