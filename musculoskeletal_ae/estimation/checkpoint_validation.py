@@ -4,22 +4,22 @@
 Four checks compare a candidate with the geometric model, the arm and the network in use:
 
     validation/postures.py        errors on fixed states of the geometric model
-    validation/message_errors.py  errors on the last seconds of healthy messages of this node
+    validation/message_errors.py  errors on the healthy messages of the last seconds
     validation/agreement.py       difference of θ and of lengths from joint sensors, or else from
                                   the network in use
-    validation/detector.py        a calibrated detector is silent on those messages, and would
+    validation/detector.py        a calibrated detector is silent on these messages, and would
                                   detect a rupture
 
 The first network is only subject to the first and the last check, because its error on a body that
 differs from its model is not known beforehand. A network that a user has chosen is not subject to
 the third. All limits leave a margin to the values of healthy networks: initial and learned ones of
 both presets, on both shipped robots and both emulator models. `python -m bench gate` prints these
-values, and those of attacks.
+values, and the values of networks that must be rejected.
 
 A candidate without a calibrated detector inherits the detector in use, which would otherwise be
-switched off. A muscle that was repaired within the last DECLARED seconds may be relearned, and its
-residuals then differ from those of the calibration. The inherited detector ignores this muscle and
-judges all others, until a network with a calibrated detector of its own takes over.
+switched off. A muscle that was repaired within the last RELEARNING_TIME seconds may be relearned,
+and its residuals then differ from those of the calibration. The inherited detector ignores this
+muscle and judges all others, until a network with a calibrated detector of its own takes over.
 
 When an anomaly is detected, networks that have been in use for less than PROOF seconds are
 discarded, and the newest network that has been in use for longer takes over again.
@@ -41,10 +41,10 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
 
-PROOF = 10.0  # [s] without an anomaly, after which a network is proven
-MOST_USED = 20  # number of networks that are kept for a rollback
-DECLARED = 600.0  # [s] after its repair, during which a muscle may be relearned
-NOTICED = 2.0  # [s] before an anomaly is detected, in which messages may already be faulty
+PROOF = 10.0  # time in use without an anomaly after which a network is proven [s]
+MOST_USED = 20  # largest number of networks that are kept for a rollback
+RELEARNING_TIME = 600.0  # time after its repair during which a muscle may be relearned [s]
+DETECTION_DELAY = 2.0  # time before a detection in which messages may already be faulty [s]
 
 
 class CheckpointValidator:
@@ -63,7 +63,7 @@ class CheckpointValidator:
         self._messages = RecentMessages(robot.joint_count)
         self._used: list[tuple[float, Mae]] = []  # networks, and the times at which they took over
         self._is_anomaly = False
-        self._repaired_at: dict[int, float] = {}  # by muscle [s]
+        self._repaired_at: dict[int, float] = {}  # time of each muscle's last repair [s]
         self.isolated: tuple[int, ...] = ()
 
     @property
@@ -74,7 +74,14 @@ class CheckpointValidator:
     def message(
         self, tension: Array, length: Array, now: float, theta: Array | None = None
     ) -> None:
-        """Take one of the node's own messages: T [N] and l [m] (M,), and measured θ [rad] (D,)."""
+        """Record a measurement on which candidates are tested.
+
+        Args:
+            tension: T [N], (M,).
+            length: l [m], (M,).
+            now: Time of the measurement [s].
+            theta: Measured θ [rad], (D,), or None.
+        """
         self._messages.note(tension, length, now, theta, is_healthy=not self._is_anomaly)
 
     def start(self) -> None:
@@ -94,7 +101,7 @@ class CheckpointValidator:
             is_chosen: Whether a user has chosen it. It need not agree with the network in use.
 
         Raises:
-            GateError: If it is rejected; names each quantity, its value and its limit.
+            GateError: If it is rejected; the text names each quantity, its value and its limit.
         """
         try:
             deque(self.trial(mae, is_chosen), maxlen=0)
@@ -104,7 +111,7 @@ class CheckpointValidator:
     def trial(self, mae: Mae, is_chosen: bool = False) -> Iterator[None]:
         """Check a network in steps of some milliseconds, between which a node can do other work.
 
-        Arguments and errors are those of `check`.
+        `check` describes the arguments and the error.
         """
         faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
         while True:
@@ -121,11 +128,11 @@ class CheckpointValidator:
             raise GateError('; '.join(faults))
 
     def declare_repaired(self, muscles: Iterable[int], now: float) -> None:
-        """Note that a user declares muscles (indices) healthy as they are, after a repair."""
+        """Record that a user declares muscles (indices) healthy as they are, after a repair."""
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
-        """Note that a network took over."""
+        """Record that a network took over at `now` [s]."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
@@ -133,14 +140,18 @@ class CheckpointValidator:
             del self._used[1]  # the first one is proven and stays
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
-        """Note whether an anomaly is detected; return the network for a rollback, or None."""
+        """Record whether an anomaly is detected, and roll back a network that is not proven.
+
+        Returns:
+            The network that takes over again, or None if there is no rollback.
+        """
         if detected == self._is_anomaly:
             return None
         self._is_anomaly = detected
         if not detected:
-            self._messages.clear()  # a repaired arm may differ
+            self._messages.clear()  # a repaired arm may differ from them
             return None
-        self._messages.drop_after(now - NOTICED)
+        self._messages.drop_after(now - DETECTION_DELAY)
         in_use = self.mae
         while len(self._used) > 1 and now - self._used[-1][0] < PROOF:
             del self._used[-1]
@@ -168,7 +179,7 @@ class CheckpointValidator:
         has_own = mae.anomaly is not None and mae.anomaly.calibrated
         if has_own or statistics is None or not statistics.calibrated:
             return mae
-        repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < DECLARED]
+        repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < RELEARNING_TIME]
         statistics = statistics.ignoring(repaired)
         return detector.with_detector_of(statistics, mae, self._messages, self.isolated)
 

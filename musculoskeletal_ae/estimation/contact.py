@@ -8,8 +8,8 @@
 θ and Gᵀ T_end pass through the same second-order low-pass filter, which also gives θ̇ and θ̈. The
 result is the residual of the momentum observer (De Luca 2005) without numerical differentiation of
 noise. Tendon friction μ has to be known: unknown friction hides a contact force of 10 N. σ is the
-residual torque of a healthy moving arm (`estimation/healthy_torque.py`). F₀ keeps components of the
-force small that produce no joint torque, such as those along a stretched arm.
+residual torque of the healthy moving arm (`estimation/healthy_torque.py`). F₀ keeps components of
+the force small that produce no joint torque, such as those along a stretched arm.
 
 Torques that press a joint against its stop cannot be measured, because the stop carries them. A
 torque away from the stop is at least as large as the measured one.
@@ -28,14 +28,16 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: bandwidth of the filter [1/s]; damping ratio 0.5 (critical damping would be a third slower)
 BANDWIDTH = 25.0
-LARGEST_USUAL = 20.0  # F₀ [N]
+LARGEST_USUAL = 20.0  # F₀: largest usual force at the hand [N]
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-# For prismatic joints, [rad] below are times RACK [m].
-#: A joint closer to its limit counts as at its stop [rad]; this is the error of the estimate.
+#: distance from a limit below which a joint counts as at its stop [rad], for prismatic joints times
+#: RACK [m]; this is about the error of the estimate
 AT_STOP = 0.06
-TURNED = 0.02  # motion of a joint after which G is evaluated again [rad]
-#: d of five healthy arms that explored for ten minutes each reached 8.6
-CONTACT, IN_A_ROW = 10.0, 2
+#: motion of a joint after which G is evaluated again [rad], for prismatic joints times RACK [m]
+TURNED = 0.02
+#: threshold of d; for five healthy arms that explored for ten minutes each, d was at most 8.6
+CONTACT = 10.0
+IN_A_ROW = 2  # number of consecutive messages with d > CONTACT that are a contact
 
 
 class Contact(NamedTuple):
@@ -45,7 +47,7 @@ class Contact(NamedTuple):
         torque: τ_ext [N·m], (D,); 0 where a stop carries it.
         force: Computes F on the origin of the end effector, in the axes of the root link [N], (3,).
             It is a function, because few callers need the force.
-        distance: d; NaN without statistics of the healthy arm.
+        distance: d; NaN if the residual torque of the healthy arm has not been calibrated.
         is_contact: Whether there is contact.
     """
 
@@ -71,7 +73,7 @@ class LowPass:
         self._value = None
 
     def step(self, value: Array, dt: float) -> tuple[Array, Array, Array]:
-        """Take an input u, dt [s] after the previous one; return y, ẏ and ÿ.
+        """Filter an input u that arrives dt [s] after the previous one; return y, ẏ and ÿ.
 
         The implicit Euler method is stable at any dt.
         """
@@ -90,8 +92,9 @@ class ContactEstimator:
 
     Attributes:
         velocity: Filtered θ̇ [rad/s], (D,).
-        is_calibrated: Whether the healthy torque of this arm is known, which detection requires.
-        count: Number of contacts so far.
+        is_calibrated: Whether the residual torque of the healthy arm has been calibrated. Contacts
+            are detected only then.
+        count: Number of contacts detected so far.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -105,12 +108,12 @@ class ContactEstimator:
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Use another network, with its tendon friction and healthy torque."""
+        """Use another network, with its tendon friction and its residual torque σ."""
         joint_count, healthy = self._robot.joint_count, mae.touch
         self._robot = self._robot.with_elasticity(mae.elasticity)
         self._mae = mae
-        self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated
-        self._weight = np.ones(joint_count)  # 1/σ²
+        self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated last
+        self._weight = np.ones(joint_count)  # 1/σ², (D,)
         self.is_calibrated = healthy is not None and healthy.calibrated
         if healthy is not None and self.is_calibrated:
             self._weight = 1.0 / healthy.spread**2
@@ -122,7 +125,7 @@ class ContactEstimator:
         self._beyond = 0  # consecutive messages with d > CONTACT
 
     def step(self, theta: Array, end_tension: Array, dt: float) -> Contact:
-        """Take an estimate and return the external load.
+        """Return the external load at one message.
 
         Args:
             theta: θ [rad], (D,).

@@ -46,14 +46,14 @@ from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-#: largest time between two messages that detectors count [s]; a longer pause counts as this
+#: largest time between two messages that detectors count [s]; a longer pause counts as this time
 LONGEST_PERIOD = 0.1
-#: after a longer pause between two messages [s], the detectors start to collect evidence anew. What
-#: happened in the pause is unknown: the driver may have received no commands, or the whole computer
-#: may have stood still. The controller stops the arm after the same time (`max_age`).
+#: Pause between two messages after which the detectors discard their evidence [s]. What happened in
+#: the pause is unknown: the driver may have received no commands, or the whole computer may have
+#: stood still. The controller stops the arm after the same time (`max_age`).
 INTERRUPTION = 0.2
-JOINTS_AGE = 0.05  # [s] age up to which measured joint angles are used with a message
-SHIFTED = 0.02  # [m] change of an estimated offset above which it is published again
+JOINTS_AGE = 0.05  # age up to which measured joint angles are used with a message [s]
+SHIFTED = 0.02  # change of an estimated length offset above which it is published again [m]
 
 
 class Output(NamedTuple):
@@ -77,7 +77,7 @@ class Output(NamedTuple):
 
 
 class Estimator:
-    """Passes each message through its parts.
+    """Estimates the joint angles from each message, and monitors the health of the body.
 
     `time` is the clock of the messages [s], `now` a steady clock [s].
 
@@ -94,7 +94,8 @@ class Estimator:
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
-        measured: θ from joint sensors [rad], (D,), at that message; None unless all reported it.
+        measured: θ from joint sensors [rad], (D,), at the last message with an estimate; None
+            unless all joint sensors reported a value.
         stepped_at: Time of the last message that was estimated, on the steady clock [s].
     """
 
@@ -113,7 +114,7 @@ class Estimator:
         self.output: Output | None = None
         self.measured: Array | None = None
         self.stepped_at = -math.inf
-        self._stated_posture: tuple[float, ...] = ()  # of the last length calibration
+        self._stated_posture: tuple[float, ...] = ()  # posture of the last length calibration [rad]
         self._jumps = 0  # number of length jumps handled so far
         self._valid_offsets = self.body.offsets  # the last known offsets
         self._commands = ModuleCommands()
@@ -147,7 +148,8 @@ class Estimator:
         calibration starts again, because its estimate depends on the network.
 
         Raises:
-            numpy.linalg.LinAlgError: If its statistics are singular; the previous network stays.
+            numpy.linalg.LinAlgError: If its statistics are singular; the previous network stays in
+                use.
         """
         isolated = mae.isolated if self._follows_network else self.body.isolated
         reduced = mae.without(isolated)
@@ -191,12 +193,15 @@ class Estimator:
             MusculoskeletalError: If there is no network, or the posture is not valid.
         """
         if self.mae is None:
-            raise MusculoskeletalError('no checkpoint; a length calibration requires one')
+            raise MusculoskeletalError(
+                'a length calibration requires a checkpoint; set the parameter checkpoint or start '
+                'the learner'
+            )
         check_stated_posture(self.robot, posture)
         if not posture and not self.robot.knows_tension:
             raise MusculoskeletalError(
-                'tension_source: none: without tensions, lengths are calibrated in a known posture '
-                'only; hold the arm still and set the parameter stated_posture'
+                'without tensions (tension_source: none), lengths can be calibrated only in a '
+                'known posture; hold the arm still and set the parameter stated_posture'
             )
         self._stated_posture = posture
         stated = np.array(posture) if posture else None
@@ -211,11 +216,11 @@ class Estimator:
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
     ) -> None:
-        """Note the target lengths [m] or tensions [N] (M,) sent to the muscle modules."""
+        """Record the target lengths [m] or tensions [N], (M,), sent to the muscle modules."""
         self._commands.note(now, length, tension)
 
     def joints(self, theta: Array, now: float) -> None:
-        """Note measured θ [rad], (D,)."""
+        """Record θ [rad], (D,), measured by joint sensors."""
         self._measured = now, theta
 
     def reset(self) -> None:
@@ -233,7 +238,7 @@ class Estimator:
         self._clear(self.suspects.clear(self.body.isolated))
 
     def clock_jumped_back(self) -> None:
-        """Forget earlier messages, after a jump of the clock; a latched finding stays."""
+        """Discard earlier messages after the clock jumped back; a latched finding stays."""
         self.sample = None
         self.stream.reset()
         self.health.reset()
@@ -242,7 +247,7 @@ class Estimator:
     # -- messages -------------------------------------------------------------------------------
 
     def take(self, message: Any, time: float, now: float) -> Output | None:
-        """Take a muscle_states message; see `step`.
+        """Process a muscle_states message as `step` processes raw values.
 
         Raises:
             RejectionError: If the message cannot be used.
@@ -250,7 +255,7 @@ class Estimator:
         return self._take(partial(self.stream.take, message, time, now), now)
 
     def step(self, states: Array, time: float, now: float) -> Output | None:
-        """Take raw l [m], T [N] and temperature [°C], (3, M).
+        """Estimate and monitor from raw l [m], T [N] and temperature [°C], (3, M).
 
         Returns:
             The results; None without a network, or before the first estimate of the length offsets.
@@ -270,7 +275,7 @@ class Estimator:
             θ, with NaN for joints that do not move the end effector.
 
         Raises:
-            MessageError: If the pose is out of reach.
+            MessageError: If the end effector cannot reach the pose.
         """
         middle = 0.5 * (self.robot.lower + self.robot.upper)
         start = middle if self.output is None else self.output.state.theta

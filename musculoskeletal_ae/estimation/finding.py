@@ -60,7 +60,7 @@ class Observation:
         sample: The readings.
         estimate: The network's estimate.
         demand: T commanded to the muscle modules [N], (M,); None without a command.
-        dt: Time since the previous message [s], at most a short pause.
+        dt: Time since the previous message [s]; longer pauses are shortened.
         lengths_known: Whether the length offsets are known.
         measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
         command: l_target of the muscle modules [m], (M,); None without a command.
@@ -92,10 +92,10 @@ def observe(
         length: l with the length offset removed [m], (M,).
         motor_tension: T [N], (M,).
         bone_tension: T_end [N], (M,).
-        dt: Time since the message before [s].
-        demand: T that the modules are commanded [N], (M,), if it is known.
-        state: What the network restores, if the caller has computed it already.
-        command: l_target of the modules [m], (M,), if it is known.
+        dt: Time since the previous message [s].
+        demand: T commanded to the modules [N], (M,), or None.
+        state: The state that the network restores; None to compute it.
+        command: l_target of the modules [m], (M,), or None.
     """
     unknown = np.full(len(length), np.nan)
     sample = MuscleSample(
@@ -115,7 +115,7 @@ def observe(
 
 
 class Detector:
-    """Base class of the detectors, each of which detects one kind of fault and latches nothing.
+    """Base class of the detectors. Each detects one kind of fault; findings are latched elsewhere.
 
     A new detector overrides `step` or `read`, and other methods as needed. `HealthMonitor` uses it
     once it is in its list.
@@ -134,7 +134,7 @@ class Detector:
         """Consider muscles healthy in their present state."""
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:  # noqa: ARG002
-        """Take the readings of every message, even of a rejected one.
+        """Check the raw readings of a message, even of a rejected one; return a finding or None.
 
         Args:
             states: Raw l [m], T [N] and temperature [°C], (3, M).
@@ -144,5 +144,5 @@ class Detector:
         return None
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
-        """Take a message for which there is an estimate."""
+        """Check a message for which there is an estimate; return a finding or None."""
         return None

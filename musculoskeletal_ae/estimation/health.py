@@ -82,11 +82,11 @@ class HealthMonitor:
             detector.accept(muscles)
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Take the readings of every message, even of a rejected one; see `Detector`."""
+        """Check the raw readings of a message, even of a rejected one; see `Detector`."""
         findings = [detector.read(states, usable, now) for detector in self._detectors]
         return next(filter(None, findings), None)
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message for which there is an estimate."""
+        """Check a message for which there is an estimate; return the first finding or None."""
         findings = [detector.step(observation) for detector in self._detectors]
         return next(filter(None, findings), None)

@@ -3,7 +3,7 @@
 
     σ_j² ← σ_j² + (dt / t) (τ_ext,j² − σ_j²),   t: time of motion so far, MEMORY at most
 
-`estimation/contact.py` decides by σ whether a torque means contact.
+`estimation/contact.py` divides the external torque by σ to decide whether there is contact.
 """
 
 from dataclasses import replace
@@ -17,10 +17,11 @@ from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-MEMORY = 180.0  # time constant of the average in time of motion [s]
-#: speed of all joints together above which an arm moves [rad/s]; prismatic joints times RACK [m/s]
+MEMORY = 180.0  # largest time constant of the average; only motion counts [s]
+#: norm of the joint velocities above which an arm moves [rad/s]; speeds of prismatic joints are
+#: divided by RACK
 MOVING = 0.05
-#: Torques are clipped to this many times σ, because larger ones indicate contact.
+#: multiple of σ to which torques are clipped, because larger ones indicate contact
 OUTLIER = 5.0
 LEAST_SPREAD = 1e-3  # smallest σ [N·m]
 
@@ -55,7 +56,7 @@ class HealthyTorque:
         self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Take T [N] and l [m] (M,) of a healthy arm, dt [s] after the previous ones."""
+        """Update σ from T [N] and l [m], (M,), of a healthy arm, dt [s] after the previous ones."""
         end = self._direction.end_tension(self._mae.friction, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._contact.step(theta, end, dt).torque

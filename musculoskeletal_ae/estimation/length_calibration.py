@@ -2,8 +2,8 @@
 """Length calibration: determine the offset of every length sensor after power-on.
 
 The arm moves gently, with or without measured joint angles, or it stands in a stated posture.
-`length_moments.py` collects the readings, `length_fit.py` has the equations, and this file decides
-when to fit and whether the result is reliable.
+`length_moments.py` collects the readings, and `length_fit.py` fits the offsets to them. This file
+decides when to fit and whether the result is reliable.
 """
 
 from __future__ import annotations
@@ -18,15 +18,18 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
 
-#: duration of a calibration [s]: gentle motion with measured joint angles, gentle motion without
-#: them, and standing in a stated posture
-ENOUGH_WITH_ANGLES, ENOUGH, STANDING = 20.0, 38.0, 1.0
-FIRST, AGAIN = 0.5, 2.0  # [s] until the first estimate, and between later ones
-#: median residual [m] and cost per residual above which a fit is rejected. Correct offsets have
-#: 0.0003 m and 0.2–0.5, those of a wrong posture cost 1.1, and pure noise costs 0.95.
-LARGEST_RESIDUAL, LARGEST_COST = 0.02, 0.75
-CORRELATED = 10.0  # number of successive moments that carry the information of one
-BEYOND_STOP = 0.01  # share of its range by which a stated joint angle may exceed a limit
+ENOUGH_WITH_ANGLES = 20.0  # required duration of gentle motion with measured joint angles [s]
+ENOUGH = 38.0  # required duration of gentle motion without measured joint angles [s]
+STANDING = 1.0  # required duration of standing in a stated posture [s]
+FIRST_FIT = 0.5  # time until the first fit [s]
+FIT_INTERVAL = 2.0  # time between two later fits [s]
+#: median residual of a length above which a fit is rejected [m]; correct offsets have 0.0003 m
+LARGEST_RESIDUAL = 0.02
+#: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
+#: wrong posture 1.1, and pure noise 0.95
+LARGEST_COST = 0.75
+CORRELATED = 10.0  # number of successive moments with the information of one independent moment
+BEYOND_STOP = 0.01  # fraction of its range by which a stated joint angle may exceed a limit
 MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
 
 
@@ -49,7 +52,7 @@ class LengthCalibration:
         self._robot, self._mae, self.posture = robot, mae, posture
         self._fit = LengthFit(robot, mae)
         self._collector = MomentCollector(self._fit.used, robot.joint_count, posture)
-        self._since = 0.0  # [s] since the last fit began
+        self._since = 0.0  # time since the last fit began [s]
         self._work: tuple[Steps, Moments] | None = None  # the running fit
         self._best: Fit | None = None
         self._has_angles = False  # whether joint angles are measured most of the time
@@ -89,7 +92,7 @@ class LengthCalibration:
         return f'{progress}; {problem}' if problem else progress
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
-        """Take the readings of one message.
+        """Record the readings of one message, and continue or begin a fit if one is due.
 
         Args:
             tension: T [N], (M,).
@@ -110,7 +113,7 @@ class LengthCalibration:
 
     @property
     def _pause(self) -> float:
-        return FIRST if self._best is None or self.is_standing else AGAIN
+        return FIRST_FIT if self._best is None or self.is_standing else FIT_INTERVAL
 
     def _begin_fit(self, moments: Moments) -> None:
         measured = np.flatnonzero(~np.isnan(moments.theta).any(axis=1))
@@ -129,7 +132,7 @@ class LengthCalibration:
             self._judge(ended.value, moments)
 
     def _judge(self, fit: Fit, moments: Moments) -> None:
-        """Use a fit as the newest estimate, and decide whether the offsets are known by it."""
+        """Use a fit as the newest estimate, and decide whether it is reliable."""
         muscle_count, used = self._robot.muscle_count, self._fit.used
         expected = self._mae.lengths(fit.theta, moments.tension)
         # An isolated muscle still receives commands and needs an offset, however uncertain.
@@ -148,14 +151,15 @@ class LengthCalibration:
         self.offsets = LengthOffsets(offset, deviation)
 
     def _problem_of(self, fit: Fit, residual: Array) -> str:
-        """Return why a fit is not reliable, or ''; `residual` is that of l [m], (M,)."""
+        """Return why a fit is not reliable, or ''; `residual` is the median one of l [m], (M,)."""
         if residual.max() > LARGEST_RESIDUAL:
             name = self._robot.muscles[int(residual.argmax())]
             limit = 1e3 * LARGEST_RESIDUAL
             return f'{name} has a residual of {1e3 * residual.max():.1f} mm, limit {limit:g} mm'
         cost = self._fit.cost_per_residual(fit)
-        if not cost <= LARGEST_COST:  # the fit may have found a similar, wrong posture
-            problem = 'lengths and tensions do not agree with one posture'
+        # the fit may have found wrong postures that are similar to the true ones
+        if not cost <= LARGEST_COST:
+            problem = 'no offsets explain the lengths and tensions'
             return f'{problem}: cost {cost:.2f}, limit {LARGEST_COST:g}'
         return ''
 
@@ -168,7 +172,7 @@ def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
         posture: θ [rad], (D,); () means no posture and is legal.
 
     Raises:
-        MusculoskeletalError: If it is outside the joint limits; names the legal ranges.
+        MusculoskeletalError: If it is outside the joint limits; the text names the legal ranges.
     """
     if not posture:
         return
@@ -180,4 +184,4 @@ def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
         return
     limits = zip(robot.units, robot.lower, robot.upper, strict=True)
     legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
-    raise MusculoskeletalError(f'posture {list(posture)}; legal: an empty list, or {legal}')
+    raise MusculoskeletalError(f'stated posture {list(posture)}; legal: an empty list, or {legal}')

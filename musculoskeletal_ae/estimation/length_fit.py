@@ -2,13 +2,13 @@
 """Fit the length offsets, and the postures of all moments, to readings of length and tension.
 
     l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
-    0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more while the arm moves slowly
+    0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more equations while the arm moves slowly
 
 l and G are those of the network (①). If the joint angles were measured, o is the mean residual of
 the first line. Otherwise o and the postures of all moments are estimated together, by maximum
 likelihood with noise of Student's distribution. Because muscles outnumber joints and G changes with
-the posture, only one o explains all moments of a moving arm. The weight of the arm already
-restricts its posture at the first moment, when the lengths do not yet.
+the posture, only one o explains all moments of a moving arm. The second line already restricts
+the posture at the first moment, when the lengths alone do not.
 
 The fit is a damped Gauss–Newton method that eliminates the postures. It starts from the best of
 many random first postures. Besides o it estimates the friction μ of every tendon, the offset of
@@ -27,35 +27,45 @@ from musculoskeletal_ae.estimation.length_moments import Moments
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-# For prismatic joints, [rad] below are multiplied by RACK [m], and [N·m] divided by it.
+# Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
+# RACK and become [m], and torques are divided by RACK and become [N].
 
 # Standard deviations of the residuals.
-LENGTH_NOISE, TORQUE_NOISE = 0.0004, 0.4  # [m], [N·m] of the network, without friction
-WORST = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
-OUTSIDE = 0.05  # [rad] beyond the joint limits
-ISOLATED = 1e-6  # weight of an isolated muscle's length relative to the others
-FREEDOM = 4.0  # degrees of freedom of the Student distribution
-AT_STOP = 0.03  # [rad] from a joint limit, within which the stop may carry torque
+LENGTH_NOISE = 0.0004  # error of a length by the network [m]
+TORQUE_NOISE = 0.4  # error of a joint torque by the network, apart from friction [N·m]
+LIMIT_NOISE = 0.05  # excess of a joint angle over its limits [rad]
+NOISE_FACTORS = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
+ISOLATED_WEIGHT = 1e-6  # weight of an isolated muscle's length relative to the others
+FREEDOM = 4.0  # degrees of freedom of Student's distribution
+AT_STOP = 0.03  # distance from a joint limit below which the stop may carry torque [rad]
 
-# Prior of the constants: the standard deviation. The mean is 0 except for FRICTION.
-OFFSET = 0.1  # [m] of a length
-FRICTION = 0.05  # μ of a tendon: both mean and standard deviation
-TENSION_OFFSET = 1.5  # [N] of a tension sensor; covers the error of its gain
-JOINT_FRICTION = 0.03  # Coulomb torque of a joint over the largest torque of the weight
-STICKING = 0.003  # [rad] after a reversal, over which the friction of a joint changes sign
-LEAST_WEIGHT = 0.1  # smallest torque of the weight that is assumed, over that of T_bias
+# Prior of the constants. Each value is the standard deviation; the mean is 0 except for FRICTION.
+OFFSET = 0.1  # offset of a length [m]
+FRICTION = 0.05  # friction coefficient μ of a tendon: both mean and standard deviation
+TENSION_OFFSET = 1.5  # offset of a tension sensor [N]; covers the error of its gain
+JOINT_FRICTION = 0.03  # Coulomb torque of a joint, relative to the largest torque of the weight
 
-# The search for a start: numbers of random postures that are drawn, fitted coarsely to the
-# lengths, compared by torque as well, and refined.
-DRAWN, TRIED, LISTED, PURSUED = 3200, 400, 30, 6
-FEW_MOMENTS = 24  # moments in that search
-BATCH = 20  # postures that are fitted during one message
-COARSE = 0.01, 2.0, 0.1  # [m], [N·m], [rad]: standard deviations in that search
-FARTHEST = 0.3  # largest offset [m], and largest step of an angle [rad]
+STICKING = 0.003  # motion after a reversal over which the friction of a joint changes sign [rad]
+#: smallest torque of the weight that is assumed, relative to the largest torque of the tensions
+#: T_bias
+LEAST_WEIGHT = 0.1
 
-ROUNDS, FIRST_ROUNDS = 20, 6  # largest numbers of Gauss–Newton steps
-STEP = 1e-3  # of numerical derivatives
-LARGEST_DAMPING = 1e4
+# The search for a start.
+DRAWN_POSTURES = 3200  # number of random first postures that are compared by torque
+FITTED_POSTURES = 400  # number of the best of these, which are fitted coarsely to the lengths
+COMPARED_FITS = 30  # number of the best coarse fits, which are compared by torque as well
+REFINED_FITS = 6  # number of the best coarse fits, which are refined
+FEW_MOMENTS = 24  # number of moments that the search uses
+BATCH = 20  # number of postures that are fitted during one message
+COARSE_LENGTH = 0.01  # standard deviation of a length in coarse fits [m]
+COARSE_TORQUE = 2.0  # standard deviation of a torque in coarse fits [N·m]
+COARSE_ANGLE = 0.1  # standard deviation of the excess over joint limits in coarse fits [rad]
+
+FARTHEST = 0.3  # largest offset [m], and largest change of an angle in a Gauss–Newton step [rad]
+ROUNDS = 20  # largest number of Gauss–Newton steps
+FIRST_ROUNDS = 6  # largest number of Gauss–Newton steps in the search for a start
+STEP = 1e-3  # step of numerical derivatives, of θ [rad] and of μ
+LARGEST_DAMPING = 1e4  # damping at which the fit ends, because no step lowers the cost
 
 
 class Fit(NamedTuple):
@@ -102,23 +112,24 @@ class LengthFit:
         self._prior_spread[-joint_count:] /= radian
         self._torque_noise = TORQUE_NOISE / radian
         self.used = ~np.isin(np.arange(muscle_count), mae.isolated)
-        length_noise = LENGTH_NOISE * _relative_error(mae) / np.where(self.used, 1.0, ISOLATED)
+        length_weight = np.where(self.used, 1.0, ISOLATED_WEIGHT)
+        length_noise = LENGTH_NOISE * _relative_error(mae) / length_weight
         #: standard deviations of the residuals, (M + 2D,)
-        self._noise = np.concatenate((length_noise, self._torque_noise, OUTSIDE * radian))
+        self._noise = np.concatenate((length_noise, self._torque_noise, LIMIT_NOISE * radian))
 
     def known_angles(self, moments: Moments) -> Fit:
-        """Fit moments whose angles were measured."""
+        """Return the fit to moments whose angles were measured."""
         residual = moments.length - self._mae.lengths(moments.theta, moments.tension)
         muscle_count = self._robot.muscle_count
         constants = np.concatenate([residual.mean(axis=0), self._prior_mean[muscle_count:]])
         return Fit(0.0, constants, moments.theta)
 
     def unknown_angles(self, moments: Moments, before: Fit | None) -> Steps:
-        """Fit moments whose angles were not measured.
+        """Fit moments whose angles were not measured, in short pieces of work.
 
         Args:
             moments: The moments.
-            before: An earlier fit, from which the search also starts, or None.
+            before: An earlier fit, from which the fit also starts, or None.
         """
         rows = np.unique(np.linspace(0, len(moments.length) - 1, FEW_MOMENTS).astype(np.int64))
         few = moments.rows(rows)
@@ -149,18 +160,18 @@ class LengthFit:
     def _guesses(self, moments: Moments, few: Moments) -> Generator[None, None, list[Array]]:
         """Return the constants that the likeliest of many random first postures imply."""
         mae = self._mae
-        tension = np.tile(moments.tension[0], (TRIED, 1))
+        tension = np.tile(moments.tension[0], (FITTED_POSTURES, 1))
         # The balance of torques excludes most postures before any offset is known.
         drawn, unbalanced = list[Array](), list[Array]()
-        for _ in range(DRAWN // TRIED):
-            drawn.append(self._robot.random_postures(TRIED, self._rng))
+        for _ in range(DRAWN_POSTURES // FITTED_POSTURES):
+            drawn.append(self._robot.random_postures(FITTED_POSTURES, self._rng))
             torque = self._radian * self._torque(drawn[-1], tension)[0]
             unbalanced.append(np.linalg.norm(torque, axis=1))
             yield
-        first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:TRIED]]
+        first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:FITTED_POSTURES]]
         offset = moments.length[0] - mae.lengths(first, tension)
         largest = np.abs(offset * self.used).max(axis=1)
-        plausible = max(PURSUED, int((largest < FARTHEST).sum()))
+        plausible = max(REFINED_FITS, int((largest < FARTHEST).sum()))
         offset = offset[np.argsort(largest)[:plausible]]
         cost, postures = np.empty(len(offset)), list[Array]()
         for n in range(0, len(offset), BATCH):
@@ -168,17 +179,17 @@ class LengthFit:
             tension = np.broadcast_to(few.tension, length.shape)
             theta = mae.estimate(tension, length).theta
             residual = self.used * (length - mae.lengths(theta, tension))
-            parts = residual / COARSE[0], self._outside(theta) / (COARSE[2] * self._radian)
+            parts = residual / COARSE_LENGTH, self._outside(theta) / (COARSE_ANGLE * self._radian)
             costs = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
             cost[n : n + BATCH] = np.sum(costs, axis=0)
             postures.extend(theta)
             yield
-        order = np.argsort(cost)[:LISTED]
+        order = np.argsort(cost)[:COMPARED_FITS]
         for n in order:
-            torque = self._radian * self._torque(postures[n], few.tension)[0] / COARSE[1]
+            torque = self._radian * self._torque(postures[n], few.tension)[0] / COARSE_TORQUE
             cost[n] += np.log1p(torque**2).sum()
             yield
-        best = order[np.argsort(cost[order])][:PURSUED]
+        best = order[np.argsort(cost[order])][:REFINED_FITS]
         others = self._prior_mean[self._robot.muscle_count :]
         return [np.concatenate([offset[n], others]) for n in best]
 
@@ -322,4 +333,4 @@ def _relative_error(mae: Mae) -> Array:
     if mae.anomaly is None:
         return np.ones(len(mae.muscles))
     variance = np.diag(mae.anomaly.covariance)[len(mae.muscles) :]
-    return np.clip(variance / np.median(variance), *WORST)
+    return np.clip(variance / np.median(variance), *NOISE_FACTORS)

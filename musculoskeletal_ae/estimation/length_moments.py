@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collect the readings for a length calibration: means over short windows, called moments.
+"""Collects the readings for a length calibration: means over short windows, called moments.
 
 Tendon friction changes its sign with the direction of motion. The moments therefore have to cover
 many postures, reached from different sides. A moment counts only if the arm has moved since the
@@ -15,10 +15,10 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-WINDOW = 0.25  # [s] over which one moment averages
-MOVED = 0.002  # [m] change of a muscle's length above which the arm has moved
-FASTEST = 0.05  # [m/s] speed of a muscle above which inertial forces are not negligible
-MOST = 240  # largest number of moments kept
+WINDOW = 0.25  # duration of the window over which one moment averages [s]
+MOVED = 0.002  # change of a muscle's length above which the arm has moved [m]
+FASTEST = 0.05  # speed of a muscle above which inertial forces are not negligible [m/s]
+MOST = 240  # largest number of moments that are kept
 
 
 class Moments(NamedTuple):
@@ -27,7 +27,8 @@ class Moments(NamedTuple):
     Attributes:
         tension: T [N], (K, M).
         length: Raw l [m], 0 for isolated muscles, (K, M).
-        sliding: Direction s in which each tendon slid last: 1 wound in, −1 paid out, (K, M).
+        sliding: Direction s in which each tendon slid last, (K, M): 1 when wound in, −1 when paid
+            out.
         read: Raw l of all muscles, including isolated ones [m], (K, M).
         theta: Measured θ [rad], NaN where it was not measured, (K, D).
     """
@@ -64,7 +65,7 @@ class MomentCollector:
         self._direction = FrictionDirection()
         self._window: list[tuple[Array, ...]] = []  # T, l, s and raw l of each message
         self._angles: list[Array] = []  # measured θ in the same window
-        self._span = 0.0  # [s] duration of the window so far
+        self._span = 0.0  # duration of the present window so far [s]
         self._moments: list[tuple[Array, ...]] = []
         self._last_length: Array = np.zeros(len(used))  # l when the arm had moved last [m]
         self.time = 0.0
@@ -78,7 +79,7 @@ class MomentCollector:
         return Moments(*map(np.array, zip(*self._moments)))
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None) -> None:
-        """Take the readings of one message.
+        """Add the readings of one message to the present window; a full window becomes a moment.
 
         Args:
             tension: T [N], (M,).

@@ -8,9 +8,9 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: Largest errors of position and orientation [m], [rad]. With larger ones, the pose is that of
-#: another marker, or the camera is not calibrated.
-MARKER_DISTANCE, MARKER_ANGLE = 0.05, 0.3
+# With a larger error, the pose is that of another marker, or the camera is not calibrated.
+MARKER_DISTANCE = 0.05  # largest error of the position [m]
+MARKER_ANGLE = 0.3  # largest error of the orientation [rad]
 
 
 def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
@@ -25,13 +25,14 @@ def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
         θ, with NaN for joints that do not move the end effector.
 
     Raises:
-        MessageError: If the pose is out of reach.
+        MessageError: If the end effector cannot reach the pose.
     """
     posture = inverse_kinematics(robot, pose, start)
     if posture.distance > MARKER_DISTANCE or posture.angle > MARKER_ANGLE:
         raise MessageError(
             'out of reach',
-            f'the nearest posture is {posture.distance:.3f} m and {posture.angle:.2f} rad away; '
+            f'in the nearest posture, the end effector is {posture.distance:.3f} m and '
+            f'{posture.angle:.2f} rad away from the pose of the marker; '
             f'legal: at most {MARKER_DISTANCE:g} m and {MARKER_ANGLE:g} rad',
         )
     return posture.observed_theta

@@ -15,20 +15,21 @@ class ModuleCommands:
     def __init__(self) -> None:
         self._length: Array | None = None  # l_target [m], (M,)
         self._tension: Array | None = None  # T_target [N], (M,)
-        self._time = -math.inf  # [s]
+        self._time = -math.inf  # time of the newest command [s]
 
     def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
         """Store target lengths [m] or target tensions [N], (M,)."""
         self._length, self._tension, self._time = length, tension, now
 
     def length(self, now: float) -> Array | None:
-        """Return l_target [m], (M,), or None."""
+        """Return l_target [m], (M,), or None without an up-to-date length command."""
         return self._length if now - self._time <= COMMAND_AGE else None
 
     def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
-        """Return T that the modules have to pull with at l [m] (M,), [N] (M,), or None.
+        """Return the tension that the newest command demands of each module [N], (M,), or None.
 
-        Modules that follow positions have no such tension.
+        Length commands demand a tension that depends on l [m] (M,). Nothing is demanded if the
+        command is out of date, or if the modules follow positions.
         """
         if now - self._time > COMMAND_AGE or robot.follows_position:
             return None

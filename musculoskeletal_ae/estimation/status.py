@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
 
 UNKNOWN_TENSION = 'unknown: tension_source is none'
-SILENCE = 1.0  # [s] without a message, after which the status is a warning
+SILENCE = 1.0  # time without a message after which the status is a warning [s]
 
 
 def report(core: Estimator, now: float) -> Report:

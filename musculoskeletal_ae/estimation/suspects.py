@@ -13,16 +13,17 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
     over, and the controller resumes after a verification (`control/stops.py`).
 
 With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
-`estimator/reset`. The same applies after ACQUITTALS healthy suspects within WITHIN seconds, because
-there is a fault that a verification does not reveal. Some kinds of findings differ:
+`estimator/reset`. The same applies if ACQUITTALS suspects were verified as healthy within WITHIN
+seconds, because there must be a fault that a verification does not reveal. Some kinds of findings
+differ:
 
     values_missing          never latched; with `on_anomaly: isolate` the muscle is isolated without
                             a verification, because a sensor without numbers is faulty
-    lengths_jumped          of several muscles, none of which is isolated. The length offsets are
-    lengths_disagree        revoked, and the finding stays latched until the next length
+    lengths_jumped          concern several muscles, none of which is isolated. The length offsets
+    lengths_disagree        are revoked, and the finding stays latched until the next length
                             calibration. The same applies to a `length_jump` of a muscle that is
                             not isolated.
-    joint_sensors_disagree  of no muscle; none is isolated
+    joint_sensors_disagree  concerns no muscle, so none is isolated
 """
 
 from collections.abc import Iterable
@@ -38,8 +39,9 @@ from musculoskeletal_ae.estimation.verification import (
 )
 from musculoskeletal_ae.robot.robot import Robot
 
-ACQUITTALS, WITHIN = 2, 60.0  # number of healthy suspects, and the time in which they count [s]
-#: findings that no single muscle can cause
+ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
+WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
+#: kinds of findings that no single muscle can cause
 OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
 
 
@@ -91,12 +93,15 @@ class SuspectHandling:
         return f'{self._robot.muscles[muscle]}: {verdict}'
 
     def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
-        """Take a finding; return the muscles that are isolated from now on.
+        """Latch a finding and isolate its suspect, as far as the settings and its kind require.
 
         Args:
             finding: The finding of a detector.
             isolated: The muscles isolated so far.
             now: Time of a steady clock [s].
+
+        Returns:
+            The muscles that are isolated from now on.
         """
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE

@@ -13,7 +13,7 @@ elastic element if the suspect is stretched further than before the verification
     L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T)
 
 Their tendons may be slack at first. The suspect is wound in until it has tension, or until it is so
-short that a healthy one would have tension. The first row that applies decides:
+short that a healthy one would have tension. For these modules, the first row that applies decides:
 
     l does not change at all                     length_sensor_frozen
     l does not follow l_target                   jammed
@@ -25,14 +25,14 @@ short that a healthy one would have tension. The first row that applies decides:
     T rises with T_ref                           healthy
     otherwise                                    tension_sensor_frozen
 
-The first row that applies decides, under muscle stiffness control:
+Under muscle stiffness control, the first row that applies decides:
 
     l does not change at all                     length_sensor_frozen
     T near zero, and l' − l > FAR or growing     ruptured: the winch winds in the rest of the tendon
     T does not change at all                     tension_sensor_frozen
     |l − l'| > FAR                               length_sensor_offset
     l stays, and T does not rise with T_ref      jammed
-    T near zero all the same                     tension_sensor_frozen
+    T near zero otherwise                        tension_sensor_frozen
     T follows T_ref                              healthy
     otherwise                                    jammed
 
@@ -50,21 +50,22 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.signals.limits import LIMITS
 
-BEGUN = 0.001  # decrease of the command from which on the suspect counts as being wound in [m]
-JUDGED = 0.8  # time of being wound in after which the suspect is classified [s]
-PATIENCE = 8.0  # longest time without being wound in [s]
+WINDING_CHANGE = 0.001  # decrease of the command above which the suspect is being wound in [m]
+CLASSIFICATION_TIME = 0.8  # duration of winding in after which the suspect is classified [s]
+PATIENCE = 8.0  # time after which a suspect that was not wound in stays isolated [s]
 FAR = 0.025  # smallest |l − l'| that noise and network errors do not explain [m]
-FOLLOWED = 0.005  # decrease of l − l' that shows the rest of a ruptured tendon being wound in [m]
+RUPTURE_CHANGE = 0.005  # decrease of l − l' when the rest of a ruptured tendon is wound in [m]
 USUAL_BIAS = 30.0  # T_bias for which the tensions below apply; for other arms they are scaled [N]
-CLOSE = 8.0  # absolute tolerance of T relative to T_ref [N]
-SHARE = 0.35  # relative tolerance, as a share of T_ref − T_bias
-TIGHT = 20.0  # excess over T_ref that shows a jam although the suspect was not wound in [N]
-STRETCHED = 1.5  # multiple of the stretch at T_bias at which a healthy tendon has tension
-LONGEST_WINDING = 2.5  # [s] for which a slack tendon is wound in, at most
+CLOSE = 8.0  # absolute tolerance of the difference between T and T_ref [N]
+SHARE = 0.35  # tolerance of the difference between T and T_ref, relative to T_ref − T_bias
+JAM_EXCESS = 20.0  # T − T_ref above which a suspect that was not wound in is jammed [N]
+STRETCHED = 1.5  # stretch at which a healthy tendon has tension, relative to the stretch at T_bias
+LONGEST_WINDING = 2.5  # longest duration of winding in a slack tendon [s]
 BEHIND = 0.005  # decrease of a position command that a healthy module follows [m]
 STANDS = 0.0005  # largest motion of a jammed muscle module [m]
-HIGHEST, HALVINGS = 5000.0, 40  # of the search for T_ref of a position [N]
-FROZEN = 1e-6  # largest range of the readings of a frozen sensor [m], [N]
+HIGHEST_TENSION = 5000.0  # upper end of the search for T_ref of a position [N]
+HALVINGS = 40  # number of bisection steps of the search for T_ref of a position
+FROZEN = 1e-6  # range of the readings below which a sensor is frozen [m] or [N]
 
 
 class Outcome(Enum):
@@ -98,7 +99,7 @@ class Verdict(NamedTuple):
     """The outcome of a verification, with its evidence."""
 
     outcome: Outcome
-    evidence: str = ''  # such as 'by 50 mm'
+    evidence: str = ''  # size of the fault, such as 'by 50 mm'
 
     def __str__(self) -> str:
         text = _TEXTS[self.outcome]
@@ -129,7 +130,7 @@ class ModuleLaw:
     """T_ref of one module under muscle stiffness control."""
 
     def __init__(self, bias: float, stiffness: float) -> None:
-        """Take T_bias [N] and K [N/m]."""
+        """Describe a module with T_bias [N] and K [N/m]."""
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
@@ -137,7 +138,7 @@ class ModuleLaw:
         return row.likely - row.length
 
     def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
-        """Return T_ref [N]; `is_reference`: the suspect has not been wound in yet."""
+        """Return T_ref [N]; `is_reference` is true until the suspect is wound in."""
         return self.bias + max(0.0, self._stiffness * (row.length - row.command))
 
 
@@ -145,11 +146,12 @@ class PositionLaw(ModuleLaw):
     """T_ref of one module that follows positions, by the stretch of its series elastic element."""
 
     def __init__(self, bias: float, elongation: Callable[[float], float]) -> None:
-        """Take T_bias [N] and L_e [m] as a function of T [N]."""
+        """Describe a module with T_bias [N] and the function L_e(T) [m] of T [N]."""
         super().__init__(bias, math.inf)
         self._elongation = elongation
         self._reference = 0.0  # x_0 − L_e(T_0) [m]
-        self.stretched = STRETCHED * elongation(bias)  # [m]
+        #: stretch of a healthy tendon with tension [m]
+        self.stretched = STRETCHED * elongation(bias)
 
     def stretch(self, row: _Reading) -> float:
         """Return the stretch x [m]."""
@@ -161,7 +163,7 @@ class PositionLaw(ModuleLaw):
         if is_reference:  # x_0 of a slack tendon is not known
             is_slack = row.tension < LIMITS.slack_share * self.bias
             self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
-        wanted, low, high = stretch - self._reference, 0.0, HIGHEST
+        wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._elongation(middle) < wanted else (low, middle)
@@ -183,14 +185,14 @@ class Verification:
         self._scale = min(1.0, bias / USUAL_BIAS)
         self._time = 0.0
         self._highest_command = -math.inf
-        self._before = bias, bias  # T and T_ref before it was wound in
+        self._before = bias, bias  # T and T_ref before the suspect was wound in [N]
         self._rows: list[_Row] = []
-        self._watched = 0.0  # time of being wound in [s]
+        self._watched = 0.0  # duration of winding in so far [s]
 
     def step(
         self, tension: float, length: float, command: float | None, likely: float, dt: float
     ) -> Verdict | None:
-        """Take the readings of one message.
+        """Process the readings of one message.
 
         Args:
             tension: T [N].
@@ -211,17 +213,17 @@ class Verification:
             if is_reference:
                 self._highest_command = command
                 self._before = tension, demand
-            if command < self._highest_command - BEGUN:
+            if command < self._highest_command - WINDING_CHANGE:
                 self._watched += dt
                 excess = length - likely
                 self._rows.append(_Row(tension, length, demand, excess, command, stretch))
-        if self._watched >= JUDGED and isinstance(self._law, PositionLaw):
+        if self._watched >= CLASSIFICATION_TIME and isinstance(self._law, PositionLaw):
             return self._judge_position(self._law)
-        if self._watched >= JUDGED:
+        if self._watched >= CLASSIFICATION_TIME:
             return self._judge()
         if self._time < PATIENCE:
             return None
-        if tension > demand + TIGHT * self._scale:
+        if tension > demand + JAM_EXCESS * self._scale:
             return Verdict(Outcome.JAMMED)  # its tension is high although it was not wound in
         return Verdict(Outcome.NOT_WOUND_IN)
 
@@ -231,7 +233,7 @@ class Verification:
         last_quarter = slice(-max(len(tension) // 4, 1), None)
         reached, wanted, beside = map(_late_median, (tension, demand, excess))
         is_slack = reached < LIMITS.slack_share * self._bias
-        follows_the_winch = excess[0] - excess[-1] > FOLLOWED
+        follows_the_winch = excess[0] - excess[-1] > RUPTURE_CHANGE
         if np.ptp(length) < FROZEN:
             return Verdict(Outcome.LENGTH_SENSOR_FROZEN)
         if is_slack and (beside < -FAR or follows_the_winch):

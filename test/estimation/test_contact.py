@@ -75,7 +75,7 @@ def test_a_planar_arm_estimates_no_force_across_its_plane(robot):
 
 def test_known_tendon_friction_is_not_taken_for_a_force():
     tension, length = pulling(THETA)
-    wound = length + np.linspace(0.01, 0.0, 50)[:, None]  # s = 1: T exceeds T_end
+    wound = length + np.linspace(0.01, 0.0, 50)[:, None]  # every tendon is wound in, so s is 1
     errors = []
     for friction in (0.0, 0.1):
         core, sliding = observer(), FrictionDirection()

@@ -100,7 +100,7 @@ def test_a_reset_restarts_the_count(calibrated, watch, wound):
 def test_a_muscle_without_its_commanded_tension_is_an_anomaly(robot, mae, watch, slack, by_length):
     watched = watch(mae)
     messages = round(DEAD_TIME / DT) + 1
-    assert not any(watched.findings(slack, messages))  # no command: no demand
+    assert not any(watched.findings(slack, messages))  # without a command, no tension is demanded
     watched.demand = np.full(6, 60.0)
     if by_length:
         watched.demand = robot.demanded(slack.length, slack.length - 0.003)
@@ -172,7 +172,8 @@ def test_preset_paper_decides_by_a_alone_once_it_is_calibrated(
     assert finding.evidence.startswith('A = ') if known else finding is None
     watched.health.reset()
     assert not any(watched.findings(healthy, IN_A_ROW))
-    watched.health.configure(Detection(1e6))  # never reached; detectors by physics remain
+    # A never reaches this threshold; only detectors by physics remain
+    watched.health.configure(Detection(1e6))
     assert not any(watched.findings(slack, round(2 * DEAD_TIME / DT)))
 
 

@@ -104,7 +104,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     loop.step(cut, 20)
     assert loop.core.cause.startswith(robot.muscles[2])
     assert loop.core.body.isolated == loop.core.mae.isolated == (2,)
-    assert robot.isolated == ()  # other parts share this object
+    assert robot.isolated == ()  # other parts share this object, so it must not change
     values = loop.core.report(loop.now).values
     assert values['finding'] in ('residual_distance', 'slack_tendon')
     assert values['verification'] == 'running'
@@ -123,7 +123,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     assert report.values['isolated muscles'] == robot.muscles[2]
     assert report.values['finding'] == report.values['verification'] == 'none'
     assert report.values['last outcome'] == 'ruptured'
-    loop.step(healthy, 30)  # it is repaired
+    loop.step(healthy, 30)  # the muscle is repaired
     loop.core.isolate(())
     loop.step(healthy, 10)
     assert loop.core.mae.isolated == ()
@@ -146,7 +146,7 @@ def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, heal
         assert loop.core.suspects.last_verdict[1].outcome is Outcome.HEALTHY
         assert loop.core.body.isolated == ()
         assert loop.core.cause == ''
-    assert loop.core.body.isolated == ()  # latched as with on_anomaly: stop
+    assert loop.core.body.isolated == ()  # the finding stays latched, as with on_anomaly: stop
     loop.step(healthy, 1000)
     assert loop.core.cause
 
@@ -194,7 +194,7 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calib
 
 
 def test_a_tension_that_stays_exactly_at_the_bias_is_no_sensor_fault(robot, calibrated, healthy):
-    # As by a simulated module whose tendon is paid out.
+    # A simulated module without sensor noise reports exactly T_bias while its tendon is paid out.
     rng, paid_out = np.random.default_rng(0), 3
     core = Estimator(robot)
     quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
@@ -233,7 +233,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
 
 @pytest.mark.parametrize('scale', [1.0, 0.1])
 def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
-    # It stays at T_bias although three times that is demanded.
+    # The tension stays at T_bias although three times T_bias is demanded.
     watched = Verification(0, ModuleLaw(scale * BIAS, scale * STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0004), 0.006)

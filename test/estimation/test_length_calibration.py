@@ -43,8 +43,8 @@ def swinging(robot, mae):
 
 @pytest.fixture
 def seldom(monkeypatch):
-    # Fits take long; fewer of them find the offsets in the same time.
-    monkeypatch.setattr(length_calibration, 'AGAIN', 5.0)
+    # Fits take long, and with fewer of them the calibration is not slower.
+    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 5.0)
 
 
 @pytest.fixture
@@ -96,14 +96,14 @@ def test_a_standing_arm_does_not_determine_the_length_offsets(robot, mae, moment
 
 def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
     estimator = Estimator(robot)
-    with pytest.raises(MusculoskeletalError, match='no checkpoint'):
+    with pytest.raises(MusculoskeletalError, match='requires a checkpoint'):
         estimator.calibrate_lengths()
     estimator.use(mae)
     for posture in ((0.1,), tuple(robot.upper + 0.1)):
         with pytest.raises(MusculoskeletalError, match='legal'):
             estimator.calibrate_lengths(posture)
     assert estimator.body.offsets.known
-    on_stop = tuple(robot.upper + 0.002)  # reading of joints at their stops
+    on_stop = tuple(robot.upper + 0.002)  # sensors of joints at their stops may read this
     estimator.calibrate_lengths(on_stop)
     assert not estimator.body.offsets.known
 
@@ -133,7 +133,9 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibration(
     monkeypatch, robot, mae, moment, sees
 ):
-    monkeypatch.setattr(length_calibration, 'AGAIN', 10.0)  # fits without a muscle take longer
+    monkeypatch.setattr(
+        length_calibration, 'FIT_INTERVAL', 10.0
+    )  # fits without a muscle take longer
     rng = np.random.default_rng(0)
 
     def disturbed(t):
@@ -161,7 +163,8 @@ def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 def test_length_calibration_of_an_arm_without_weight_stays_finite(mae):
     robot = Robot.load('arm26')
-    robot.kinematics.model.gravity.linear = np.zeros(3)  # as with upright axes
+    # like an arm whose joints all have vertical axes
+    robot.kinematics.model.gravity.linear = np.zeros(3)
     calibration = run(LengthCalibration(robot, mae), swinging(robot, mae), 60.0, sees=False)
     assert np.isfinite(calibration.offsets.offset).all()
 
@@ -177,7 +180,7 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert re.search('calibrating the lengths: [1-4] of', reported)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == reported
-    estimator.use(mae)  # counts as another network
+    estimator.use(mae)  # the estimator treats it as another network
     assert 'calibrating the lengths: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):
         _, tension, length = moment(0.01 * n)

@@ -70,7 +70,7 @@ def verdict(tension, length, slack):
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.028)
         pull, wound = tension(-command, shake), length(command, stir)
-        likely = -slack - elongation(pull)  # the joints stay where they are
+        likely = -slack - elongation(pull)  # the joints do not move
         if result := watched.step(pull, wound, command, likely, DT):
             return result.outcome
     raise AssertionError('no answer')

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detect a sensor whose reading stays exactly the same while its muscle moves.
 
-A working sensor has noise, so such a sensor is faulty even if the estimate is hardly disturbed. The
-other muscles show whether the muscle moves.
+The readings of a working sensor contain noise. Therefore a constant reading is a fault even if it
+hardly disturbs the estimate. The other muscles show whether the muscle moves.
 """
 
 import numpy as np
@@ -13,8 +13,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
-FROZEN_TIME = 1.0  # [s] of identical readings
-MOVED = 0.006  # [m] by which the muscle moves meanwhile, according to the other muscles
+FROZEN_TIME = 1.0  # duration of identical readings after which a sensor may be frozen [s]
+MOVED = 0.006  # motion of the muscle, predicted from the others, that proves it [m]
 
 
 class FrozenSensor(Detector):
@@ -24,8 +24,9 @@ class FrozenSensor(Detector):
         self._robot = self._complete_robot = robot
         self._mae: Mae | None = None
         self._last: Array | None = None  # last readings of l and T, (2, M)
-        self._unchanged_time: Array = np.zeros((2, robot.muscle_count))  # [s] of l and of T
-        self._reduced_mae: Mae | None = None  # without the observed muscle
+        #: time without a change of l and of T [s]
+        self._unchanged_time: Array = np.zeros((2, robot.muscle_count))
+        self._reduced_mae: Mae | None = None  # network without the observed muscle
         self._shortest, self._longest = np.inf, -np.inf  # predicted lengths of that muscle [m]
 
     def use(self, mae: Mae) -> None:
@@ -40,7 +41,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message."""
+        """Report a muscle with a constant reading that moves according to the others."""
         sample, robot = observation.sample, self._robot
         # An unknown tension does not count as frozen.
         tension, mae = sample.model_tension, self._mae

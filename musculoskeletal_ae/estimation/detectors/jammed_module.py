@@ -18,11 +18,12 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Obser
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-STANDS = 0.001  # [m] motion below which the winch counts as stationary
-JAM_TIME = 1.0  # [s]
-BEHIND = 0.005  # [m]
-FULL = 0.9  # share of T_max from which on a module need not move, because it cannot pull harder
-JAM, JAM_SHARE = 50.0, 0.3  # [N], and as a share of T_ref because the gain of sensors varies
+STANDS = 0.001  # motion below which the winch counts as stationary [m]
+JAM_TIME = 1.0  # time after which a stationary winch is reported [s]
+BEHIND = 0.005  # difference from l_target above which a module has to move [m]
+FULL = 0.9  # fraction of T_max above which a module need not move, because it cannot pull harder
+JAM = 50.0  # difference from T_ref above which a winch has to move [N]
+JAM_SHARE = 0.3  # the same, relative to T_ref, because the gains of tension sensors vary
 
 
 class JammedModule(Detector):
@@ -30,7 +31,8 @@ class JammedModule(Detector):
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
-        self._time: Array = np.zeros(robot.muscle_count)  # [s]
+        #: time for which the winch has been stationary [s]
+        self._time: Array = np.zeros(robot.muscle_count)
         self._length: Array = np.zeros(robot.muscle_count)  # l when the winch moved last [m]
 
     def use(self, mae: Mae) -> None:
@@ -42,7 +44,7 @@ class JammedModule(Detector):
         self._time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message."""
+        """Report the winch that has been stationary longest, if JAM_TIME has passed."""
         is_far, length = self._is_far(observation), observation.sample.length
         if is_far is None:
             self._time[:] = 0.0

@@ -24,15 +24,16 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-SPACING, COUNT = 0.1, 10  # [s] between values of g, and number of values in its median
-LASTING = 1.0  # [s] for which Δ has to exceed its limits
+SPACING = 0.1  # time between two values of g [s]
+COUNT = 10  # number of values in the median of g
+LASTING = 1.0  # time for which Δ has to exceed its limits before it is reported [s]
 
 
 class Largest(NamedTuple):
     """Limits of Δ, or of g itself while g_usual is unknown."""
 
-    single: float  # of one muscle [m]
-    all: float  # root mean square over the muscles in use [m]
+    single: float  # largest absolute value of a single muscle [m]
+    all: float  # largest root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
         """Return a change [m] (M,) relative to the limits; above 1 it exceeds one of them."""
@@ -41,16 +42,22 @@ class Largest(NamedTuple):
 
 
 # Measured on healthy exploring Musashi arms, half of them of emulator model `foreign`, some with a
-# load of 3.6 kg and pushed. With initial networks, Δ reached 0.036 m and 0.019 m, and g 0.051 m and
+# load of 3.6 kg and pushes. With initial networks, Δ reached 0.036 m and 0.019 m, and g 0.051 m and
 # 0.029 m; with networks that had learned for 20 to 60 s, Δ reached 0.032 m and 0.013 m.
-CHANGE_YOUNG, GAP_YOUNG = Largest(0.06, 0.028), Largest(0.08, 0.045)
-# With networks whose detector of the residual is calibrated, both reached 0.013 m and 0.006 m. An
-# error of 0.05 m of a single muscle is detected in every posture.
-CHANGE_LEARNED, GAP_LEARNED = Largest(0.035, 0.016), Largest(0.035, 0.016)
-#: [s] between the healthy messages for g_usual, their largest number, and the number required
-HEALTHY_SPACING, HEALTHY_COUNT, ENOUGH = 1.0, 60, 5
-CLEARLY = 0.5  # relative Δ up to which a message counts as healthy, so that g_usual never drifts
-EXPLAINED = 0.5  # share of Δ that may stay unexplained if a joint sensor is reported
+CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with these networks
+GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with these networks
+# With networks whose residual detector is calibrated, Δ and g reached 0.013 m and 0.006 m. An error
+# of 0.05 m of a single muscle is detected in every posture.
+CHANGE_LEARNED = Largest(0.035, 0.016)  # limits of Δ with calibrated networks
+GAP_LEARNED = Largest(0.035, 0.016)  # limits of g with calibrated networks
+HEALTHY_SPACING = 1.0  # time between the healthy messages from which g_usual is computed [s]
+HEALTHY_COUNT = 60  # largest number of these messages
+ENOUGH = 5  # smallest number of these messages
+#: Δ relative to its limits up to which a message counts as healthy; it is low, so that g_usual does
+#: not follow a drift
+HEALTHY_EXCESS = 0.5
+#: largest part of Δ that a joint-sensor offset may leave unexplained, relative to Δ
+UNEXPLAINED = 0.5
 
 
 class JointDisagreement(Detector):
@@ -68,7 +75,7 @@ class JointDisagreement(Detector):
         #: θ, T_end and l of healthy messages, from which g_usual of any network follows
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
         self._usual: Array | None = None  # g_usual [m], (M,)
-        self._healthy_time = 0.0  # [s] since a message was last added to `_healthy`
+        self._healthy_time = 0.0  # time since a message was last added to `_healthy` [s]
         self.reset()
 
     def use(self, mae: Mae) -> None:
@@ -79,13 +86,13 @@ class JointDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Forget the last messages, but keep g_usual, which a reset does not make wrong."""
+        """Discard the last messages; g_usual is kept, because it remains valid."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Forget g_usual as well, because the length offsets change."""
+        """Discard the last messages and g_usual, because the length offsets change."""
         self.reset()
         self._healthy.clear()
         self._usual = None
@@ -102,7 +109,7 @@ class JointDisagreement(Detector):
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message."""
+        """Report the lengths or a joint sensor if Δ has exceeded its limits for LASTING."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9 or self._mae is None:
             return None
@@ -123,7 +130,7 @@ class JointDisagreement(Detector):
         self._beyond = self._beyond + dt if excess > 1.0 else 0.0
         if not observation.lengths_known:
             return None
-        if excess <= (1.0 if self._usual is None else CLEARLY):
+        if excess <= (1.0 if self._usual is None else HEALTHY_EXCESS):
             self._note_healthy(theta, sample, dt)
         return self._finding(observation) if self._beyond > LASTING else None
 
@@ -164,7 +171,7 @@ class JointDisagreement(Detector):
             f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * largest.single:.0f} mm), and all '
             f'lengths by {1e3 * size:.0f} mm (limit {1e3 * largest.all:.0f} mm)'
         )
-        if np.linalg.norm(unexplained) > EXPLAINED * np.linalg.norm(change):
+        if np.linalg.norm(unexplained) > UNEXPLAINED * np.linalg.norm(change):
             return Finding(muscle, Kind.LENGTHS_DISAGREE, evidence)
         j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
         offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'

@@ -12,7 +12,7 @@ class LengthJump(Detector):
     """Reports the muscles that the muscle stream has named."""
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message."""
+        """Report the muscles whose lengths have jumped according to the sample."""
         jumped = observation.sample.jumped
         if not jumped or not observation.lengths_known:
             return None
@@ -23,5 +23,5 @@ def finding_of(jumped: tuple[int, ...]) -> Finding:
     """Return the finding for one or several muscles whose lengths have jumped."""
     if len(jumped) == 1:
         return Finding(jumped[0], Kind.LENGTH_JUMP, 'its length jumped')
-    evidence = f'its length and {len(jumped) - 1} others jumped'
+    evidence = f'its length and {len(jumped) - 1} other lengths jumped'
     return Finding(jumped[0], Kind.LENGTHS_JUMPED, evidence)

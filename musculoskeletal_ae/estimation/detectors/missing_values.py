@@ -13,7 +13,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind
 from musculoskeletal_ae.robot.robot import Robot
 
-SILENT = 0.15  # [s] during which all messages have NaN for the same muscle
+SILENT = 0.15  # time with NaN for the same muscle after which it is reported [s]
 
 
 class MissingValues(Detector):
@@ -22,10 +22,10 @@ class MissingValues(Detector):
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._muscle: int | None = None
-        self._since = self._last = -math.inf  # times of the first and the last such message [s]
+        self._since = self._last = -math.inf  # times of the first and the last message with NaN [s]
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Take the readings of every message; see `Detector`."""
+        """Report a muscle that alone has reported NaN for SILENT; see `Detector`."""
         known = states[:2] if self._robot.knows_tension else states[:1]
         is_missing = ~np.isfinite(known).all(axis=0) & usable
         muscle = int(is_missing.argmax()) if np.count_nonzero(is_missing) == 1 else None

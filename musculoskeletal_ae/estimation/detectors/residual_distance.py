@@ -37,12 +37,12 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
-#: Names of the thresholds of d and A among those of the checkpoint.
-DISTANCE, NORM = 'distance', 'norm'
+DISTANCE = 'distance'  # name of the threshold of d in a checkpoint
+NORM = 'norm'  # name of the threshold of A in a checkpoint
 
-IN_A_ROW = 5  # consecutive messages above the threshold that make a finding
+IN_A_ROW = 5  # number of consecutive messages above the threshold that are a finding
 NEAR = 0.25  # distance to a calibrated posture above which the threshold grows [joint ranges]
-WIDEST = 3.0  # largest factor of the threshold
+WIDEST = 3.0  # largest factor by which the threshold is raised
 
 
 class Reading(NamedTuple):
@@ -60,7 +60,7 @@ class ResidualDistance(Detector):
     Attributes:
         symbol: Symbol of the statistic, for messages.
         threshold_name: Name of its threshold in the checkpoint.
-        threshold: Threshold of the checkpoint; ∞ if it is not calibrated.
+        threshold: Threshold in the checkpoint; ∞ if it is not calibrated.
         reading: Results of the last message; None before the first.
     """
 
@@ -72,8 +72,8 @@ class ResidualDistance(Detector):
         Args:
             robot: The nominal body.
             settings: Settings with the threshold of A.
-            slack: The detector that knows which slack tendons are being wound in; None: messages
-                always count.
+            slack: The detector that knows which slack tendons are being wound in; None if all
+                messages count.
         """
         self._robot = self._complete_robot = robot
         self._settings, self._slack = settings, slack
@@ -104,15 +104,15 @@ class ResidualDistance(Detector):
         self._settings = settings
 
     def reset(self) -> None:
-        """Forget the consecutive messages."""
+        """Discard the count of consecutive messages."""
         self._beyond = 0
 
     def forget_reading(self) -> None:
-        """Forget the last message, for example when the length offsets change."""
+        """Discard the last reading, for example when the length offsets change."""
         self.reading = None
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message."""
+        """Update `reading`, and report its suspect after IN_A_ROW messages above the threshold."""
         sample, error = observation.sample, observation.estimate.residual
         tension, muscle_count = sample.model_tension, len(sample.motor_tension)
         distance, share = math.nan, error

@@ -12,8 +12,8 @@ is long. The rule then looks for a tendon that is stretched, but has no tension:
 
     T < slack_share · T_bias for DEAD_TIME, and l(θ, 0) − l > STRETCH · L_e(T_bias)
 
-θ is estimated from the tendons that are not slack. A rupture of a tendon without load
-is detected as soon as the tendon should carry load.
+θ is estimated from the tendons that are not slack. A rupture of a tendon without load is detected
+as soon as the tendon should carry load.
 """
 
 import numpy as np
@@ -26,11 +26,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: stretch of a tendon without tension that shows a rupture, as a multiple of that at T_bias: with
-#: healthy statistics of the real arm, and without. Healthy slack tendons of networks that have not
-#: learned the arm seem to be stretched by up to 1.5.
-STRETCH, UNCALIBRATED = 1.5, 3.0
-DEAD_TIME = 0.5  # [s] without tension after which a muscle is reported
+#: stretch of a tendon without tension above which it is ruptured, relative to the stretch at T_bias
+STRETCH = 1.5
+#: the same without calibrated statistics: a network that has not learned the arm can estimate a
+#: stretch of up to 1.5 for a healthy slack tendon
+UNCALIBRATED_STRETCH = 3.0
+DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
 
 class SlackTendon(Detector):
@@ -44,8 +45,9 @@ class SlackTendon(Detector):
         self._robot = self._complete_robot = robot
         self._settings = settings
         muscle_count = robot.muscle_count
-        self._slack_time: Array = np.zeros(muscle_count)  # [s] without tension
-        self._idle_time: Array = np.zeros(muscle_count)  # [s] without tension and winding in
+        self._slack_time: Array = np.zeros(muscle_count)  # time without tension [s]
+        #: time without tension and without winding in [s]
+        self._idle_time: Array = np.zeros(muscle_count)
         self._taut_excess: Array = np.zeros(muscle_count)  # `excess` when the tension was lost [m]
         self._wound_length: Array = np.zeros(muscle_count)  # l when it was last wound in [m]
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
@@ -64,7 +66,7 @@ class SlackTendon(Detector):
         self._slack_time[:] = self._idle_time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Take a message."""
+        """Report a muscle that has been slack for DEAD_TIME and is not being wound in."""
         if self._robot.follows_position:
             return self._step_by_stretch(observation)
         sample, theta, dt = observation.sample, observation.estimate.state.theta, observation.dt
@@ -101,7 +103,7 @@ class SlackTendon(Detector):
         )
 
     def _step_by_stretch(self, observation: Observation) -> Finding | None:
-        """Take a message of modules that follow positions."""
+        """Report a muscle that has been stretched without tension for DEAD_TIME."""
         sample, bias = observation.sample, self._robot.tension.bias
         is_slack = (sample.motor_tension < LIMITS.slack_share * bias) & self._robot.used
         is_dead = is_slack & observation.lengths_known
@@ -114,7 +116,7 @@ class SlackTendon(Detector):
         return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched, but has no tension')
 
     def _is_stretched(self, sample: MuscleSample, slack: tuple[int, ...]) -> Bools:
-        """Return which slack muscles are so short that they had to pull, (M,)."""
+        """Return which slack muscles are so short that healthy ones would have tension, (M,)."""
         robot, mae = self._robot, self._mae
         isolated = tuple(sorted({*robot.isolated, *slack}))
         if robot.muscle_count - len(isolated) <= robot.joint_count:
@@ -125,7 +127,7 @@ class SlackTendon(Detector):
         tension = sample.bone_tension.copy()
         tension[list(isolated)] = 0.0
         is_calibrated = mae.anomaly is not None and mae.anomaly.calibrated
-        share = STRETCH if is_calibrated else UNCALIBRATED
+        share = STRETCH if is_calibrated else UNCALIBRATED_STRETCH
         stretch = mae.lengths(theta, tension) - sample.length
         is_stretched: Bools = stretch > share * robot.elongation(robot.description.tension.bias)
         return is_stretched
@@ -133,8 +135,9 @@ class SlackTendon(Detector):
     def _demand(self, observation: Observation) -> Array | None:
         """Return the demanded tension [N], (M,), or None if it is unknown.
 
-        While the estimate is implausible, the controller sends no commands, and the modules
-        maintain T_bias.
+        Without a known command it is unknown, with one exception: while the estimate is
+        implausible, the controller sends no commands, and the modules hold T_bias. Then T_bias is
+        returned, unless all muscles are slack.
         """
         if observation.demand is not None:
             return observation.demand

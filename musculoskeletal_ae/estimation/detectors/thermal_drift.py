@@ -23,8 +23,8 @@ class ThermalDrift(Detector):
         """Consider the modules of these muscles healthy as they are now."""
         self._heat.accept(*muscles)
 
-    def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002 (heat has it)
-        """Take a message."""
+    def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
+        """Report a module that has changed according to the thermal model and is hot."""
         for muscle, change in self._heat.changed.items():
             if self._heat.core[muscle] > COOL:
                 return Finding(muscle, Kind.THERMAL_DRIFT, f'its module {change}')

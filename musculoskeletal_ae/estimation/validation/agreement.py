@@ -29,30 +29,36 @@ from musculoskeletal_ae.estimation.validation.recent_messages import LEAST, Rece
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-# Networks that were learned and published differed from joint sensors by 0.29 rad after others
-# that differed by 0.18 rad, and their lengths by 0.03 m. At its first update, an initial network
-# moves by 0.56 rad and its lengths by 0.05 m; a learned network moves by 0.31 rad.
-ANGLE_FLOOR, LENGTH_FLOOR, ANGLE_WORSE = 0.35, 0.06, 1.5  # [rad], [m], and a factor
-ANGLE_MOVED, ANGLE_MOVED_INITIAL = 0.45, 0.8  # [rad] from a learned network, from an initial one
-LENGTH_MOVED = 0.07  # [m]
+# Limits relative to joint sensors. Good learned networks differed from joint sensors by up to 0.29
+# rad after a network that differed by 0.18 rad, and their lengths by up to 0.03 m.
+ANGLE_FLOOR = 0.35  # error of a joint that is always permitted [rad]
+LENGTH_FLOOR = 0.06  # error of a length that is always permitted [m]
+ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
+# Limits relative to the network in use. The first update of an initial network changed θ by up to
+# 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
+ANGLE_MOVED = 0.45  # largest difference of θ from a learned network [rad]
+ANGLE_MOVED_INITIAL = 0.8  # largest difference of θ from an initial network [rad]
+LENGTH_MOVED = 0.07  # largest difference of a length from either network [m]
 # A minute of learning changed the shape of an initial network by 0.32 and that of a learned one by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
-SHAPE_MOVED, SHAPE_MOVED_INITIAL = 0.3, 0.42  # from a learned network, from an initial one
+SHAPE_MOVED = 0.3  # largest relative difference in shape from a learned network
+SHAPE_MOVED_INITIAL = 0.42  # largest relative difference in shape from an initial network
 
-BY_SENSORS, BY_NETWORK = 'joint sensors', 'the network in use'  # sources of a reference
+BY_SENSORS = 'joint sensors'  # source of a reference
+BY_NETWORK = 'the network in use'  # source of a reference
 
 
 class Comparison(NamedTuple):
     """Differences of one quantity from its reference."""
 
     name: str
-    owners: tuple[str, ...]  # what each entry belongs to
-    error: Array  # of each joint [rad] or muscle [m], or the relative one of all lengths
+    owners: tuple[str, ...]  # joint or muscle of each entry
+    error: Array  # error of each joint [rad] or muscle [m], or the relative error of all lengths
     limit: Array  # largest permitted error of each entry
     source: str  # source of the reference
 
     def faults(self) -> Iterator[str]:
-        """Yield the fault, if an error exceeds its limit."""
+        """Yield a text on the largest fault, if an error exceeds its limit."""
         excess = self.error / self.limit
         if not excess.max() <= 1.0:
             worst = int(excess.argmax())

@@ -17,8 +17,9 @@ from musculoskeletal_ae.estimation.validation.recent_messages import LEAST, Rece
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 
-LEAST_RUPTURED = 0.1  # smallest measure with a ruptured muscle, for the clearest muscle
-WIDENED = 3.5  # threshold of an inherited detector over the highest d of the messages
+#: smallest permitted measure with a ruptured muscle; the muscle with the largest measure counts
+LEAST_RUPTURED = 0.1
+WIDENED = 3.5  # smallest ratio of an inherited threshold to the highest d of the messages
 
 
 def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Iterator[float]:
@@ -38,7 +39,7 @@ def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Ite
         return float(np.median(statistics.distances(error) / threshold))
 
     yield measure(tension, length)
-    rows = np.linspace(0, len(length) - 1, LEAST).astype(int)  # LEAST messages per muscle suffice
+    rows = np.linspace(0, len(length) - 1, LEAST).astype(int)  # these LEAST messages suffice
     is_intact = 1.0 - np.eye(tension.shape[1])
     for factors in np.delete(is_intact, tuple(isolated), axis=0):
         yield measure(tension[rows] * factors, length[rows])

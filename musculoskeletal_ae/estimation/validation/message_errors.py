@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check how well a candidate network explains recent messages of the arm.
 
-The errors are those of T and l through ②, and of l through ① at the θ that ② estimates. The median
-of each muscle may be WORSE times that of the network in use, or FLOOR if that is more.
+Three errors are compared: T and l through ②, and l through ① at the θ that ② estimates. The median
+error of each muscle may be WORSE times the median error of the network in use, or FLOOR if that is
+more.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,8 +14,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
-WORSE = 2.0
-FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}  # [N], [m], [m]
+WORSE = 2.0  # largest error relative to the error of the network in use
+#: error that is always permitted: of T [N] and of l [m]
+FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
 
 
 def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:

@@ -11,8 +11,8 @@ of the model whose elongation is multiplied, for each muscle, by the factor that
 the differences over the elongation. Constant differences of lengths do not change the slope.
 
 The scale is the common factor of all route lengths by ①, with the same elongations removed. Errors
-of single muscles average out: it was 0.84 to 1.11 for healthy networks of both presets, on both
-shipped robots and both emulator models. Its error is the difference from 1.
+of single muscles average out: the scale was 0.84 to 1.11 for healthy networks of both presets, on
+both shipped robots and both emulator models. Its error is the difference from 1.
 
 The relative error of a joint or muscle is its root mean square error divided by the standard
 deviation of the true values. A network with a constant output has a relative error of 1. LIMITS
@@ -33,15 +33,15 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 64
-SCALE = 'scale of l by ①'
+POSTURES = 64  # number of fixed states
+SCALE = 'scale of l by ①'  # name of the error of the common factor
 
-#: largest relative errors; they leave a margin to those of healthy networks (`bench gate`)
+#: largest permitted relative errors; healthy networks have smaller ones (`python -m bench gate`)
 LIMITS = {
     'θ by ①': 0.6,
-    'T by ①': 1.35,  # two exchanged muscles have √2
+    'T by ①': 1.35,  # exchanging two muscles gives √2
     'l by ①': 1.7,
-    'θ by ②': 1.3,  # a joint that the muscles do not determine has 1
+    'θ by ②': 1.3,  # a joint that the muscles do not determine gives 1
     'T by ②': 1.35,
     'l by ②': 0.6,
     'θ by ③': 0.7,
@@ -52,13 +52,14 @@ LIMITS = {
     'mean θ by ①': 0.6,
     'mean θ by ③': 0.7,
 }
-# Smallest spread of a length and size of a moment arm by which errors are divided [m].
-LEAST_SPREAD, LEAST_ARM = 0.04, 0.01
-# Bounds of the factor of a muscle's elongation; constants of elastic elements differ by e^±1.5.
-STIFFEST, SOFTEST = 0.2, 4.5
-INELASTIC = 1e-12  # sum of squared elongations of a tendon without elasticity [m²]
-UNDETERMINED = 1.2
-AFFINE = 1000  # states to which the affine map is fitted; as many others give its error
+LEAST_SPREAD = 0.04  # smallest standard deviation by which errors of lengths are divided [m]
+LEAST_ARM = 0.01  # smallest size of the moment arms by which errors of G are divided [m]
+# Constants of elastic elements differ from the model's by factors of e^±1.5.
+STIFFEST = 0.2  # smallest factor of a muscle's elongation
+SOFTEST = 4.5  # largest factor of a muscle's elongation
+INELASTIC = 1e-12  # smallest divisor of a slope over the elongation [m²]
+UNDETERMINED = 1.2  # largest error of a poorly determined joint, relative to the affine map
+AFFINE = 1000  # number of states to which the affine map is fitted; as many others give its error
 
 
 class PostureCheck:
@@ -157,7 +158,7 @@ class PostureCheck:
 
     @cached_property
     def _undetermined(self) -> Array:
-        """Permitted relative error of each joint, derived from that of an affine map, (D,)."""
+        """Permitted relative error of each joint, derived from the best affine map, (D,)."""
         theta, tension, length = self._states(2 * AFFINE)
         ones = np.ones((2 * AFFINE, 1))
         inputs = np.hstack([ones, tension / tension.std(), length / length.std()])

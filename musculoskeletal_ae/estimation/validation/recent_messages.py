@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keep the last seconds of healthy messages, on which candidate networks are validated."""
+"""Keeps the last seconds of healthy messages, on which candidate networks are validated."""
 
 import math
 from collections import deque
@@ -11,13 +11,14 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
 
-SPAN, SPACING = 10.0, 0.1  # [s] that the kept messages cover, and shortest time between two of them
-LEAST = 20  # smallest number of messages that permits a verdict
-LONGEST_PERIOD = 0.5  # [s] without messages, after which the direction of sliding is unknown
+SPAN = 10.0  # time that the kept messages cover [s]
+SPACING = 0.1  # shortest time between two kept messages [s]
+LEAST = 20  # smallest number of messages on which a network can be validated
+LONGEST_PERIOD = 0.5  # time without messages after which the direction of sliding is unknown [s]
 
 
 class _Message(NamedTuple):
-    time: float  # [s]
+    time: float  # time on the steady clock [s]
     tension: Array  # T [N], (M,)
     length: Array  # l [m], (M,)
     direction: Array  # s: direction in which each tendon slid last, (M,)
@@ -48,7 +49,7 @@ class RecentMessages:
     def note(
         self, tension: Array, length: Array, now: float, theta: Array | None, is_healthy: bool
     ) -> None:
-        """Take a message; keep it if the arm is healthy and the last kept one is old enough.
+        """Keep a message if the arm is healthy and the last kept message is old enough.
 
         Args:
             tension: T [N], (M,).
