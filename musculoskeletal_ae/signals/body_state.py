@@ -3,7 +3,7 @@
 
 The estimator owns the body state and publishes it on the latched topics `isolated_muscles` and
 `muscle_length_zeros`. All other nodes receive it. Every change creates a new object with the next
-version.
+version number.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 
-# Standard deviations of length offsets.
-UNKNOWN = 1.0  # [m] of an unknown offset
-SUSPECT = 2.0  # [m] of an offset that was known until a fault revoked it
-KNOWN = 0.05  # [m]; offsets with a lower one count as known
+UNKNOWN = 1.0  # standard deviation of an unknown length offset [m]
+SUSPECT = 2.0  # standard deviation of a length offset that a fault has revoked [m]
+KNOWN = 0.05  # standard deviation below which a length offset counts as known [m]
 
 
 @dataclass(frozen=True)

@@ -5,18 +5,20 @@
 
 T is the motor-side tension and T_end the bone-side tension. s is 1 after winding in, when T is
 higher than T_end, and −1 after paying out. In between, friction reverses gradually. The network
-models the body without friction. Its T is therefore T_end, and sensor values must be converted.
+models the body without friction. Therefore its tension is T_end, into which measured values of T
+have to be converted.
 """
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-REVERSAL = 0.0004  # [m] b, sliding distance over which friction reverses
-#: Noise of a length [m]. A deviation ē of this size is as likely due to sliding.
+REVERSAL = 0.0004  # b: sliding distance over which friction reverses [m]
+#: noise of a length [m]; a mean deviation ē of this size is as likely due to sliding as due to
+#: noise
 NOISE = 0.00013
-LATEST = 0.07  # weight of the newest deviation in their running mean ē
-SPIKE = 0.0002  # [m] by which a reading may lie outside the range of the last two
+LATEST = 0.07  # weight a of the newest deviation in the running mean ē
+SPIKE = 0.0002  # distance to which a reading outside the range of the last two is limited [m]
 
 
 def slid(direction: Array, way: Array, moved: Array) -> Array:
@@ -24,7 +26,7 @@ def slid(direction: Array, way: Array, moved: Array) -> Array:
 
     Args:
         direction: s before, (..., M).
-        way: Direction of sliding, 1: winding in, −1: paying out, (..., M).
+        way: Direction of sliding, (..., M): 1 when winding in, −1 when paying out.
         moved: Sliding distance [m], (..., M).
     """
     after: Array = way + (direction - way) * np.exp(np.abs(moved) * (-1.0 / REVERSAL))
@@ -53,7 +55,7 @@ class FrictionDirection:
         self._length: Array | None = None
 
     def step(self, length: Array) -> Array:
-        """Take the next l [m] (M,) and return s (M,)."""
+        """Update the directions with the next l [m] (M,), and return s (M,)."""
         if self._length is None:
             self._length, self._mean, self._read = length, length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
@@ -74,11 +76,11 @@ class FrictionDirection:
         return self._direction
 
     def end_tension(self, friction: Array | float, tension: Array, length: Array) -> Array:
-        """Take the next T [N] and l [m] (M,) and return T_end [N] (M,), with μ (M,)."""
+        """Update s with the next l [m] (M,); return T_end [N] (M,) for T [N] (M,) and μ (M,)."""
         return end_tension(friction, tension, self.step(length))
 
     def reset(self) -> None:
-        """Forget all lengths, for example after a jump of the clock."""
+        """Discard all lengths, for example after a jump of the clock."""
         self._length = None
 
 

@@ -20,28 +20,32 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD = 60.0  # [s] for which planned tensions must be permissible
-MOMENT = 5.0  # [s] for which every tension must be permissible
-EVERY = 1.0  # [s] between two updates
-LONGEST = 10.0  # [s] that one update may cover
-JUMP = 5.0  # [°C]; no housing changes by more between two updates, so a sensor or other heat did
-NOISE = 0.1  # [°C] σ of the mean of c₂ over EVERY
-RATIO = 0.4  # r, assumed: typical of small motors, which vary widely
-# Assumed before anything is measured: while T_limit is held, the housing settles RISE [°C] above
-# the air.
-RISE, WINDING_TIME, HOUSING_TIME, AIR = 80.0, 30.0, 800.0, 25.0
-# Standard deviations of c₁ − c₂, c₂ [°C], log κ, log τ₁, log τ₂, c_a [°C].
-SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])  # initial
-WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])  # of the random walk, per √s
-FAR = 2.5  # [log] farthest distance of a constant from its initial estimate
+HELD = 60.0  # duration for which planned tensions must be permissible [s]
+MOMENT = 5.0  # duration for which every commanded tension must be permissible [s]
+EVERY = 1.0  # time between two updates [s]
+LONGEST = 10.0  # longest time that one update may cover [s]
+#: change of a housing's temperature between two updates that the motor cannot cause [°C]; the
+#: sensor or another source of heat has caused a larger one
+JUMP = 5.0
+NOISE = 0.1  # standard deviation of the mean of c₂ over EVERY [°C]
+RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
+# Initial estimates.
+RISE = 80.0  # temperature of the housing above the air if T_limit is held for ever [°C]
+WINDING_TIME = 30.0  # time constant τ₁ of the winding [s]
+HOUSING_TIME = 800.0  # time constant τ₂ of the housing [s]
+AIR = 25.0  # temperature c_a of the air [°C]
+# Standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C].
+SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])  # of the initial estimates
+WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])  # of the random walks, per √s
+FAR = 2.5  # largest change of the logarithm of a constant from its initial estimate
 SLOPE = 1e-4  # step of numerical derivatives
-LEARNED = 1200.0  # [s] of learning before a constant can count as known
-KNOWN = 0.2  # [log] highest σ of a known constant
+LEARNED = 1200.0  # time of learning before a constant can count as known [s]
+KNOWN = 0.2  # largest standard deviation of the logarithm of a known constant
 CHANGED = 1.5  # factor by which a known constant must change to be reported
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:
-    """Return the states (6, ...) after dt [s] at a squared tension [N²] (...)."""
+    """Return the state (6, ...) after dt [s] at a squared tension [N²] (...)."""
     inner, outer, *logs, air = state
     kappa, winding, housing = np.exp(logs)
     share = winding / (housing * RATIO)  # C₁/C₂
@@ -66,7 +70,7 @@ class Heat:
         self._known = np.zeros(count, dtype=bool)  # whether the housing temperature is measured
         #: whether the housing temperature appeared, vanished or jumped since the last update
         self._interrupted = np.zeros(count, dtype=bool)
-        self._age: Array = np.zeros(count)  # [s] of learning
+        self._age: Array = np.zeros(count)  # time of learning [s]
         self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ when first known
         self._sums: Array = np.zeros((2, count))
         self._passed, self._messages = 0.0, 0
@@ -77,7 +81,7 @@ class Heat:
 
     @property
     def core(self) -> Array:
-        """Estimated winding temperatures [°C] (M,); NaN where that of the housing is unknown."""
+        """Estimated winding temperatures [°C] (M,); NaN where the housing's is unknown."""
         return np.where(self._known, self._state[0] + self._state[1], np.nan)
 
     def accept(self, *muscles: int) -> None:

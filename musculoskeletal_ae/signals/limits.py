@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of plausible sensor values, and checks that use them.
 
-The limits include a margin beyond the extremes of five healthy arms that each explored for a
-minute, with and without an unknown payload of 3.6 kg, under the initial network of preset
-`default`. There, lengths changed by up to 0.9 mm in 10 ms, estimates left a joint's range by up to
-0.13 of it, and tensions reached 343 N.
+The limits leave a margin to the extremes of five healthy arms that each explored for a minute, with
+and without an unknown payload of 3.6 kg, under the initial network of preset `default`. Lengths
+changed by up to 0.9 mm in 10 ms, estimates exceeded a joint's range by up to 0.13 of the range, and
+tensions reached 343 N.
 """
 
 import math
@@ -21,40 +21,38 @@ from musculoskeletal_ae.robot.robot import Robot
 class Limits(NamedTuple):
     """Limits of plausible values; all parts of the package reject values beyond them."""
 
-    #: how far a joint sensor and an estimate may exceed the joint's range, as a share of it
+    #: largest excess of a joint sensor over the joint's range, as a fraction of the range
     joint_outside: float = 0.1
+    #: largest excess of an estimated angle over the joint's range, as a fraction of the range
     estimate_outside: float = 0.5
-    #: lowest and highest tension, as shares of `tension.max`
-    lowest_tension: float = -0.1
-    highest_tension: float = 1.1
-    #: lowest and highest temperature of a muscle module [°C]
-    lowest_temperature: float = -40.0
-    highest_temperature: float = 200.0
-    #: a module's temperature changes by at most `temperature_step + temperature_rate · dt` [°C],
-    #: [°C/s] since the last accepted one; the first is accepted once further ones have agreed with
-    #: it to within the step for `glitch` [s]
-    temperature_step: float = 5.0
-    temperature_rate: float = 50.0
-    #: how far a length may exceed its range within the joint limits [m], because tendons wrap, are
-    #: wound in with slack, or are attached elsewhere; a slack tendon can be wound in further
+    lowest_tension: float = -0.1  # lowest tension, as a fraction of `tension.max`
+    highest_tension: float = 1.1  # highest tension, as a fraction of `tension.max`
+    lowest_temperature: float = -40.0  # lowest temperature of a muscle module [°C]
+    highest_temperature: float = 200.0  # highest temperature of a muscle module [°C]
+    # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
+    # time dt since the last accepted one. The first temperature is accepted once further readings
+    # have agreed with it to within `temperature_step` for `glitch`.
+    temperature_step: float = 5.0  # [°C]
+    temperature_rate: float = 50.0  # [°C/s]
+    #: largest excess of a length over its range within the joint limits [m]: tendons wrap, are
+    #: wound in with slack, or are attached elsewhere than modelled
     length_margin: float = 0.1
-    slack_length_margin: float = 1.0
-    #: a tendon with less than this share of T_bias is slack
-    slack_share: float = 0.2
-    #: a length changes by at most `step + speed · dt` between two messages [m], [m/s], with dt
-    #: limited to `longest_step` [s]; a new level is accepted after it has lasted `settled` [s]
-    step: float = 0.02
-    speed: float = 1.0
-    longest_step: float = 0.05
-    settled: float = 1.0
-    #: implausible messages for longer than this are a fault instead of a glitch [s]
+    slack_length_margin: float = 1.0  # distance by which a slack tendon can be shorter still [m]
+    slack_share: float = 0.2  # tension below which a tendon is slack, as a fraction of T_bias
+    # Between two messages, a length changes by at most `step + speed · dt`, where the time dt
+    # counts up to `longest_step`. A new level is accepted after it has lasted for `settled`.
+    step: float = 0.02  # [m]
+    speed: float = 1.0  # [m/s]
+    longest_step: float = 0.05  # [s]
+    settled: float = 1.0  # [s]
+    #: time after which implausible messages are a fault instead of a glitch [s]
     glitch: float = 0.1
-    #: after a longer pause of the messages, the direction of sliding is unknown [s]
+    #: pause of the messages after which the direction of sliding is unknown [s]
     pause: float = 0.5
 
 
 LIMITS = Limits()
-POSTURES = 500  # random postures over which `length_range` searches
+POSTURES = 500  # number of random postures over which `length_range` searches
 
 TENSION = 'tension beyond the maximum'
 LENGTH = 'length beyond what the joints allow'
@@ -67,7 +65,7 @@ def length_range(robot: Robot, outside: float = 0.0) -> tuple[Array, Array]:
 
     Args:
         robot: The nominal body.
-        outside: How far joints may exceed their ranges, as a share of the range.
+        outside: How far joints may exceed their ranges, as a fraction of the range.
 
     Returns:
         Smallest and largest l [m], (M,) each.
@@ -86,17 +84,19 @@ def longest_lengths(robot: Robot) -> Array:
 
 
 def share_outside(robot: Robot, theta: Array) -> Array:
-    """Return how far each joint exceeds its range, as a share of the range, (D,)."""
+    """Return how far each joint exceeds its range, as a fraction of the range, (D,)."""
     low, high = robot.lower, robot.upper
     share: Array = np.maximum(theta - high, low - theta) / (high - low)
     return share
 
 
 def check_posture(robot: Robot, theta: Array, outside: float) -> None:
-    """Check that no joint exceeds its range by more than a share of it; NaN is ignored.
+    """Check that no joint exceeds its range by more than a fraction `outside` of the range.
+
+    Joints with NaN are ignored.
 
     Raises:
-        MessageError: If a joint does; names the joint, its angle and its limits.
+        MessageError: If a joint does; the text names the joint, its angle and its limits.
     """
     beyond = share_outside(robot, theta)
     j = int(np.nanargmax(np.append(beyond, -np.inf)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert between the messages of ros2_control and muscles.
+"""Converts between messages of ros2_control and lengths and tensions of muscles.
 
 The motors of the muscles are joints of a ros2_control hardware interface. With the direction
 s = ±1, the radius r of the spool, the position q and the effort e of a motor, a muscle has
@@ -10,7 +10,8 @@ joint_state_broadcaster publishes q and e as a JointState: in any order, mixed w
 and with NaN for interfaces that the hardware does not have. forward_command_controller takes a
 Float64MultiArray of positions, in the order of its own parameter `joints`.
 
-A motor without effort gives an unknown tension, and every temperature is unknown: NaN, never 0.
+The tension of a motor without effort is unknown, and so is every temperature. Unknown values are
+NaN, never 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +29,7 @@ STATES = 'muscle_states'
 
 
 class Layout(NamedTuple):
-    """The layout of a reading: row length, row tension, row temperature."""
+    """The layout of a reading, as in a Float64MultiArray: no named dimensions and no offset."""
 
     dim: tuple[()] = ()
     data_offset: int = 0
@@ -73,7 +74,7 @@ class MotorInterface:
             raise _refused('motor_command_topic', 'needs motor_state_topic, which is empty')
         if len(self._motors) != count:
             legal = f'a motor for each of the {count} muscles: {", ".join(muscles)}'
-            raise _refused('motor_names', f'{len(self._motors)} names, expected {legal}')
+            raise _refused('motor_names', f'got {len(self._motors)} names; expected {legal}')
         if len(set(self._motors)) < count:
             twice = max(self._motors, key=self._motors.count)
             raise _refused('motor_names', f'{twice!r} is listed twice; each muscle has one motor')
@@ -81,7 +82,8 @@ class MotorInterface:
         if sorted(order) != sorted(self._motors):
             wrong = sorted({*order} ^ {*self._motors}) or [max(order, key=order.count)]
             legal = f'each of {", ".join(self._motors)} once'
-            raise _refused('motor_command_order', f'{wrong[0]!r}; expected {legal}')
+            problem = f'{wrong[0]!r} is missing, unknown or repeated; expected {legal}'
+            raise _refused('motor_command_order', problem)
         #: muscle of each value of a command, (M,)
         self._order: Ints = np.array([self._motors.index(name) for name in order])
         each = {
@@ -90,20 +92,23 @@ class MotorInterface:
                 'spool_radius', 'motor_direction', 'motor_zero', 'tension_per_effort', 'effort_zero'
             )
         }  # fmt: skip
-        for name, legal in (('motor_direction', '1 or -1'), ('tension_per_effort', 'not 0')):
+        for name, legal in (
+            ('motor_direction', '1 or -1'),
+            ('tension_per_effort', 'a number other than 0'),
+        ):
             values = np.abs(each[name])
             fits = values == 1.0 if name == 'motor_direction' else values > 0.0
             if not fits.all():
-                raise _refused(name, f'{each[name][~fits][0]:g}; expected {legal}')
+                raise _refused(name, f'got {each[name][~fits][0]:g}; expected {legal}')
         self._length_per_position = each['motor_direction'] * each['spool_radius']
         self._zero, self._effort_zero = each['motor_zero'], each['effort_zero']
         self._tension_per_effort = each['tension_per_effort']
-        self._names: list[str] = []  # of the last message
-        self._places = np.zeros(count, dtype=int)  # of our motors among them, (M,)
+        self._names: list[str] = []  # names of the joints in the last message
+        self._places = np.zeros(count, dtype=int)  # places of the motors among these names, (M,)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last stamp, for example after a jump of the clock."""
+        """Discard the last stamp, for example after a jump of the clock."""
         self._stamps = Stamps()
 
     def reading(self, message: Any) -> Any:
@@ -122,9 +127,10 @@ class MotorInterface:
             self._places, self._names = self._find(names), names
         stamp = message.header.stamp
         if stamp.sec == 0 and stamp.nanosec == 0:
-            raise MessageError('no stamp', 'header.stamp is 0, so that old values look like new')
+            raise MessageError('no stamp', 'header.stamp is 0; old values could not be recognised')
         if not self._stamps.is_new(stamp):
-            raise MessageError('repeated stamp', f'{stamp.sec}.{stamp.nanosec:09d} s')
+            detail = f'{stamp.sec}.{stamp.nanosec:09d} s is not later than the last stamp'
+            raise MessageError('repeated stamp', detail)
         position = np.array(message.position, dtype=float)[self._places]
         rows = np.full((3, len(position)), np.nan)
         with np.errstate(over='ignore'):  # values that large are rejected as not finite
@@ -151,7 +157,7 @@ class MotorInterface:
         return take
 
     def joint_values(self, length: Array, tension: Array) -> tuple[tuple[str, ...], Array, Array]:
-        """Return motors, positions and efforts of muscles with l [m] and T [N], (M,) each."""
+        """Return the motors' names, positions and efforts for l [m] and T [N], (M,) each."""
         effort = tension / self._tension_per_effort + self._effort_zero
         return tuple(self._motors), self._position(length), effort
 
@@ -164,10 +170,11 @@ class MotorInterface:
         places = {name: place for place, name in enumerate(names)}
         if missing := [motor for motor in self._motors if motor not in places]:
             there = ', '.join(names[:20])
-            raise MessageError('missing motor', f'{", ".join(missing)}; the message has {there}')
+            detail = f'{", ".join(missing)}; the message contains {there}'
+            raise MessageError('missing motor', detail)
         for motor in self._motors:
             if names.count(motor) > 1:
-                raise MessageError('duplicate motor', repr(motor))
+                raise MessageError('duplicate motor', f'{motor!r} is in the message more than once')
         return np.array([places[motor] for motor in self._motors])
 
 
@@ -178,6 +185,6 @@ def _refused(name: str, problem: str) -> MusculoskeletalError:
 def _each(name: str, values: Sequence[float], count: int) -> Array:
     """Return one value for each muscle, (M,)."""
     if len(values) not in (1, count):
-        raise _refused(name, f'{len(values)} values; expected 1 or {count}, one for each muscle')
+        raise _refused(name, f'got {len(values)} values; expected 1, or {count} for all muscles')
     each: Array = np.full(count, values[0]) if len(values) == 1 else np.array(values)
     return each

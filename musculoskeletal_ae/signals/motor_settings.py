@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 from musculoskeletal_ae.parameters import Parameter
 
-ARRAY, JOINT_STATE = 'std_msgs/msg/Float64MultiArray', 'sensor_msgs/msg/JointState'
+ARRAY = 'std_msgs/msg/Float64MultiArray'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
 
-_EACH = 'one for all or one each'
+_EACH = 'one for all muscles or one for each'
 
 
 @dataclass(frozen=True)
@@ -22,13 +23,14 @@ class MotorSettings:
     motor_command_topic: str = Parameter(
         '',
         'topic of commands to the motors, to which forward_command_controller subscribes (empty: '
-        'none, only muscle_length_command)',
+        'only muscle_length_command is published)',
     ).field()
     motor_names: tuple[str, ...] = Parameter(
-        ('',), 'joint that is the motor of each muscle ([""]: named like the muscle)'
+        ('',), 'joint that is the motor of each muscle ([""]: the names of the muscles)'
     ).field()
     motor_command_order: tuple[str, ...] = Parameter(
-        ('',), 'motors in the order of the command controller\'s `joints` ([""]: as motor_names)'
+        ('',),
+        'motors in the order of the command controller\'s `joints` ([""]: order of motor_names)',
     ).field()
     spool_radius: tuple[float, ...] = Parameter(
         (1.0,),

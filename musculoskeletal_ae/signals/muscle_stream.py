@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert raw `muscle_states` messages to checked samples.
+"""Converts raw `muscle_states` messages to checked samples.
 
     message ─► shape, finite ─► plausible level ─► plausible step ─► median ─► length offset
             ─► tendon friction, plausible temperature ─► MuscleSample
 
 A message that fails a check raises a `RejectionError`, which names the reason, the value and the
-legal range. Nodes, bags and experiments all use this class; `signals/limits.py` has the limits.
+legal range. Nodes, bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits.
 Values of isolated muscles are not checked.
 """
 
@@ -40,7 +40,7 @@ class RejectionError(MessageError):
     """A message is rejected.
 
     Attributes:
-        reason: Short text under which it is counted.
+        reason: Short text under which the message is counted.
         states: The raw l, T and temperature, (3, M); None if the message had another shape.
     """
 
@@ -59,12 +59,12 @@ class MuscleSample:
         length_read: l as the sensor measured it [m].
         motor_tension: Motor-side tension T [N]; NaN where it is not known.
         bone_tension: Bone-side tension T_end, with tendon friction removed [N]. Where tension is
-            not known, it is the one that models assume (`Robot.assumed_tension`).
-        sliding: Direction in which each tendon slid last: 1 wound in, −1 paid out.
+            not known, it is the tension that models assume (`Robot.assumed_tension`).
+        sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.
         temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
         usable: Which muscles are not isolated.
         newest: l (offset removed), T and temperature of the last message alone, without the median
-            against glitches, (3, M).
+            filter, (3, M).
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
     """
 
@@ -130,7 +130,7 @@ class LevelCheck:
         place = quantity, muscle
         value, least, most = distinct(states[place], low[place], self._high[place])
         legal = f'{least} to {most} {unit}'
-        return reason, f'{self._robot.muscles[muscle]} {value} {unit}, possible {legal}'
+        return reason, f'{self._robot.muscles[muscle]} {value} {unit}, legal: {legal}'
 
 
 class StepCheck:
@@ -142,7 +142,8 @@ class StepCheck:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._accepted: Array | None = None  # the last accepted lengths [m], (M,)
-        self._last: Array = np.zeros(robot.muscle_count)  # the last lengths, accepted or not
+        #: the last lengths, accepted or not [m], (M,)
+        self._last: Array = np.zeros(robot.muscle_count)
         self._last_at, self._settled_since = -math.inf, math.inf
         self._far: Bools = np.zeros(robot.muscle_count, dtype=bool)  # which lengths jumped
         self._after_pause = False  # whether they jumped during a pause of the messages
@@ -152,7 +153,7 @@ class StepCheck:
     def problem(self, length: Array, used: Bools, now: float) -> tuple[str, str] | None:
         """Return reason and detail if a length jumped, or None.
 
-        With the message that makes a new level accepted, `jumped` contains its muscles.
+        When a new level is accepted, `jumped` contains the muscles that have jumped to it.
         """
         self.jumped = ()
         pause = max(now - self._last_at, 0.0)
@@ -174,7 +175,8 @@ class StepCheck:
             self._settled_since = now
         self._settled_since = min(self._settled_since, now)
         if now - self._settled_since > LIMITS.settled:
-            # Some lengths may have returned meanwhile, and others may have moved as far.
+            # Some lengths may have returned meanwhile, and others may have changed as much by
+            # moving.
             self.jumped = tuple(np.flatnonzero(self._far & (change > allowed)).tolist())
             self.jumped_in_pause = self._after_pause
             self._accept(length)
@@ -196,13 +198,14 @@ class TemperatureCheck:
 
     def __init__(self, muscle_count: int) -> None:
         self._believed: Array = np.full(muscle_count, math.nan)  # last accepted [°C], (M,)
-        self._age: Array = np.zeros(muscle_count)  # of the last accepted temperature [s]
+        self._age: Array = np.zeros(muscle_count)  # age of the last accepted temperature [s]
         self._first: Array = self._believed.copy()  # candidate for the first temperature [°C]
-        self._first_age: Array = np.zeros(muscle_count)  # how long readings have agreed with it [s]
+        #: time for which readings have agreed with it [s]
+        self._first_age: Array = np.zeros(muscle_count)
         self._last_at = math.nan
 
     def step(self, read: Array, now: float) -> Array:
-        """Return the accepted temperatures [°C] (M,) after readings at `now` [s]; NaN: unknown."""
+        """Return the accepted temperatures [°C] (M,), or NaN, after readings at `now` [s]."""
         elapsed = max(now - self._last_at, 0.0) if math.isfinite(self._last_at) else 0.0
         self._last_at = now
         possible = (read >= LIMITS.lowest_temperature) & (read <= LIMITS.highest_temperature)
@@ -230,24 +233,26 @@ class MuscleStream:
         body: Length offsets and isolated muscles.
         displaced: Muscles whose lengths have jumped to another level since their last length
             calibration. Their lengths are not reliable.
-        jumps: How often lengths have jumped to another level.
+        jumps: Number of times that lengths have jumped to another level.
         has_displaced_unseen: Whether the last jump was during a pause of the messages, in which
             the arm may have moved.
     """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
-        """Expect messages of a robot.
+        """Start without messages.
 
         Args:
             robot: The nominal body.
-            body: Length offsets and isolated muscles; None: offsets of 0, no isolated muscle.
-            window: Number of messages in the median against glitches; 1: no median.
+            body: Length offsets and isolated muscles; by default, offsets of 0 and no isolated
+                muscle.
+            window: Number of messages in the median filter against outliers; 1 for no filter.
         """
         self._robot = robot
         self.body = body or BodyState.healthy(robot.muscle_count)
         self._friction: Array | float = 0.0
         self._levels = LevelCheck(robot)
-        self._readings: deque[Array] = deque(maxlen=window)  # (3, M) each, l as measured
+        #: the last messages as measured, (3, M) each
+        self._readings: deque[Array] = deque(maxlen=window)
         self._implausible = Persistence()
         self.displaced: frozenset[int] = frozenset()
         self.has_displaced_unseen = False
@@ -256,14 +261,14 @@ class MuscleStream:
         self.reset()
 
     def reset(self) -> None:
-        """Forget earlier messages, for example after a jump of the clock."""
+        """Discard earlier messages, for example after a jump of the clock."""
         self._steps = StepCheck(self._robot)
         self._direction = FrictionDirection()
         self._readings.clear()
         self._time = math.inf
 
     def use_friction(self, friction: Array | float) -> None:
-        """Set the tendon friction μ, (M,), to remove from now on."""
+        """Remove tendon friction with the coefficients μ, (M,), from now on."""
         self._friction = friction
 
     def use_body(self, body: BodyState) -> None:
@@ -285,7 +290,7 @@ class MuscleStream:
         Args:
             message: The message.
             time: Time of reception by the caller's clock [s].
-            now: The same by a steady clock [s]; None: `time` is steady.
+            now: Time of reception by a steady clock [s]; None if `time` is of a steady clock.
 
         Raises:
             RejectionError: If the message is invalid or implausible.
@@ -308,7 +313,7 @@ class MuscleStream:
     def take_states(self, states: Array, time: float, now: float | None = None) -> MuscleSample:
         """Check and convert values as measured: l [m], T [N] and temperature [°C], (3, M).
 
-        Times are those of `take`.
+        `take` describes the times.
 
         Raises:
             RejectionError: If they are implausible.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pair each (T, l) with the θ nearest in time, within half a period.
+"""Pairs each (T, l) with the θ nearest in time, within half a period of the muscle messages.
 
 A θ between two messages of the muscle modules belongs to the nearer one, or to the earlier one if
 both are equally near. Hence no θ is used twice. The rule applies to each joint separately, because
@@ -25,7 +25,7 @@ class Paired(Generic[Message]):
     Attributes:
         time: Time of reception of the message [s].
         message: The message as the caller passed it.
-        dt: Time since the message before [s]; 0 for the first.
+        dt: Time since the previous message [s]; 0 for the first.
         theta: θ [rad], (D,), NaN for joints without a matching value; None if no joint has one.
     """
 
@@ -39,21 +39,21 @@ class Pairing(Generic[Message]):
     """Pairs two streams; returns each muscle message when the next one has arrived."""
 
     def __init__(self, period: float) -> None:
-        """Pair values within half a `period` [s], that of the muscle messages."""
+        """Start; `period` is the period of the muscle messages [s]."""
         self._half = 0.5 * period + 1e-9
         self.reset()
 
     def reset(self) -> None:
-        """Forget all messages, for example after a backward jump of the clock."""
+        """Discard all messages, for example after a backward jump of the clock."""
         # For each joint, time [s] and θ (2, D) of the last value before the pending muscle message,
-        # of the first one after it, and of the latest one; NaN: none.
+        # of the first one after it, and of the latest one; NaN if there is none.
         self._last = self._next = self._latest = np.full((2, 1), np.nan)
         self._came = -math.inf
         self._pending: tuple[float, Message] | None = None
         self._before: float | None = None
 
     def joints(self, time: float, theta: Array) -> None:
-        """Take a θ [rad] (D,) received at `time` [s]; NaN for joints that are not included."""
+        """Record θ [rad] (D,) received at `time` [s]; NaN for joints that are not included."""
         if time < self._came:
             self.reset()
         self._came = time
@@ -62,7 +62,7 @@ class Pairing(Generic[Message]):
         self._next = np.where(np.isnan(self._next), new, self._next)
 
     def muscles(self, time: float, message: Message | None) -> Paired[Message] | None:
-        """Take a message received at `time` [s]; return the message before, paired.
+        """Record a message received at `time` [s], and return the previous message with its θ.
 
         At the end of a recording, pass None at time ∞ to get the last message.
         """

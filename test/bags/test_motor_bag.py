@@ -89,7 +89,9 @@ def test_a_robot_without_joint_sensors_is_read_and_what_was_not_used_is_counted(
 def test_what_is_recorded_of_another_robot_is_refused_with_the_motors_that_are_missing(tmp_path):
     recording(tmp_path / 'bag')
     other = MotorSettings(motor_state_topic='/joint_states')
-    with pytest.raises(BagError, match=r'missing motor: deltoid_anterior, .* the message has '):
+    with pytest.raises(
+        BagError, match=r'missing motor: deltoid_anterior, .* the message contains '
+    ):
         read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=other)
     with pytest.raises(BagError, match='/states of the parameter motor_state_topic is not in the'):
         interface_topics(Bag.open(tmp_path / 'bag'), motors=settings('/states'))

@@ -196,7 +196,7 @@ def test_methods_that_command_tensions_are_refused(graph):
 @pytest.mark.parametrize(
     ('changes', 'problem'),
     [
-        ({'motor_names': MOTORS[:5]}, '5 names, expected a motor for each of the 6 muscles'),
+        ({'motor_names': MOTORS[:5]}, '5 names; expected a motor for each of the 6 muscles'),
         (
             {'motor_state_topic': 'joint states'},
             r"motor_state_topic: 'joint states': .*must not",

@@ -100,7 +100,7 @@ def test_the_winding_temperature_is_estimated_after_twenty_minutes(seed):
     assert last.mean() < 4.0
     assert last.mean() < first.mean()
     through = motors.arm.winding - motors.arm._muscle.housing
-    assert last.mean() < 0.5 * through.mean()  # error of the housing's temperature
+    assert last.mean() < 0.5 * through.mean()  # mean errors of the housing's temperature
     assert motors.heat.changed == {}
 
 
@@ -114,7 +114,7 @@ def test_a_muscle_held_at_its_limit_reaches_the_highest_temperature_and_no_more(
     assert (motors.heat.core <= HIGHEST + 0.5).all()
     assert (motors.heat.core > HIGHEST - 10.0)[hot].all()
     assert (motors.arm.winding < HIGHEST + held[-1] + 0.5).all()
-    # Another muscle takes over meanwhile, and later the limit rises again.
+    # While the muscle rests at T_bias, its motor cools, and the limit rises again.
     motors.run(300, TENSION.bias)
     assert (motors.heat.limits(HIGHEST)[0] > limit)[hot].all()
 
@@ -205,6 +205,6 @@ def test_an_intermittent_thermometer_does_not_disturb_the_other_muscles():
     np.testing.assert_allclose(flaky.heat.core[others], sound.heat.core[others], atol=0.1)
     for known, observed in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
         np.testing.assert_allclose(observed[others], known[others], atol=0.5)
-    # The estimate of its own winding continues to warm up.
+    # The estimated temperature of this muscle's winding continues to rise.
     flaky.heat.step(TENSION.limit, read[0] + 24.0, 0.25)
     assert flaky.heat.core[1] > AIR + 40.0

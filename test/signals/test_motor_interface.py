@@ -101,7 +101,7 @@ def test_a_repeated_message_is_rejected_by_its_stamp_until_the_clock_is_set_back
     interface.reading(joint_state(stamp=5))
     assert refused(joint_state(stamp=5), interface) == 'repeated stamp'
     interface.reading(joint_state(stamp=6))
-    interface.reading(joint_state(stamp=2))  # another clock
+    interface.reading(joint_state(stamp=2))  # the clock has jumped back
     interface.reset()
     interface.reading(joint_state(stamp=2))
 
@@ -192,14 +192,20 @@ def test_an_emulated_arm_reads_what_is_commanded_and_publishes_what_is_read(
 @pytest.mark.parametrize(
     ('changes', 'problem'),
     [
-        ({'motor_names': ('m0',)}, 'motor_names: 1 names, expected a motor for each of the 3'),
+        ({'motor_names': ('m0',)}, 'motor_names: got 1 names; expected a motor for each of the 3'),
         ({'motor_names': ('m0', 'm0', 'm1')}, "'m0' is listed twice"),
-        ({'motor_command_order': ('m0', 'm1')}, "motor_command_order: 'm2'; expected each of m0"),
+        (
+            {'motor_command_order': ('m0', 'm1')},
+            "motor_command_order: 'm2' is missing, unknown or repeated; expected each of m0",
+        ),
         ({'motor_command_order': ('m0', 'm1', 'x')}, 'motor_command_order: '),
         ({'motor_command_order': (*MOTORS, 'm0')}, "motor_command_order: 'm0'"),
-        ({'spool_radius': (0.01, 0.02)}, 'spool_radius: 2 values; expected 1 or 3'),
-        ({'motor_direction': (0.5,)}, 'motor_direction: 0.5; expected 1 or -1'),
-        ({'tension_per_effort': (1.0, 0.0, 1.0)}, 'tension_per_effort: 0; expected not 0'),
+        ({'spool_radius': (0.01, 0.02)}, 'spool_radius: got 2 values; expected 1, or 3'),
+        ({'motor_direction': (0.5,)}, 'motor_direction: got 0.5; expected 1 or -1'),
+        (
+            {'tension_per_effort': (1.0, 0.0, 1.0)},
+            'tension_per_effort: got 0; expected a number other than 0',
+        ),
         ({'motor_state_topic': ''}, 'motor_command_topic: needs motor_state_topic'),
     ],
 )

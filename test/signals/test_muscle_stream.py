@@ -17,7 +17,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 ROBOT = Robot.load('arm26')
 M = ROBOT.muscle_count
 HEALTHY = BodyState.healthy(M)
-PERIOD = 0.01  # [s]
+PERIOD = 0.01  # period of the messages [s]
 
 
 def message(states):
