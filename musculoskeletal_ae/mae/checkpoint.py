@@ -32,17 +32,19 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
 FORMAT_VERSION = 1
-MAX_BYTES = 64 * 1024 * 1024  # a hundred times the networks of the shipped arms
-MAX_HEADER_BYTES = 1024 * 1024
-# No trained network has values beyond these limits. Larger ones could overflow when `Mae` folds
+#: largest size of a checkpoint [bytes]; the networks of the shipped arms have a hundredth of it
+MAX_BYTES = 64 * 1024 * 1024
+MAX_HEADER_BYTES = 1024 * 1024  # largest size of a checkpoint's header [bytes]
+# No trained network has values beyond the following limits. They could overflow when `Mae` folds
 # units and standardisation into the layers.
-LARGEST = 1e9
-SMALLEST_STD = 1e-9
-LARGEST_FRICTION = 5.0  # μ; a factor of 150 between the tensions at the ends of a tendon
-SMALLEST_EIGENVALUE = 1e-12  # of a covariance, relative to the largest eigenvalue
-INDEFINITE = -1e-6  # smallest eigenvalue of the springs, relative to the largest
-#: limits of a trained network's estimate of a rest posture: θ [rad], T [N], l [m], G [m/rad]
-ABSURD = (100.0, 1e5, 100.0, 1e5)
+LARGEST = 1e9  # largest absolute value of any number
+SMALLEST_STD = 1e-9  # smallest standard deviation
+LARGEST_FRICTION = 5.0  # largest μ; the tensions at the ends of a tendon then differ 150-fold
+SMALLEST_EIGENVALUE = 1e-12  # smallest eigenvalue of a covariance, relative to the largest one
+#: smallest eigenvalue of the springs' stiffness, relative to the largest one; negative by rounding
+SMALLEST_SPRING_EIGENVALUE = -1e-6
+#: largest absolute values in the estimate of the middle posture: θ [rad], T [N], l [m], G [m/rad]
+LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
@@ -175,7 +177,7 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
     Args:
         data: The bytes.
         robot: If present, the network must have its joints and muscles in the same order, and
-            must estimate a rest posture with sensible values.
+            its estimate of the middle posture must be within LARGEST_ESTIMATES.
         source: Name of the checkpoint in error messages.
 
     Raises:
@@ -204,7 +206,7 @@ class _Header(msgspec.Struct, frozen=True):
 def _metadata(data: bytes) -> Metadata:
     """Return the metadata of safetensors bytes."""
     if len(data) > MAX_BYTES:
-        raise CheckpointError(f'{len(data)} bytes; at most {MAX_BYTES} are legal')
+        raise CheckpointError(f'{len(data)} bytes; legal: at most {MAX_BYTES}')
     size = int.from_bytes(data[:8], 'little')
     if not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
         raise CheckpointError(
@@ -284,10 +286,10 @@ def _check_elasticity(stiffness: Array, damping: Array) -> None:
     if not np.array_equal(stiffness, stiffness.T):
         raise CheckpointError('tensor elasticity.stiffness is not symmetric')
     least, most = np.linalg.eigvalsh(stiffness)[[0, -1]]
-    if least < INDEFINITE * most or damping.min() < 0.0:
+    if least < SMALLEST_SPRING_EIGENVALUE * most or damping.min() < 0.0:
         problem = f'eigenvalues from {least:g} to {most:g} and dampers from {damping.min():g}'
         raise CheckpointError(
-            f'tensors elasticity have {problem}; none may be below 0, as springs only store energy'
+            f'tensors elasticity have {problem}; legal: 0 or more, as springs only store energy'
         )
 
 
@@ -328,7 +330,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
 
 
 def _check_fit(mae: Mae, robot: Robot) -> None:
-    """Check that the names fit, and that the estimate of the middle posture is sensible."""
+    """Check that the names fit, and that the estimate of the middle posture is plausible."""
     for kind in ('joints', 'muscles'):
         network_names, robot_names = getattr(mae, kind), getattr(robot, kind)
         if network_names != robot_names:
@@ -341,8 +343,13 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
     with np.errstate(all='ignore'):
         state = mae.estimate(tension, robot.muscle_lengths(theta, tension))
         answers = (*state, mae.muscle_jacobian(theta, tension))
-        if not all(np.abs(part).max() <= most for part, most in zip(answers, ABSURD, strict=True)):
-            raise CheckpointError('estimates of a rest posture are not finite or far out of range')
+        if not all(
+            np.abs(part).max() <= most
+            for part, most in zip(answers, LARGEST_ESTIMATES, strict=True)
+        ):
+            limits = '±{:g} rad, ±{:g} N, ±{:g} m or ±{:g} m/rad'.format(*LARGEST_ESTIMATES)
+            problem = f'the estimate of the middle posture is not finite or beyond {limits}'
+            raise CheckpointError(problem)
 
 
 def save(mae: Mae, path: str | Path) -> None:

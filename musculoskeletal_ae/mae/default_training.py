@@ -8,12 +8,13 @@ the muscle Jacobian ∂l/∂θ through ①, which control needs. Its error is th
 between each sample and a close neighbour, its twin. Every sample passes through all three masks.
 Muon updates the matrices, with a step size that rises and then falls to zero.
 
-Layers, steps and batch are those of an arm with 5 joints and 10 muscles. A body of several groups
+LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. A body of several groups
 that share no joint or muscle gets a block of the network for each group. The layers of a larger
-group grow in proportion to its D + M. If they grew by the square root, the error of θ would rise
-from 0.0030 to 0.0045 rad per joint at 17 × 40. The mini-batches of initial training grow with
-D + M of the largest group to the power of 1.5. With this, ② is a tenth better at 17 × 40 than at
-5 × 10; in proportion, it would be worse.
+group grow in proportion to its D + M. If they grew by the square root, the error of θ of a
+body with 17 joints and 40 muscles would be 0.0045 instead of 0.0030 rad per joint. The mini-batches
+of initial training grow with D + M of the largest group to the power of 1.5. With this power, ② is
+a tenth better for that body than for the arm with 5 joints; if they grew in proportion to D + M, ②
+would be worse.
 """
 
 import math
@@ -39,17 +40,19 @@ from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 
 LAYERS = Layers((200, 100), 'silu')
-STEPS, BATCH, SAMPLES = 3000, 128, 200_000
-STEP_SIZE = 0.004  # of the biases; `optimiser` derives that of the matrices
-REFERENCE = 5 + 10  # D + M of the arm that these numbers are for
-# Muscles counted per joint; further muscles add equations, but no unknowns.
+STEPS = 3000  # number of mini-batches
+BATCH = 128  # number of samples of a mini-batch
+SAMPLES = 200_000  # largest number of different samples
+STEP_SIZE = 0.004  # step size of the biases; `optimiser` derives the step size of the matrices
+REFERENCE = 5 + 10  # D + M of the arm to which LAYERS and STEPS apply
+# Largest number of muscles per joint that count. Further muscles add equations, but no unknowns.
 COUNTED_MUSCLES = 2.5
 
-# Share of samples with tensions beyond tension.limit. A payload causes such tensions, and an
+# Fraction of samples with tensions beyond tension.limit. A payload causes such tensions, and an
 # estimator trained on a few of them degrades gracefully.
 OVERLOAD_SHARE = 0.2
-# Samples of θ exceed each joint limit by up to this share of the range. A network is least accurate
-# at the edge of its training data, and arms do rest at their limits.
+# Samples of θ exceed each joint limit by up to this fraction of the range. A network is least
+# accurate at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
 # Distance of twins in standard deviations of θ: small compared with the curvature of a route, but
 # large enough for float32 to resolve the difference.
@@ -57,7 +60,7 @@ TWIN_DISTANCE = 0.1
 # Lower limit of the standard deviation in scaled units. Standardisation would otherwise amplify a
 # joint or muscle that hardly varies.
 LEAST_SPREAD = 1e-4
-RISE = 0.05  # share of the training during which the step size rises
+RISE = 0.05  # fraction of the training during which the step size rises
 
 # -- size --------------------------------------------------------------------------------------
 
@@ -68,7 +71,7 @@ def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
     Args:
         number: The number for the reference arm, D + M = REFERENCE.
         groups: The groups of joints and muscles.
-        power: The number grows with D + M to this power.
+        power: Power of D + M with which the number grows.
     """
     times = max(1.0, max(map(size, groups)) / REFERENCE)
     return round(number * times**power)

@@ -49,14 +49,14 @@ from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 Layer = tuple[Array, Array]
 
 # Constants of the estimate with isolated muscles.
-NEWTON_STEPS = 10  # at most
-SETTLED = 1e-4  # [rad]; iteration ends with a smaller step
-LENGTH_NOISE = 0.0003  # [m] σ added to that of the healthy length residuals
-LENGTH_SPREAD = 0.003  # [m] σ of a length if there are no anomaly statistics
+NEWTON_STEPS = 10  # largest number of Newton steps
+SETTLED = 1e-4  # step below which the iteration ends [rad]
+LENGTH_NOISE = 0.0003  # standard deviation that is added to the healthy length residuals [m]
+LENGTH_SPREAD = 0.003  # standard deviation of a length without anomaly statistics [m]
 
 
 class BlockDiagonal:
-    """A weight (in, out) of blocks, each with its own inputs and outputs."""
+    """A weight (in, out) that consists of blocks, each with its own inputs and outputs."""
 
     __array_ufunc__ = None  # lets numpy use __rmatmul__ for x @ weight
 
@@ -65,8 +65,8 @@ class BlockDiagonal:
 
         Args:
             blocks: Weights of the blocks, each (in, out).
-            into: x[..., into] are the inputs of all blocks, in order; None: x is in this order.
-            out: y[..., out] of the blocks' outputs y are the outputs; None: keep their order.
+            into: x[..., into] are the inputs of all blocks, in order; None if x is in this order.
+            out: y[..., out] of the blocks' outputs y are the outputs; None to keep their order.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
@@ -91,8 +91,8 @@ class BlockDiagonal:
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
     """Return x @ weight, shape (..., out), for x (..., in).
 
-    Uses the method `dot` where possible: the operator's overhead is 0.4 µs higher, as long as the
-    product of a layer with one row takes.
+    Uses the method `dot` where possible, because the overhead of the operator @ is 0.4 µs higher.
+    This is as long as the product of a layer with one row takes.
     """
     if x.ndim > 2 or isinstance(weight, BlockDiagonal):
         return x @ weight
@@ -265,11 +265,14 @@ class Mae:
     std: Array  # standard deviation of scaled (θ, T, l) in standardisation, (D+2M,)
     version: int = 0  # rises with every checkpoint that the learner publishes
     training: str = ''  # description of the training, for people
-    anomaly: AnomalyStatistics | None = None  # residuals on healthy data
-    touch: TouchStatistics | None = None  # friction and healthy torques; None: not yet learned
-    covariance: Array | None = None  # of θ_est − θ [rad²] (D, D); None: not yet learned
-    elasticity: JointElasticity | None = None  # springs of the joints; None: not learned
-    groups: tuple[Group, ...] = ()  # each has a block of the network; empty: one block for all
+    anomaly: AnomalyStatistics | None = None  # statistics of the residuals on healthy data
+    #: tendon friction, and residual torques of the healthy arm; None if not yet learned
+    touch: TouchStatistics | None = None
+    #: covariance of θ_est − θ [rad²], (D, D); None if not yet learned
+    covariance: Array | None = None
+    elasticity: JointElasticity | None = None  # springs of the joints; None if not learned
+    #: groups of joints and muscles, each with a block of the network; () for one block
+    groups: tuple[Group, ...] = ()
     isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
@@ -472,7 +475,7 @@ class Mae:
 
     def _lengths_and_jacobian(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         x = np.concatenate((theta, tension), axis=-1)
-        # One direction serves one joint of every group, because groups do not affect each other.
+        # One direction moves one joint of every group, because groups do not affect each other.
         directions = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
         for group in self.groups:
             directions[np.arange(len(group.joints)), group.joints] = 1.0

@@ -56,9 +56,10 @@ class Blocks(nn.Module):
 
 
 class Network(nn.Module):
-    """D joints, M muscles: layers (D+2M+3, *hidden, D+M, *reversed hidden, D+2M).
+    """The network of D joints and M muscles.
 
-    With several groups, each has such a block with its own D, M and hidden layers.
+    Its layers have D+2M+3, *hidden, D+M, *reversed hidden and D+2M units. With several groups, each
+    group has such a block with its own D, M and hidden layers.
     """
 
     mean: Tensor
@@ -77,12 +78,13 @@ class Network(nn.Module):
         """Initialise the weights with torch's random generator.
 
         Args:
-            joints: D.
-            muscles: M.
+            joints: Number of joints D.
+            muscles: Number of muscles M.
             layers: Activation, and hidden layers of a network with one block.
             mean: Mean of scaled (θ, T, l) in standardisation, (D+2M,).
             std: Standard deviation of scaled (θ, T, l) in standardisation, (D+2M,).
-            blocks: Hidden layers of the block of each group, which replace those of `layers`.
+            blocks: Hidden layers of the block of each group; by default, one block with the hidden
+                layers of `layers`.
         """
         super().__init__()
         self.joints, self.muscles, self.activation = joints, muscles, layers.activation

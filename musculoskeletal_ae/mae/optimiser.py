@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
-MOMENTUM = 0.95
+MOMENTUM = 0.95  # decay of Muon's momentum per step
 # Newton–Schulz polynomials; applied in turn, they bring every singular value close to 1.
 POLYNOMIALS = (
     (4.0848, -6.8946, 2.9270),

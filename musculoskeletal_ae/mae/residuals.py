@@ -18,17 +18,17 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
-# Lowest standard deviation in scaled units, below any sensor's resolution (0.02 N, 0.01 mm). Keeps
-# the covariance invertible when a network restores some combination of its inputs perfectly.
+# Lowest standard deviation in scaled units, below any sensor's resolution (0.02 N, 0.01 mm). It
+# keeps the covariance invertible if a network restores some combination of its inputs perfectly.
 FLOOR = 1e-4
 ANYTHING = 10.0  # standard deviation of a residual that is ignored, in scaled units
-LEAST_MOTION = 60.0  # [s] of motion that calibrated touch statistics need
+LEAST_MOTION = 60.0  # duration of motion that calibrated touch statistics require [s]
 
 
 def residuals(
     restored: State, tension: Array, length: Array, isolated: Sequence[int] = ()
 ) -> Array:
-    """Return the residuals e in scaled units, (..., 2M); those of isolated muscles are 0.
+    """Return the residuals e in scaled units, (..., 2M), which are 0 for isolated muscles.
 
     Args:
         restored: States that the network restored from the measured ones.
@@ -54,11 +54,12 @@ def anomaly(error: Array) -> Array:
 class AnomalyStatistics:
     """Mean and covariance of e over healthy data."""
 
-    mean: Array  # (2M,)
-    covariance: Array  # symmetric positive definite, (2M, 2M)
+    mean: Array  # mean μ of e, (2M,)
+    covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
     calibrated: bool  # whether measured on the real arm instead of the geometric model
     samples: int  # number of samples
-    thresholds: Mapping[str, float] = field(default_factory=dict)  # of a detector, by name; finite
+    #: of the detectors, by name; finite
+    thresholds: Mapping[str, float] = field(default_factory=dict)
     #: θ [rad] (K, D) of healthy postures far apart from each other; K may be 0
     postures: Array = field(default_factory=lambda: np.empty((0, 0)))
 
@@ -100,7 +101,7 @@ class TouchStatistics:
 
     friction: Array  # tendon friction μ of each muscle, (M,): T = T_end e^{±μ}
     spread: Array  # root mean square of τ_ext of the healthy moving arm [N·m], (D,); positive
-    time: float = 0.0  # duration of the motion behind `spread` [s]
+    time: float = 0.0  # duration of the motion in which `spread` was measured [s]
 
     @property
     def calibrated(self) -> bool:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Initial training of the Musculoskeletal AutoEncoder on the geometric model of a robot.
 
-Each preset has its own training; `default_training.py` has that of preset `default`. This module
-has the parts that all presets share: random states of the geometric model, mini-batches, the choice
-of the torch device, the resulting checkpoint, and the errors on held-out states.
+Each preset has its own training; `default_training.py` contains the training of preset `default`.
+This module contains the parts that all presets share: random states of the geometric model,
+mini-batches, the choice of the torch device, the resulting checkpoint, and the errors on held-out
+states.
 """
 
 from collections.abc import Callable, Iterator
@@ -47,8 +48,8 @@ def random_states(
         count: Number of states N.
         rng: Draws the states.
         highest: Upper end of the uniform distribution of T_r [N]; a number, (M,) or (N, M).
-        lowest: Lower end of the uniform distribution of T_r [N], likewise.
-        margin: How far θ_r may exceed each joint limit, as a share of the range.
+        lowest: Lower end of the uniform distribution of T_r [N]; a number, (M,) or (N, M).
+        margin: How far θ_r may exceed each joint limit, as a fraction of the range.
     """
     theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(lowest, highest, (count, robot.muscle_count))
@@ -105,7 +106,7 @@ class TrainedNetwork(NamedTuple):
     """Result of a preset's initial training."""
 
     network: Network
-    losses: list[float]  # of every mini-batch
+    losses: list[float]  # loss of every mini-batch
     by: str  # size of the mini-batches and name of the optimiser, for people
 
 
@@ -113,7 +114,7 @@ class Trained(NamedTuple):
     """Result of `initial_mae`."""
 
     mae: Mae  # ready for a checkpoint
-    losses: list[float]  # of every mini-batch
+    losses: list[float]  # loss of every mini-batch
 
 
 def initial_mae(
@@ -123,14 +124,14 @@ def initial_mae(
     progress: Progress | None = None,
     steps: int | None = None,
 ) -> Trained:
-    """Train a network on the geometric model and add anomaly statistics, not calibrated.
+    """Train a network on the geometric model, and add anomaly statistics of the model.
 
     Args:
         robot: The geometric model.
         preset: Name of the preset.
         seed: Random seed; on the same machine, the same seed gives the same network.
         progress: Called after every mini-batch.
-        steps: Number of mini-batches; None: that of the preset.
+        steps: Number of mini-batches; None for the preset's number.
     """
     chosen = preset_named(preset)
     steps = chosen.initial_steps(robot.groups) if steps is None else steps
@@ -139,7 +140,7 @@ def initial_mae(
 
 
 def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
-    """Add history and anomaly statistics, not calibrated, to a trained network.
+    """Add the history and anomaly statistics of the geometric model to a trained network.
 
     Args:
         robot: The geometric model.
@@ -163,7 +164,7 @@ def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> 
 
 # -- errors ------------------------------------------------------------------------------------
 
-#: outputs with the unit of their errors and its factor from SI
+#: each output with the unit of its errors and the factor from SI to this unit
 OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
@@ -172,7 +173,7 @@ class PairError(NamedTuple):
 
     mask: Mask
     output: str  # 'theta', 'tension' or 'length'
-    unit: str  # of `norm` and `elements`
+    unit: str  # unit of `norm` and `elements`
     norm: float  # mean over samples of the L2 norm
     elements: Array  # mean absolute error of each joint or muscle, (D,) or (M,)
 

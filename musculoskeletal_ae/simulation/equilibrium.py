@@ -12,13 +12,13 @@ surface z = ①(θ, T) of the latent space, they are D+M equations for D+M unkno
 the rest posture. (Solving for z itself, with decoded θ and T, gives a root no closer to that of the
 body, and each step costs more.)
 
-The arm approaches the root through a viscous medium B by linearly implicit Euler steps. These are
-Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and geared
-muscle modules, and so makes speeds realistic; it is larger where muscles have larger moment arms,
-and includes the dampers of the joints. B does not affect the rest posture. K and b are those of the
-joints' springs (`JointElasticity`), as far as learned those of the network. A joint limit is a hard
-stop that exerts any torque needed. Tendon friction (`friction`) does affect the rest posture: it
-differs after winding in and paying out.
+The arm approaches the root against a viscous resistance B, by linearly implicit Euler steps. These
+are Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and
+geared muscle modules, and so makes speeds realistic; it is larger where muscles have larger moment
+arms, and includes the dampers of the joints. B does not affect the rest posture. K and b describe
+the springs of the joints (`JointElasticity`): the values that the network has learned, or else
+those of the robot description. A joint limit is a hard stop that exerts any torque needed. Tendon
+friction (`friction`) does affect the rest posture: it differs after winding in and paying out.
 """
 
 import math
@@ -37,21 +37,23 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, Tree, hold
 
-#: l_target of muscles without a command; MSC then holds T_bias, and modules that follow positions
-#: hold their length
-PAID_OUT = np.inf  # [m]
-#: K of modules that follow positions [N/m]; 400 N move such a module by a millimetre
+#: l_target of muscles without a command [m]; MSC then holds T_bias, and modules that follow
+#: positions hold their length
+PAID_OUT = np.inf
+#: K_stiff of modules that follow positions [N/m]; 400 N move such a module by a millimetre
 RIGID = 4e5
-#: B divided by Σ_i |∂l_i/∂θ| [N·s/rad]. Motions then take as long as those of the emulated arm;
+#: B divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on the emulated arm;
 #: values from 8 to 20 do equally well.
 VISCOSITY = 12.0
-JACOBIAN_POSTURES = 100  # postures over which |∂l_i/∂θ| is averaged
-LEAST_VISCOSITY = 0.1  # [N·m·s/rad] of a joint that no muscle crosses
-JOINT_SPEED = 5.0  # [rad/s] or [m/s]; limits each step, and so the effect of network errors
-MODULE_SPEED = 0.25  # [m/s] winding speed of muscle modules, the same as in the emulator
-ROUNDS = 3  # at most, to find the tendons whose friction reverses in a step
-FARTHEST = 0.05  # how far a position command may run ahead of the module [m]
-POSTURES_PER_COEFFICIENT = 10  # of a cubic
+JACOBIAN_POSTURES = 100  # number of postures over which |∂l_i/∂θ| is averaged
+LEAST_VISCOSITY = 0.1  # smallest B, such as that of a joint that no muscle crosses [N·m·s/rad]
+#: largest speed of a joint [rad/s] or [m/s]; it limits each step, and so the effect of network
+#: errors
+JOINT_SPEED = 5.0
+MODULE_SPEED = 0.25  # largest winding speed of muscle modules [m/s], the same as in the emulator
+ROUNDS = 3  # largest number of rounds to find the tendons whose friction reverses in a step
+FARTHEST = 0.05  # largest distance by which a position command runs ahead of the module [m]
+POSTURES_PER_COEFFICIENT = 10  # number of postures per coefficient to which a cubic is fitted
 
 
 class ArmState(NamedTuple):
@@ -71,18 +73,18 @@ class Body(NamedTuple):
     stiffness: Array  # K_stiff [N/m]
     bias: Array  # T at l = l_target [N]: T_bias, or 0 for modules that follow positions
     most: Array  # T_max [N]
-    #: how far l_target can lie below and beyond l before T no longer changes [m]
-    span: Array
-    loose: Array
-    friction: Array  # μ
+    span: Array  # distance of l_target below l at which T reaches T_max [m]
+    loose: Array  # distance of l_target above l beyond which T no longer changes [m]
+    friction: Array  # tendon friction μ
     speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
-    force: Array  # of the series elastic elements, as in `SeriesElastic`
+    # constants of the series elastic elements, as in `SeriesElastic`
+    force: Array
     rate: Array
     wire_stretch: Array
-    length_at_zero: Array
-    lower: Array
-    upper: Array
-    viscosity: Array  # B
+    length_at_zero: Array  # length of each tendon at θ = 0 [m]
+    lower: Array  # lower joint limits [rad]
+    upper: Array  # upper joint limits [rad]
+    viscosity: Array  # B [N·m·s/rad]
 
 
 class Limbs(NamedTuple):
@@ -103,7 +105,7 @@ class Limbs(NamedTuple):
 
 @njit(cache=True)
 def handed(body: Body, tree: Tree, limbs: Limbs) -> Handle:
-    """Return the constants as a handle that a step takes."""
+    """Return the constants as one handle, the argument `robot` of `advance`."""
     return Handle((body, tree, limbs))
 
 
@@ -124,8 +126,8 @@ def follow(
         followed: The length it had reached a step before [m].
         length: Muscle length [m].
         span: How far the command can lie below `length` until the tension is T_max [m].
-        loose: How far it can lie beyond `length`, as of a slack tendon [m].
-        most: Farthest that the module winds in a step [m].
+        loose: How far the command can lie above `length`, as with a slack tendon [m].
+        most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
     # Beyond these limits the tension no longer changes, but the way back would take time.
@@ -269,10 +271,10 @@ def advance(
         state: The arms now; its length is the network's at (θ, T_end), (M, N).
         after: Filled with the arms after the step.
         h: Duration of the step [s].
-        passed: Share of the tension that tendon friction transmits, T_end / T, (M, N).
+        passed: Fraction of the tension that reaches the bone despite friction, T_end / T, (M, N).
         pulled: The network's Gᵀ T_end [N·m], (D, N).
         command: l_target [m], (M, N).
-        wrench: On the end effectors [N, N·m], (6, N).
+        wrench: Wrench on the end effectors [N, N·m], (6, N).
         fixed: Angles that joints are forced to [rad], (D, N); NaN for a free joint.
     """
     body, tree, limbs = robot.held
@@ -329,8 +331,8 @@ def advance(
                 soft[m, n] = stiffness / (give[m, n] + stiffness * by_motor)
                 slack = compliance[m, n] * lost[m, n] - by_motor * (aim - tension[m, n])
                 wanted[m, n] = aim + soft[m, n] * slack
-                # Beyond the corners max(0, ·) and T_max, a muscle does not act as a spring
-                # (semismooth Newton).
+                # Where T is clipped to T_bias or T_max, it does not depend on the length, so the
+                # stiffness of the muscle is left out of the Newton matrix (semismooth Newton).
                 settled = clip(wanted[m, n], bias, most)
                 rise = settled - tension[m, n]
                 moved = (compliance[m, n] * lost[m, n] - by_motor * rise) / give[m, n]

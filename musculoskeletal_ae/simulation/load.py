@@ -3,11 +3,11 @@
 
     load(θ) = g(θ) + K θ − b − Jᵀ F
 
-(paper, §III-F: the necessary torque from the geometric model), compiled by numba; K and b are those
-of `JointElasticity`. Pinocchio computes the same torque of the weight, and a test compares the two.
-However, it has no gradient with a wrench, and a call from Python takes as long as the rest of a
-step. With forces f_i at points c_i, a joint k at o_k with axis a_k
-needs only sums over the bodies that it carries:
+(paper, §III-F: the necessary torque from the geometric model), compiled by numba. K and b describe
+the springs of the joints (`JointElasticity`). Pinocchio computes the same torque of the weight, and
+a test compares the two. However, it has no gradient with a wrench, and a call from Python takes as
+long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with axis a_k needs only
+sums over the bodies that it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
@@ -29,25 +29,25 @@ from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 class Tree(NamedTuple):
     """The J joints of pinocchio and their bodies; joint 0 is the root link."""
 
-    parent: Ints  # (J,)
-    master: Ints  # index in θ of the coordinate that moves a joint
+    parent: Ints  # index of the parent of each joint, (J,)
+    master: Ints  # index in θ of the coordinate that moves each joint, (J,)
     terms: Array  # coefficients of q = Σ terms_k θᵏ, (J, K)
-    slides: Bools
-    #: pose in the parent's frame, (J, 4, 4): placement + sin q · first + (1 − cos q) · second if
-    #: revolute, placement + q · first if prismatic
+    slides: Bools  # whether each joint is prismatic, (J,)
+    # Pose of a joint in the parent's frame, each part of shape (J, 4, 4): placement + sin q · first
+    # + (1 − cos q) · second for a revolute joint, placement + q · first for a prismatic one.
     placement: Array
     first: Array
     second: Array
-    axis: Array  # in the joint's frame, (J, 3)
-    mass: Array  # [kg] (J,)
-    carried: Array  # total mass that a joint carries [kg] (J,)
-    centre: Array  # centre of mass in the joint's frame [m], (J, 3)
-    gravity: Array  # [m/s²] (3,)
-    carries: Bools  # whether a joint carries the end effector, (J,)
-    effector_joint: int
-    effector: Array  # end effector in the frame of the joint that carries it [m], (3,)
-    springs: Array  # K [N·m/rad], (D, D)
-    preload: Array  # b [N·m], (D,)
+    axis: Array  # axis of each joint in its own frame, (J, 3)
+    mass: Array  # mass of each joint's body [kg], (J,)
+    carried: Array  # total mass that each joint carries [kg], (J,)
+    centre: Array  # centre of mass of each body in its joint's frame [m], (J, 3)
+    gravity: Array  # acceleration of gravity [m/s²], (3,)
+    carries: Bools  # whether each joint carries the end effector, (J,)
+    effector_joint: int  # index of the joint to whose body the end effector belongs
+    effector: Array  # position of the end effector in the frame of that joint [m], (3,)
+    springs: Array  # stiffness K of the joints' springs [N·m/rad], (D, D)
+    preload: Array  # preload b of the joints' springs [N·m], (D,)
 
 
 @njit(cache=True)
@@ -121,7 +121,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
     joints, arms = len(tree.parent), theta.shape[1]
     pose, bend = np.empty((joints, 6, 3, arms)), np.empty((3, arms))
     place(tree, theta, pose)
-    gears = np.empty((joints, arms))  # ∂q/∂θ
+    gears = np.empty((joints, arms))  # ∂q/∂θ of each joint
     for i in range(joints - 1, 0, -1):
         for n in range(arms):
             gears[i, n] = polynomial(tree.terms[i], 1, theta[tree.master[i], n])
@@ -211,7 +211,7 @@ class Load:
 
         Args:
             theta: θ [rad], (N, D).
-            wrench: On the end effectors, axes of the root link [N, N·m], (N, 6); None for none.
+            wrench: Wrench on the end effectors, axes of the root link [N, N·m], (N, 6), or None.
         """
         wrench = np.zeros((len(theta), 6)) if wrench is None else wrench
         theta, wrench = np.ascontiguousarray(theta.T), np.ascontiguousarray(wrench.T)

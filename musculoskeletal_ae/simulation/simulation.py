@@ -2,10 +2,11 @@
 """The learned body as a simulator: joint angles and muscle tensions from commanded lengths.
 
 (Paper, §III-F.) The simulated arms follow the same length commands as the robot, because muscle
-stiffness control is part of them. An l_target, with its l_comp, causes the same tensions at rest as
-on the robot. An arm without a command rests at T_bias. The same compiled code simulates one arm or
-thousands, on all cores; the network may run on a GPU. The preset selects the equations
-(`Preset.make_simulator`); those of preset `default` are in `equilibrium`.
+stiffness control is part of them. A length command l_target, which includes the compensation
+l_comp(T) (paper, §III-E, eq. 6), causes the same tensions at rest as on the robot. An arm without a
+command rests at T_bias. The same compiled code simulates one arm or thousands, on all cores; the
+network may run on a GPU. The preset selects the equations (`Preset.make_simulator`); those of
+preset `default` are in `equilibrium`.
 """
 
 import os
@@ -26,14 +27,14 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
-LONGEST_STEP = 0.01  # [s]; longer times are divided into several steps
+LONGEST_STEP = 0.01  # longest step [s]; longer times are divided into several steps
 CHUNK = 384  # number of arms whose arrays fit into a core's cache
-SETTLING_STEP = 0.1  # [s] of `settle`
-SETTLING_STEPS = 300  # at most
-SETTLED = 1e-6  # [rad] of motion in a step
+SETTLING_STEP = 0.1  # duration of a step of `settle` [s]
+SETTLING_STEPS = 300  # largest number of steps of `settle`
+SETTLED = 1e-6  # motion in a step below which the arms have settled [rad]
 
-STOP_TORQUE = 0.1  # [N·m]; a stop with a lower torque is not reported
-TENSION_MARGIN = 1.0  # [N]; a tension this far below T_max is not reported
+STOP_TORQUE = 0.1  # torque of a stop above which `limits` names the joint [N·m]
+TENSION_MARGIN = 1.0  # distance from T_max below which `limits` names the muscle [N]
 
 
 class SimulatedBody(Protocol):
@@ -51,7 +52,7 @@ class SimulatedBody(Protocol):
             state: The arms now.
             command: l_target [m], (N, M); PAID_OUT for muscles without a command.
             h: Duration of the step [s].
-            wrench: On the end effectors, axes of the root link [N, N·m], (N, 6).
+            wrench: Wrench on the end effectors, axes of the root link [N, N·m], (N, 6).
             fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
         """
 
@@ -62,7 +63,7 @@ class Simulation:
     mae: Mae  # the learned body
     state: ArmState  # the arms now; assign an earlier state to return to it
     command: Array  # l_target [m], (N, M)
-    wrench: Array  # on the end effectors, axes of the root link [N, N·m], (N, 6)
+    wrench: Array  # wrench on the end effectors, axes of the root link [N, N·m], (N, 6)
     fixed: Array  # angles that joints are forced to [rad], (N, D); NaN for a free joint
 
     def __init__(
@@ -80,7 +81,7 @@ class Simulation:
             mae: The learned body.
             preset: Name of the preset, which selects the equations.
             arms: Number of arms.
-            device: Torch device of the network, such as `cuda`; None: numpy.
+            device: Torch device of the network, such as `cuda`; None to use numpy.
 
         Raises:
             MusculoskeletalError: If torch or the preset cannot use the device, or if `arms` is 0.
@@ -97,7 +98,7 @@ class Simulation:
         self.start_from(np.zeros((arms, robot.joint_count)))
 
     def use(self, mae: Mae) -> None:
-        """Set a new network; the arms move from their state to its equilibrium.
+        """Set a new network; from their present state, the arms move to its equilibrium.
 
         Raises:
             FloatingPointError: If it cannot be simulated; the current network then stays in use.
@@ -153,7 +154,7 @@ class Simulation:
         return self.state
 
     def limits(self, arm: int = 0) -> list[str]:
-        """Return the joints of one arm at a joint limit, and its muscles at T_max."""
+        """Return the names of one arm's joints at a joint limit and of its muscles at T_max."""
         robot, forced, tension = self.robot, self.fixed[arm], self.state.tension[arm]
         stopped = np.isnan(forced) & (np.abs(self.state.holding[arm]) > STOP_TORQUE)
         stopped |= (forced < robot.lower) | (forced > robot.upper)

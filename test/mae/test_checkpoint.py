@@ -211,7 +211,7 @@ def test_weights_that_cannot_be_computed_with_are_refused_for_a_robot(mae, robot
     huge = tuple((np.full_like(weight, 1e9), bias) for weight, bias in mae.decoder)
     data = to_bytes(replace(mae, decoder=huge))
     from_bytes(data)
-    with pytest.raises(CheckpointError, match='rest posture'):
+    with pytest.raises(CheckpointError, match='middle posture'):
         from_bytes(data, robot)
 
 
@@ -268,7 +268,7 @@ def test_any_changed_byte_gives_a_sound_network_or_a_checkpoint_error(place, fli
         mae = from_bytes(bytes(data))
     except CheckpointError:
         return
-    # A flipped bit of a weight gives another valid weight.
+    # A flipped bit of a weight results in another valid weight.
     assert all(np.isfinite(part).all() for part in arrays(mae))
 
 

@@ -35,7 +35,7 @@ def test_readings_of_isolated_muscles_have_no_influence(trained, states, preset,
     others[1][:, lost] = rng.uniform(-9.0, 9.0, (60, len(lost)))
     for got, want in zip(mae.estimate(*others), before, strict=True):
         np.testing.assert_array_equal(got, want)
-    one = mae.estimate(others[0][7], others[1][7])  # a message by itself
+    one = mae.estimate(others[0][7], others[1][7])  # one message that is not part of a batch
     np.testing.assert_allclose(one.theta, before.theta[7], atol=1e-4)
     error = residuals(before, *others, lost)
     assert not error.reshape(60, 2, 6)[..., lost].any()
@@ -81,7 +81,7 @@ def test_the_statistics_are_those_of_the_remaining_muscles(trained):
     )
     np.linalg.cholesky(reduced.anomaly.covariance)
     assert reduced.anomaly.calibrated
-    assert not reduced.without(()).anomaly.calibrated  # there are no statistics for it
+    assert not reduced.without(()).anomaly.calibrated  # no statistics exist for the restored muscle
 
 
 def test_a_checkpoint_stores_the_isolated_muscles(trained):

@@ -45,7 +45,8 @@ def test_unknown_robot_exits_with_1_in_one_line(tmp_path, capsys):
 def test_train_warns_of_lengths_that_jump_before_it_trains(tmp_path, capsys, name):
     behind_a_drum(tmp_path / 'arm', DRUM_ENDS[name])
     arguments = ['--robot', str(tmp_path / 'arm'), '--out', str(tmp_path / 'x')]
-    assert main([*arguments, '--from-bag', str(tmp_path / 'none')]) == 1  # nothing is trained
+    # the missing bag is noticed before the training
+    assert main([*arguments, '--from-bag', str(tmp_path / 'none')]) == 1
     error = capsys.readouterr().err
     assert ('warning: no network can represent lengths that jump' in error) == (name == 'jumps')
     assert ('straightener (' in error and 'check_robot' in error) == (name == 'jumps')

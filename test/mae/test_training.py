@@ -102,5 +102,5 @@ def test_an_arm_of_one_joint_and_two_muscles_trains(tmp_path):
     document['muscles'] = document['muscles'][-2:]
     arm = Robot.load(write_muscles(directory, document))
     assert (arm.joint_count, arm.muscle_count) == (1, 2)
-    assert arm.upper[0] < 0.0  # the posture that lengths are relative to is out of reach
+    assert arm.upper[0] < 0.0  # θ = 0, to which lengths are relative, is beyond the joint limits
     check_trains(arm)

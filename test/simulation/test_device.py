@@ -37,7 +37,7 @@ class Devices(TorchFunctionMode):
 def robot(request, tmp_path_factory):
     if request.param != 'slider':
         return Robot.load(request.param)
-    # Two groups, one with a prismatic joint, and a coupled joint.
+    # A robot with two groups, a prismatic joint and a coupled joint.
     coupled = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
     folder = tmp_path_factory.mktemp('slider')
     return Robot.load(write_robot(folder, slider=True, finger=True, couplings=[coupled]))
@@ -64,7 +64,7 @@ def test_torch_agrees_with_numpy(robot, mae):
     one, other = (pushed(robot, mae, device) for device in (None, 'cpu'))
     for _ in range(3):
         for ours, theirs in zip(one.step(0.02), other.step(0.02), strict=True):
-            # Networks have single precision, and muscles are stiff.
+            # Networks compute in single precision, and stiff muscles amplify the rounding errors.
             np.testing.assert_allclose(theirs, ours, rtol=1e-4, atol=1e-2)
         np.testing.assert_allclose(other.state.theta, one.state.theta, atol=1e-5)
         assert other.report() == one.report()
@@ -76,7 +76,7 @@ def test_torch_agrees_with_numpy(robot, mae):
 def test_a_step_agrees_with_an_implementation_in_torch(robot, mae):
     arms = pushed(robot, mae, None)
     other = EagerSimulation(arms)
-    for _ in range(5):  # later, one may reach a stop a step before the other
+    for _ in range(5):  # in later steps, one may reach a stop before the other
         ours, theirs = arms.step(0.01), other.step(0.01)
     for name, atol in {'theta': 1e-4, 'tension': 0.1, 'length': 1e-5, 'followed': 1e-5}.items():
         np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), atol=atol)
@@ -84,7 +84,8 @@ def test_a_step_agrees_with_an_implementation_in_torch(robot, mae):
 
 
 def test_the_network_is_computed_on_the_device(robot, mae):
-    # Like those of a GPU, tensors on `meta` cannot be mixed with others; they have no values.
+    # Tensors on the device `meta` have no values. Like tensors on a GPU, they cannot be mixed with
+    # tensors on another device.
     theta = robot.random_postures(ARMS, np.random.default_rng(0))
     network, tension = TorchLengths(mae, 'meta'), np.ones((ARMS, robot.muscle_count))
     with Devices() as devices, pytest.raises((NotImplementedError, RuntimeError), match='meta'):

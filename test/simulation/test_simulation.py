@@ -85,7 +85,7 @@ def test_the_arm_rests_at_the_equilibrium_of_the_geometric_model(robot, body, co
     arms = settled(robot, body, commands)
     for i, command in enumerate(commands):
         if arms.limits(i):
-            continue  # the body's stops are springs
+            continue  # this body's joint stops are springs
         rest = rest_of_body(robot, arms.state, command, i)
         np.testing.assert_allclose(arms.state.theta[i], rest.theta, atol=1e-4)
         np.testing.assert_allclose(arms.state.tension[i], rest.tension, atol=0.1)
@@ -169,7 +169,7 @@ def test_a_command_out_of_reach_ends_at_the_limits_and_is_reported(robot, body):
     arms.isolate([0])
     assert robot.muscles[0] not in arms.limits()
     arms.isolate([])
-    # No error has accumulated: half a second later the tension is gone.
+    # No error has accumulated: half a second later, the tension has fallen to T_bias.
     arms.command = np.full((1, robot.muscle_count), 1e9)
     assert arms.step(0.5).tension.max() < robot.tension.bias[0] + 1.0
 
@@ -188,7 +188,8 @@ def test_speeds_stay_limited_when_the_command_jumps(robot, body, commands):
     for _ in range(100):
         state = arms.step(0.01)
         assert np.abs(state.theta - before.theta).max() <= JOINT_SPEED * 0.01 + 1e-12
-        assert np.abs(state.tension - before.tension).max() < 25.0  # 0.25 m/s · K_stiff · 10 ms
+        # at most 0.25 m/s · K_stiff · 10 ms
+        assert np.abs(state.tension - before.tension).max() < 25.0
         before = state
 
 
@@ -202,7 +203,7 @@ def test_a_long_step_agrees_with_many_short_ones(robot, body, commands):
 
 
 def test_one_arm_and_a_batch_agree(robot, body, commands, monkeypatch):
-    monkeypatch.setattr(simulation, 'CHUNK', 5)  # uneven pieces, on all cores
+    monkeypatch.setattr(simulation, 'CHUNK', 5)  # the last piece is smaller; all cores are used
     rng = np.random.default_rng(0)
     wrench = rng.normal(0.0, 8.0, (len(commands), 6))
     fixed = np.where(rng.uniform(size=(len(commands), 5)) < 0.2, -0.2, np.nan)
@@ -246,7 +247,7 @@ def test_friction_holds_the_arm_after_winding_in(robot, commands, friction):
 def test_with_a_network_the_arm_rests_at_the_equilibrium_of_the_nominal_body(arm26, mae):
     commands = random_commands(arm26, 10, seed=2)
     theta, _, drift, tension_drift = rest_errors(arm26, mae, 'default', commands)
-    # Over five seeds of the training at most 0.004 rad, 1e-6 rad and 1e-4 N.
+    # Networks of five training seeds had at most 0.004 rad, 1e-6 rad and 1e-4 N.
     assert np.median(theta.max(axis=1)) < 0.02
     assert drift.max() < 1e-4
     assert tension_drift.max() < 0.05
@@ -263,7 +264,7 @@ def test_with_a_network_one_arm_and_a_batch_agree(arm26, mae):
         single.command, single.wrench = commands[[i]], batch.wrench[[i]]
         for name, ours in single.step(0.3)._asdict().items():
             theirs = getattr(batch.state, name)[i]
-            # An error of 1 µm by single precision is relatively large for a prismatic joint.
+            # The rounding error of 1 µm in single precision is large relative to REVERSAL.
             atol = 1e-6 / REVERSAL if name == 'slid' else 1e-5
             np.testing.assert_allclose(ours[0], theirs, rtol=1e-5, atol=atol)
 
