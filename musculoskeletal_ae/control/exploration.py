@@ -36,7 +36,7 @@ class Step(NamedTuple):
     #: T_const of `first` [N], (M,); for `second`, which uses the present tension, the tension that
     #: the geometric model expects
     tension: Array
-    duration: float  # [s]
+    duration: float  # duration of the step [s]
 
 
 class Exploration:

@@ -26,7 +26,8 @@ Where no tension is known, T is `Robot.assumed_tension` in every posture, as in 
 which the network was learned (doc/explanation/method.md).
 
 Method `stiffness` minimises ‖T − T_K‖² instead, where `methods.stiffness_command` computes T_K for
-the setpoint in AHEAD. It uses no feedback, which would change the chosen stiffness.
+a setpoint that is AHEAD seconds ahead. It uses no feedback, which would change the chosen
+stiffness.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ SHARE = 0.7
 #: points, each piece of the trajectory has at least one
 MOST_MOMENTS = 12_500
 BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
-#: error above which an arm with isolated muscles has fallen [rad]; for prismatic joints times RACK
+#: error above which an arm with isolated muscles has fallen [rad], for prismatic joints times RACK
 #: [m]
 FALLEN = 0.2
 FALLING = 2.0  # time after the end of a trajectory from which on the arm can count as fallen [s]
@@ -66,7 +67,7 @@ AHEAD = 0.2  # T_K is computed for this time ahead, and at this interval [s]
 
 
 class Stiffening:
-    """Computes the tensions T_K that method `stiffness` approaches, for the setpoint in AHEAD."""
+    """Computes the tensions T_K that method `stiffness` approaches, AHEAD seconds in advance."""
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.use(robot, settings)
@@ -85,7 +86,11 @@ class Stiffening:
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
     ) -> Array:
-        """Return T_K [N] (M,), which changes only by the part of the rate limit left by `SHARE`."""
+        """Return T_K [N], (M,).
+
+        T_K changes slowly: trajectories may use the fraction SHARE of the rate limit, and T_K uses
+        the rest.
+        """
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt
         if solution is None or self._solved >= AHEAD:

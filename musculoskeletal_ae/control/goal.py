@@ -61,9 +61,12 @@ class FollowedGoal:
         if condition is not None:
             return INVALID, f'stopped: {condition}'
         if not core.is_following or trajectory is None:
-            return INVALID, f'ended, because the mode changed to {core.supervisor.mode}'
+            return (
+                INVALID,
+                f'the trajectory ended, because the mode changed to {core.supervisor.mode}',
+            )
         if follower.latest is not trajectory:
-            return INVALID, 'replaced by another target'
+            return INVALID, 'the trajectory was replaced by another target'
         if follower.trajectory is not trajectory:
             return None  # the trajectory has not started yet
         off = np.abs(follower.error)

@@ -81,7 +81,7 @@ class CommandLimiter:
         self.command: Command | None = None
         #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
-        self._relief: Array = np.zeros(robot.muscle_count)  # r [m]
+        self._relief: Array = np.zeros(robot.muscle_count)  # relief r of each muscle [m]
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
         longest = robot.routes.relative_lengths(postures).max(axis=0)

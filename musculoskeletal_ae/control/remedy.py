@@ -29,7 +29,7 @@ class Step(Enum):
         'check_sensor',
         'check the named sensor, or call estimator/zero if lengths are off',
     )
-    CHECK_CHECKPOINT = 'check_checkpoint', 'check the checkpoint'
+    CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
     CHECK_DRIVER = 'check_driver', 'check that the driver is running'
     CHECK_ESTIMATOR = 'check_estimator', 'check that the estimator is running'
     STOP_SECOND_PUBLISHER = (
@@ -45,7 +45,7 @@ class Step(Enum):
         'set the parameter checkpoint, or start the learner',
     )
     WAIT_UNTIL_COOL = 'wait_until_cool', 'wait until all windings are below temperature_limit'
-    REPORT_LOG = 'report_log', 'report the log'
+    REPORT_LOG = 'report_log', 'report the error with the log of the controller'
 
 
 REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, settable
 
-UNREACHABLE = ('refuse', 'nearest')
+UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 BY_TENSION = ('tension', 'float')  # methods that command tensions; the others command lengths
 MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/rad]

@@ -19,6 +19,7 @@ from musculoskeletal_ae.signals.body_state import KNOWN
 
 #: fraction of the requested speed below which a slowed trajectory is reported by its duration [%]
 LEAST_SHARE = 10.0
+#: what the arm does during each activity, as a text for users
 DOING = {
     Activity.IDLE: 'no target',
     Activity.HOLDING: 'holding',
@@ -95,7 +96,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
     if not core.stream.body.offsets.known:
         unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
         values['unknown length offsets'] = robot.names(unknown)
-        warnings.append('length offsets are unknown: the arm only explores, gently')
+        warnings.append('the length offsets are unknown, so the arm can only explore gently')
     if not robot.knows_tension:
         values['tension'] = f'tension_source: none: {NO_TENSION}'
     if tense := core.watchdog.overload.tense:
@@ -113,7 +114,7 @@ def _heat_warnings(core: Controller, values: dict[str, str]) -> list[str]:
         values['temperature of windings'] = ', '.join(texts)
     if not is_known.all():
         names = 'any muscle' if not is_known.any() else robot.names(np.flatnonzero(~is_known))
-        values['not protected from heat'] = f'no temperature is measured of {names}'
+        values['not protected from heat'] = f'no temperature is measured for {names}'
     limits = zip(robot.muscles, heat.planned, robot.tension.limit)
     hot = {name: limit for name, limit, largest in limits if limit < largest}
     if not hot:
@@ -168,12 +169,14 @@ def slowed(follower: Follower) -> str:
 
 
 def _fallen(core: Controller) -> str:
-    """Return how far from its target a fallen arm rests, and the torque missing there."""
+    """Return how far from its target a fallen arm rests, and the torque that its muscles lack."""
     mae, estimate, robot = core.mae, core.estimate, core.robot
     error = core.activities.follower.error
     assert mae is not None and estimate is not None  # the arm has moved
     joint = int(np.abs(error / robot.kinematics.radian).argmax())
     distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
-    text = f'fallen: {robot.joints[joint]} rests {distance} off its target'
+    text = f'the arm has fallen: {robot.joints[joint]} rests {distance} away from its target'
     missing = reach.lacking(robot, mae, estimate)
-    return f'{text}, where the muscles lack {missing}; lift it by hand' if missing else text
+    if not missing:
+        return text
+    return f'{text}; in this posture, the muscles lack {missing}; lift it by hand'

@@ -156,7 +156,7 @@ class SafeStop:
         if rise > LARGEST_RISE:
             return command
         # A module that follows positions may have to take up slack first. `Robot.release` stretches
-        # its tendon from T_bias to T_limit, whatever its tension sensor reads.
+        # its tendon from T_bias to T_limit, whatever the tension sensor reads.
         depth = DEPTH
         if self._robot.follows_position:
             depth = float(self._robot.release[muscle])

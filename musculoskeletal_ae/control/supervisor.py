@@ -62,7 +62,7 @@ AFTER_A_STOP = {
 }
 
 _S, _E = StopState, Event
-#: the complete table (state, event) → state; any other event has no effect
+#: the complete table (state, event) → state; any other combination has no effect
 TRANSITIONS: dict[tuple[StopState, Event], StopState] = {
     (_S.RUNNING, _E.CLEARING_CAUSE): _S.PAUSED,
     (_S.RUNNING, _E.LATCHING_CAUSE): _S.STOPPED,

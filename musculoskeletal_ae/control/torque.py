@@ -80,8 +80,8 @@ class TorqueControl:
         tension, self.missing_torque = least_tension(
             jacobian, torque, robot.tension.bias, inputs.limit
         )
-        # Change all tensions by the same fraction of their way: any tensions on the line between
-        # two that hold the arm hold it as well.
+        # Scale the changes of all tensions by the same factor. If the old and the new tensions hold
+        # the arm, all tensions in between then hold it as well.
         change = tension - self._command
         rates = robot.tension_per_length(self._command) * robot.fastest(self._settings.rate_limit)
         fastest = rates * dt
@@ -104,7 +104,8 @@ class GravityCompensation(TorqueControl):
 
     A spring holds the arm at θ_held, which follows once the spring is stretched by BAND. It acts
     like joint friction, so that errors of the gravity model do not make the arm creep. Near the
-    joint limits, a wall pushes the arm back; clip(θ) is to WALL_AT inside the limits.
+    joint limits, a wall pushes the arm back; clip(θ) limits θ to WALL_AT inside the joint
+    limits.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

@@ -50,9 +50,9 @@ QUINTIC = np.array(
 class Setpoint(NamedTuple):
     """Desired motion at one moment or at N moments; each array is (D,) or (N, D)."""
 
-    theta: Array  # [rad]
-    velocity: Array  # [rad/s]
-    acceleration: Array  # [rad/s²]
+    theta: Array  # joint angles [rad]
+    velocity: Array  # joint velocities [rad/s]
+    acceleration: Array  # joint accelerations [rad/s²]
 
     @classmethod
     def resting(cls, theta: Array) -> Setpoint:

@@ -38,8 +38,8 @@ MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMAT
 class Step(NamedTuple):
     """Duration of one step of control."""
 
-    dt: float  # on the messages' clock [s]
-    elapsed: float  # on the steady clock [s]
+    dt: float  # duration on the messages' clock [s]
+    elapsed: float  # duration on the steady clock [s]
     has_paused: bool  # whether control paused before the step, so that the arm may have moved
 
 

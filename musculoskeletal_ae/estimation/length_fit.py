@@ -30,20 +30,23 @@ from musculoskeletal_ae.robot.robot import Robot
 # Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
 # RACK and become [m], and torques are divided by RACK and become [N].
 
-# Standard deviations of the residuals.
-LENGTH_NOISE = 0.0004  # error of a length by the network [m]
-TORQUE_NOISE = 0.4  # error of a joint torque by the network, apart from friction [N·m]
-LIMIT_NOISE = 0.05  # excess of a joint angle over its limits [rad]
+LENGTH_NOISE = 0.0004  # standard deviation of the network's error of a length [m]
+#: standard deviation of the network's error of a joint torque, apart from friction [N·m]
+TORQUE_NOISE = 0.4
+LIMIT_NOISE = 0.05  # standard deviation of the excess of a joint angle over its limits [rad]
 NOISE_FACTORS = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
 ISOLATED_WEIGHT = 1e-6  # weight of an isolated muscle's length relative to the others
 FREEDOM = 4.0  # degrees of freedom of Student's distribution
 AT_STOP = 0.03  # distance from a joint limit below which the stop may carry torque [rad]
 
-# Prior of the constants. Each value is the standard deviation; the mean is 0 except for FRICTION.
-OFFSET = 0.1  # offset of a length [m]
-FRICTION = 0.05  # friction coefficient μ of a tendon: both mean and standard deviation
-TENSION_OFFSET = 1.5  # offset of a tension sensor [N]; covers the error of its gain
-JOINT_FRICTION = 0.03  # Coulomb torque of a joint, relative to the largest torque of the weight
+# Prior of the constants; the mean is 0 except for FRICTION.
+OFFSET = 0.1  # prior standard deviation of a length offset [m]
+FRICTION = 0.05  # prior mean and standard deviation of the friction coefficient μ of a tendon
+#: prior standard deviation of a tension sensor's offset [N]; it covers the error of the gain
+TENSION_OFFSET = 1.5
+#: prior standard deviation of the Coulomb torque of a joint, relative to the largest torque of the
+#: weight
+JOINT_FRICTION = 0.03
 
 STICKING = 0.003  # motion after a reversal over which the friction of a joint changes sign [rad]
 #: smallest torque of the weight that is assumed, relative to the largest torque of the tensions

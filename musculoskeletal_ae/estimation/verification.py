@@ -55,7 +55,8 @@ CLASSIFICATION_TIME = 0.8  # duration of winding in after which the suspect is c
 PATIENCE = 8.0  # time after which a suspect that was not wound in stays isolated [s]
 FAR = 0.025  # smallest |l − l'| that noise and network errors do not explain [m]
 RUPTURE_CHANGE = 0.005  # decrease of l − l' when the rest of a ruptured tendon is wound in [m]
-USUAL_BIAS = 30.0  # T_bias for which the tensions below apply; for other arms they are scaled [N]
+#: T_bias for which CLOSE and JAM_EXCESS apply [N]; for a lower T_bias, they are scaled down
+USUAL_BIAS = 30.0
 CLOSE = 8.0  # absolute tolerance of the difference between T and T_ref [N]
 SHARE = 0.35  # tolerance of the difference between T and T_ref, relative to T_ref − T_bias
 JAM_EXCESS = 20.0  # T − T_ref above which a suspect that was not wound in is jammed [N]
@@ -224,7 +225,8 @@ class Verification:
         if self._time < PATIENCE:
             return None
         if tension > demand + JAM_EXCESS * self._scale:
-            return Verdict(Outcome.JAMMED)  # its tension is high although it was not wound in
+            # the tension is high although the suspect was not wound in
+            return Verdict(Outcome.JAMMED)
         return Verdict(Outcome.NOT_WOUND_IN)
 
     def _judge(self) -> Verdict:

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 1  # version of the file format
 #: largest size of a checkpoint [bytes]; the networks of the shipped arms have a hundredth of it
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024  # largest size of a checkpoint's header [bytes]
@@ -206,7 +206,7 @@ class _Header(msgspec.Struct, frozen=True):
 def _metadata(data: bytes) -> Metadata:
     """Return the metadata of safetensors bytes."""
     if len(data) > MAX_BYTES:
-        raise CheckpointError(f'{len(data)} bytes; legal: at most {MAX_BYTES}')
+        raise CheckpointError(f'it has {len(data)} bytes; legal: at most {MAX_BYTES}')
     size = int.from_bytes(data[:8], 'little')
     if not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
         raise CheckpointError(

@@ -39,7 +39,7 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 
-LAYERS = Layers((200, 100), 'silu')
+LAYERS = Layers((200, 100), 'silu')  # hidden layers of the encoder, and activation
 STEPS = 3000  # number of mini-batches
 BATCH = 128  # number of samples of a mini-batch
 SAMPLES = 200_000  # largest number of different samples

@@ -58,7 +58,7 @@ class AnomalyStatistics:
     covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
     calibrated: bool  # whether measured on the real arm instead of the geometric model
     samples: int  # number of samples
-    #: of the detectors, by name; finite
+    #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)
     #: θ [rad] (K, D) of healthy postures far apart from each other; K may be 0
     postures: Array = field(default_factory=lambda: np.empty((0, 0)))

@@ -19,7 +19,7 @@ LENGTH_SCALE = 10.0  # scaled units per [m]; mm/100 = 10 · l[m]
 
 ActivationName = Literal['tanh', 'silu']
 
-UNITS = 'theta rad, tension N/200, length mm/100'
+UNITS = 'theta rad, tension N/200, length mm/100'  # scaled units, as checkpoints name them
 
 
 class State(NamedTuple):

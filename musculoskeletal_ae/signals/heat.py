@@ -29,14 +29,15 @@ LONGEST = 10.0  # longest time that one update may cover [s]
 JUMP = 5.0
 NOISE = 0.1  # standard deviation of the mean of c₂ over EVERY [°C]
 RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
-# Initial estimates.
-RISE = 80.0  # temperature of the housing above the air if T_limit is held for ever [°C]
-WINDING_TIME = 30.0  # time constant τ₁ of the winding [s]
-HOUSING_TIME = 800.0  # time constant τ₂ of the housing [s]
-AIR = 25.0  # temperature c_a of the air [°C]
-# Standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C].
-SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])  # of the initial estimates
-WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])  # of the random walks, per √s
+#: initial estimate of how much warmer than the air the housing becomes while T_limit is held [°C]
+RISE = 80.0
+WINDING_TIME = 30.0  # initial estimate of the winding's time constant τ₁ [s]
+HOUSING_TIME = 800.0  # initial estimate of the housing's time constant τ₂ [s]
+AIR = 25.0  # initial estimate of the air temperature c_a [°C]
+#: initial standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C]
+SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
+#: standard deviations of the random walks of the same quantities, per √s
+WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
 FAR = 2.5  # largest change of the logarithm of a constant from its initial estimate
 SLOPE = 1e-4  # step of numerical derivatives
 LEARNED = 1200.0  # time of learning before a constant can count as known [s]
@@ -168,9 +169,9 @@ class Heat:
         first = (self._age > LEARNED) & (unsure < KNOWN**2) & np.isnan(self._reference[0])
         self._reference = np.where(first, logs, self._reference)
         factor = np.exp(logs - self._reference)
-        texts = 'warms {:.2g} times', 'keeps its heat {:.2g} times'
+        texts = 'heats up {:.2g} times as much', 'cools down {:.2g} times as slowly'
         self.changed = {
-            int(m): f'{texts[k].format(factor[k, m])} as much as it did'
+            int(m): f'{texts[k].format(factor[k, m])} as before'
             for k, m in np.argwhere(np.abs(np.log(factor)) > np.log(CHANGED))
         }
 

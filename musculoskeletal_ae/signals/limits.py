@@ -32,8 +32,8 @@ class Limits(NamedTuple):
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
     # time dt since the last accepted one. The first temperature is accepted once further readings
     # have agreed with it to within `temperature_step` for `glitch`.
-    temperature_step: float = 5.0  # [°C]
-    temperature_rate: float = 50.0  # [°C/s]
+    temperature_step: float = 5.0  # constant part of the largest change of a temperature [°C]
+    temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
     #: largest excess of a length over its range within the joint limits [m]: tendons wrap, are
     #: wound in with slack, or are attached elsewhere than modelled
     length_margin: float = 0.1
@@ -41,10 +41,10 @@ class Limits(NamedTuple):
     slack_share: float = 0.2  # tension below which a tendon is slack, as a fraction of T_bias
     # Between two messages, a length changes by at most `step + speed · dt`, where the time dt
     # counts up to `longest_step`. A new level is accepted after it has lasted for `settled`.
-    step: float = 0.02  # [m]
-    speed: float = 1.0  # [m/s]
-    longest_step: float = 0.05  # [s]
-    settled: float = 1.0  # [s]
+    step: float = 0.02  # constant part of the largest change of a length [m]
+    speed: float = 1.0  # largest speed of a length [m/s]
+    longest_step: float = 0.05  # longest time that counts for the change of a length [s]
+    settled: float = 1.0  # time after which a new level of a length is accepted [s]
     #: time after which implausible messages are a fault instead of a glitch [s]
     glitch: float = 0.1
     #: pause of the messages after which the direction of sliding is unknown [s]
@@ -54,6 +54,7 @@ class Limits(NamedTuple):
 LIMITS = Limits()
 POSTURES = 500  # number of random postures over which `length_range` searches
 
+# Reasons under which rejected messages are counted.
 TENSION = 'tension beyond the maximum'
 LENGTH = 'length beyond what the joints allow'
 TEMPERATURE = 'impossible temperature'

@@ -127,9 +127,9 @@ class MotorInterface:
             self._places, self._names = self._find(names), names
         stamp = message.header.stamp
         if stamp.sec == 0 and stamp.nanosec == 0:
-            raise MessageError('no stamp', 'header.stamp is 0; old values could not be recognised')
+            raise MessageError('no stamp', 'header.stamp is 0; expected the time of measurement')
         if not self._stamps.is_new(stamp):
-            detail = f'{stamp.sec}.{stamp.nanosec:09d} s is not later than the last stamp'
+            detail = f'{stamp.sec}.{stamp.nanosec:09d} s is not later than the previous stamp'
             raise MessageError('repeated stamp', detail)
         position = np.array(message.position, dtype=float)[self._places]
         rows = np.full((3, len(position)), np.nan)

@@ -75,7 +75,7 @@ class Body(NamedTuple):
     most: Array  # T_max [N]
     span: Array  # distance of l_target below l at which T reaches T_max [m]
     loose: Array  # distance of l_target above l beyond which T no longer changes [m]
-    friction: Array  # tendon friction μ
+    friction: Array  # tendon friction coefficient μ
     speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
     # constants of the series elastic elements, as in `SeriesElastic`
     force: Array
@@ -84,7 +84,7 @@ class Body(NamedTuple):
     length_at_zero: Array  # length of each tendon at θ = 0 [m]
     lower: Array  # lower joint limits [rad]
     upper: Array  # upper joint limits [rad]
-    viscosity: Array  # B [N·m·s/rad]
+    viscosity: Array  # viscous resistance B of each joint [N·m·s/rad]
 
 
 class Limbs(NamedTuple):
@@ -94,8 +94,8 @@ class Limbs(NamedTuple):
     """
 
     counts: Ints  # number of joints D and muscles M of each limb, (limbs, 2)
-    joints: Ints  # indices in θ
-    muscles: Ints  # indices in T and l
+    joints: Ints  # indices in θ of the joints, limb after limb
+    muscles: Ints  # indices in T and l of the muscles, limb after limb
     crossed: Ints  # for each muscle, the range of its limb in `joints`, (M, 2)
     #: for each limb, coefficients of G (M, D) in the basis 1, θ_j, θ_j θ_k with j ≤ k
     first: Array

@@ -288,7 +288,7 @@ def test_a_muscle_without_a_measured_temperature_is_reported_as_not_protected():
     bench.temperature = np.full(ROBOT.muscle_count, np.nan)
     bench.step(20)
     values = bench.report().values
-    assert values['not protected from heat'] == 'no temperature is measured of any muscle'
+    assert values['not protected from heat'] == 'no temperature is measured for any muscle'
     assert 'temperature of windings' not in values
     assert (bench.core.watchdog.heat.planned == ROBOT.tension.max).all()
 

@@ -63,7 +63,7 @@ def test_the_arm_explores_again_once_the_suspect_is_verified():
     supervisor.on_suspect(True)
     assert supervisor.mode == 'verifying'
     supervisor.on_verified()
-    wait(supervisor, ANOMALY, seconds=STEP)  # still present: it does not move
+    wait(supervisor, ANOMALY, seconds=STEP)  # the cause is still present, so the arm does not move
     assert not supervisor.is_running
 
 

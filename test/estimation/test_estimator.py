@@ -167,7 +167,7 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
             core.take(broken, at, at)
         return core.body.isolated == (2,)
 
-    for good, pause in ((3, 0.01), (0, 5.0)):  # pause between two bad messages
+    for good, pause in ((3, 0.01), (0, 5.0)):  # good messages and a pause between two bad messages
         assert not isolates(now)
         for _ in range(good):
             now += pause

@@ -85,7 +85,7 @@ def test_the_arm_rests_at_the_equilibrium_of_the_geometric_model(robot, body, co
     arms = settled(robot, body, commands)
     for i, command in enumerate(commands):
         if arms.limits(i):
-            continue  # this body's joint stops are springs
+            continue  # `rest_of_body` models joint stops as springs, so it differs at a limit
         rest = rest_of_body(robot, arms.state, command, i)
         np.testing.assert_allclose(arms.state.theta[i], rest.theta, atol=1e-4)
         np.testing.assert_allclose(arms.state.tension[i], rest.tension, atol=0.1)

@@ -23,7 +23,9 @@ JAM_TIME = 1.0  # time after which a stationary winch is reported [s]
 BEHIND = 0.005  # difference from l_target above which a module has to move [m]
 FULL = 0.9  # fraction of T_max above which a module need not move, because it cannot pull harder
 JAM = 50.0  # difference from T_ref above which a winch has to move [N]
-JAM_SHARE = 0.3  # the same, relative to T_ref, because the gains of tension sensors vary
+#: difference from T_ref, relative to T_ref, above which a winch has to move; it covers errors of
+#: the sensors' gains
+JAM_SHARE = 0.3
 
 
 class JammedModule(Detector):

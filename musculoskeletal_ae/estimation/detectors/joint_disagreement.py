@@ -41,18 +41,22 @@ class Largest(NamedTuple):
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
 
-# Measured on healthy exploring Musashi arms, half of them of emulator model `foreign`, some with a
-# load of 3.6 kg and pushes. With initial networks, Δ reached 0.036 m and 0.019 m, and g 0.051 m and
-# 0.029 m; with networks that had learned for 20 to 60 s, Δ reached 0.032 m and 0.013 m.
-CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with these networks
-GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with these networks
-# With networks whose residual detector is calibrated, Δ and g reached 0.013 m and 0.006 m. An error
-# of 0.05 m of a single muscle is detected in every posture.
+# Largest values on healthy exploring Musashi arms, half of them of emulator model `foreign`, some
+# with a load of 3.6 kg and pushes; first of a single muscle, then the root mean square of all:
+#
+#     initial networks                     Δ 0.036 m, 0.019 m     g 0.051 m, 0.029 m
+#     after 20 to 60 s of learning         Δ 0.032 m, 0.013 m
+#     networks with a calibrated detector  Δ 0.013 m, 0.006 m     g 0.013 m, 0.006 m
+#
+# With the limits of calibrated networks, an error of 0.05 m of a single muscle is detected in every
+# posture.
+CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with networks that are not calibrated
+GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with networks that are not calibrated
 CHANGE_LEARNED = Largest(0.035, 0.016)  # limits of Δ with calibrated networks
 GAP_LEARNED = Largest(0.035, 0.016)  # limits of g with calibrated networks
 HEALTHY_SPACING = 1.0  # time between the healthy messages from which g_usual is computed [s]
-HEALTHY_COUNT = 60  # largest number of these messages
-ENOUGH = 5  # smallest number of these messages
+HEALTHY_COUNT = 60  # largest number of messages from which g_usual is computed
+ENOUGH = 5  # smallest number of messages from which g_usual is computed
 #: Δ relative to its limits up to which a message counts as healthy; it is low, so that g_usual does
 #: not follow a drift
 HEALTHY_EXCESS = 0.5

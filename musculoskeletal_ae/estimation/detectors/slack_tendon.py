@@ -28,7 +28,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: stretch of a tendon without tension above which it is ruptured, relative to the stretch at T_bias
 STRETCH = 1.5
-#: the same without calibrated statistics: a network that has not learned the arm can estimate a
+#: STRETCH without calibrated statistics: a network that has not learned the arm can estimate a
 #: stretch of up to 1.5 for a healthy slack tendon
 UNCALIBRATED_STRETCH = 3.0
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]

@@ -39,7 +39,8 @@ def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Ite
         return float(np.median(statistics.distances(error) / threshold))
 
     yield measure(tension, length)
-    rows = np.linspace(0, len(length) - 1, LEAST).astype(int)  # these LEAST messages suffice
+    #: LEAST of the messages suffice for each muscle
+    rows = np.linspace(0, len(length) - 1, LEAST).astype(int)
     is_intact = 1.0 - np.eye(tension.shape[1])
     for factors in np.delete(is_intact, tuple(isolated), axis=0):
         yield measure(tension[rows] * factors, length[rows])
