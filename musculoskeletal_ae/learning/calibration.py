@@ -140,7 +140,7 @@ class Reservoir:
         tension, length, direction, theta, number, time = columns
         age = self._rests.accepted - number[:, 0]
         recent = (time[:, 0] > self.time - RECENT_TIME) & (age < RECENT_RESTS)
-        # A tension of 0 N means that the muscle was isolated or slack.
+        # Exclude tensions of 0 N, which mean that the muscle was isolated or slack.
         whole = recent & np.isfinite(theta).all(axis=1) & (tension > 0.0).all(axis=1)
         known = np.ones(tension.shape, dtype=bool)
         observed = Observations(theta, tension, length, direction, known, age=age)

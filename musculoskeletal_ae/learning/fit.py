@@ -99,7 +99,7 @@ def _reopened(
     body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
 ) -> MusclePrior:
     """Return a wide prior around a muscle's earlier parameters if it was changed, else `prior`."""
-    # A tension of 0 N means that the muscle was isolated.
+    # Exclude tensions of 0 N, which mean that the muscle was isolated.
     before = ~observed.known[:, m] & (observed.tension[:, m] > 0.0)
     if before.sum() < LEAST_BEFORE_CHANGE:
         return prior

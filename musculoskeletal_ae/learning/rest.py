@@ -100,7 +100,7 @@ class OpenRest:
         theta, tension, length, direction = (
             _mean(np.array(part)) for part in [*zip(*self.readings)][:4]
         )
-        # All readings of a rest were taken under one body state.
+        # Keep the body state of the last reading, because all readings of a rest have the same one.
         return self.readings[-1]._replace(
             theta=theta,
             tension=tension,

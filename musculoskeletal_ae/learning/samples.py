@@ -214,7 +214,7 @@ class SampleStore:
         theta, tension, length, direction = map(np.array, columns[:4])
         spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
-        # Without joint angles, creep cannot be distinguished from a drift of the postures.
+        # Do not estimate creep without joint angles, because a drift of the postures looks alike.
         read = np.isfinite(theta).all(axis=1).mean()
         if self.accepted <= CREEP_SHARE * self.capacity or read < CREEP_SHARE:
             age[:] = 0.0

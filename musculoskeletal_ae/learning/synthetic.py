@@ -54,7 +54,7 @@ def synthetic_samples(
     shape = count, robot.muscle_count
     theta = robot.random_postures(count, rng, MARGIN)
     tension = held_tensions(robot, count, rng)
-    # Sliding leaves the direction near either end of [−1, 1] most of the time.
+    # Draw directions mostly near −1 and 1, where sliding leaves them most of the time.
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     length, scattered = body.lengths(theta, tension, np.zeros(shape), UNKNOWN_FRICTION * direction)
     scattered = scattered + noise * rng.standard_normal(shape)

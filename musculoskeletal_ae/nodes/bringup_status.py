@@ -39,13 +39,13 @@ class BringupStatus(Shell):
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
-        self.follow_posture('joint_states', self._measured, some=True)
-        self.follow_posture('estimated_joint_states', self._estimated)
+        self.follow_posture('joint_states', self._on_measured_posture, some=True)
+        self.follow_posture('estimated_joint_states', self._on_estimate)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
         self.listen(DiagnosticArray, '/diagnostics', self.situation.diagnosed, RELIABLE)
         self.create_timer(1.0, self._print, clock=STEADY)
 
-    def _measured(self, theta: Array) -> None:
+    def _on_measured_posture(self, theta: Array) -> None:
         self.measured = time.monotonic(), theta
 
     @property
@@ -54,7 +54,7 @@ class BringupStatus(Shell):
         at, theta = self.measured
         return theta if time.monotonic() - at <= LARGEST_AGE else None
 
-    def _estimated(self, theta: Array) -> None:
+    def _on_estimate(self, theta: Array) -> None:
         if (measured := self.theta) is not None:
             self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - measured))))
 

@@ -58,7 +58,8 @@ from musculoskeletal_ae.validity import (
 class Controller(Shell):
     """Passes messages, parameters and services to the core controller; publishes its commands."""
 
-    # Several publishers of muscle_states stop the arm, but paying out still needs the readings.
+    # Several publishers of muscle_states stop the arm. Their messages are still accepted, because
+    # paying out needs the readings.
     accepted_from_all = frozenset({'muscle_states'})
 
     def __init__(self, **options: Any) -> None:
@@ -89,7 +90,7 @@ class Controller(Shell):
         self.follow_offsets(self._use_body)
         self.sources.watch(*AUTHORS)
         self.follow_muscle_messages(self._muscles)
-        self.listen(JointState, 'estimated_joint_states', self._estimated, SENSOR)
+        self.listen(JointState, 'estimated_joint_states', self._on_estimate, SENSOR)
         self.listen(JointState, 'target_joint_states', self._target, RELIABLE)
         self.listen(JointTrajectory, 'joint_trajectory', self._trajectory, RELIABLE)
         self.listen(PoseStamped, 'target_pose', self._pose, RELIABLE)
@@ -138,7 +139,8 @@ class Controller(Shell):
             kind: publisher.get_subscription_count()
             for kind, publisher in self.publishers_of.items()
         }
-        # The limiter turns tensions into lengths for modules that follow positions.
+        # Modules that follow positions need no tension commands, because the limiter turns tensions
+        # into lengths.
         by_tension = value in BY_TENSION and not self.robot.follows_position
         if by_tension and followed[LENGTH] and not followed[TENSION]:
             # Refuse the method, because a driver that gets no commands pays the muscles out.
@@ -162,11 +164,12 @@ class Controller(Shell):
         """Stop while another node publishes a topic that belongs to one of the arm's nodes."""
         self.core.watchdog.second_publisher = intruders
 
-    def _estimated(self, message: JointState) -> None:
+    def _on_estimate(self, message: JointState) -> None:
         theta = read_posture(message, self.robot.joints)
         is_new = self.estimate_stamps.is_new(message.header.stamp)
         self.core.estimated(theta, time.monotonic(), is_new)
-        # Estimates are computed from the newest muscle states, so all inputs are fresh now.
+        # Compute a command now. An estimate comes from the newest muscle states, so all inputs are
+        # fresh.
         self._step()
 
     def _target(self, message: JointState) -> None:

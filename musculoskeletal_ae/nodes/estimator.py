@@ -68,7 +68,7 @@ class Estimator(Shell):
         self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
         self.follow_parameter('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
-            # Without known offsets, no node uses the measured lengths before calibration.
+            # Forget the offsets, so that no node uses the lengths before they are calibrated.
             self.core.forget_offsets()
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
         self.candidates.follow()

@@ -74,7 +74,7 @@ class LeanExecutor(SingleThreadedExecutor):
         self._next_full_round = 0.0  # time of the next full round on the monotonic clock [s]
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run all ready callbacks; wait at most `timeout_sec` and the period of full rounds."""
+        """Run all ready callbacks; wait for at most `timeout_sec` or the period of full rounds."""
         if self._wait_set is None:
             self._build_wait_set()
         wait_set, groups = self._wait_set, self._groups
@@ -107,7 +107,7 @@ class LeanExecutor(SingleThreadedExecutor):
         return super().shutdown(timeout_sec)
 
     def _run(self, entity: Any, take: Callable[[Any], Any]) -> None:
-        # Another callback may have cancelled the timer since the wait.
+        # Skip a timer that another callback has cancelled since the wait.
         if isinstance(entity, Timer) and not entity.handle.is_timer_ready():
             return
         execute = take(entity)

@@ -50,7 +50,7 @@ class FollowJointTrajectory:
         self._handle: Any = None
         self._server = LateServer(
             node, kind, NAME, lambda _: kind.Result(), goal_callback=self._ask,
-            handle_accepted_callback=self._accepted, cancel_callback=self._cancel,
+            handle_accepted_callback=self._on_accepted, cancel_callback=self._cancel,
         )  # fmt: skip
 
     def _ask(self, goal: Any) -> GoalResponse:
@@ -70,7 +70,7 @@ class FollowJointTrajectory:
         self._requested = FollowedGoal(self._core, self._joints, bounds[0], bounds[1], late)
         return GoalResponse.ACCEPT
 
-    def _accepted(self, handle: Any) -> None:
+    def _on_accepted(self, handle: Any) -> None:
         self._end(INVALID, 'replaced by a new goal')
         self._handle, self._goal = handle, self._requested
         handle.execute()

@@ -29,7 +29,8 @@ SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
 def end_process() -> None:
     """Dump the stacks of all threads, and end the process immediately."""
-    print(f'no progress for {LONGEST_STALL:g} s: ending; stacks of all threads:', file=sys.stderr)
+    problem = f'no progress for {LONGEST_STALL:g} s; the process ends'
+    print(f'{problem}. Stacks of all threads:', file=sys.stderr)
     faulthandler.dump_traceback(all_threads=True)
     os._exit(STALLED)
 

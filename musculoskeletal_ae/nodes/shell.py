@@ -291,7 +291,7 @@ class Shell(Node):
 
     def _held(self, name: str) -> Any:
         value = self.get_parameter_or(name, RosParameter(name)).value
-        # rcl reads an empty list on the command line as None.
+        # Return an empty list for None, as which rcl reads an empty list on the command line.
         return [] if value is None and isinstance(self._table[name].default, tuple) else value
 
     def follow_parameter(

@@ -11,7 +11,7 @@ beside its successor, but sends no more messages. Three signs distinguish a seco
 - Sequence numbers that repeatedly go back: two nodes take turns publishing.
 - A report on /diagnostics under our own name with another identity, after our first report. The
   identity is a random number of the reporting node.
-- Two publishers that have both been in the graph for longer than it keeps a killed one.
+- Two publishers that have both been in the graph for longer than it keeps a killed publisher.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Twins:
 
     def __init__(self, name: str, identity: str) -> None:
         """Watch reports with this status name; the reports of our own node contain `identity`."""
-        # With the length prefix of CDR, `/controller` does not match within `/left/controller`.
+        # Include CDR's length prefix, so that `/controller` does not match in `/left/controller`.
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
         self._has_reported = False

@@ -2,7 +2,8 @@
 """The node `view`: shows a running arm on a web page, and moves it on request.
 
 The node subscribes only while somebody views the page. It then takes only the newest message of
-each topic, at the frame rate. An executor would handle every message, for a tenth of a core.
+each topic, at the frame rate. An executor would handle every message, which would take a tenth of a
+core.
 """
 
 import math

@@ -65,7 +65,7 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
 
 def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
     """Return the joint-space inertia M of all joints of the tree [kg·m² or kg], (J−1, J−1)."""
-    # Pinocchio fills the upper triangle only.
+    # Add the lower triangle, which pinocchio does not fill.
     upper = np.triu(pin.crba(model, data, q))
     return upper + np.triu(upper, 1).T
 

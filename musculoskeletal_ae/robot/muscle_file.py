@@ -100,7 +100,7 @@ class MuscleEntry(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         """Check the name and the order of the route."""
-        # Messages join the names of several muscles with commas.
+        # Refuse commas, because messages join the names of several muscles with commas.
         if self.name != self.name.strip() or ',' in self.name:
             problem = 'name: expected a name without a comma and without spaces around it'
             raise ValueError(f'{problem}, got {self.name!r}')

@@ -110,7 +110,7 @@ class Routes:
     def _attach_objects(self, routes: Sequence[Route]) -> tuple[Ints, WrapObjects | None]:
         parts = [branch for route in routes for branch in branches(route)]
         steps = [step for branch in parts for step in pairwise(branch)]
-        # Every segment begins at a point; a wrap lies within one.
+        # Number the segments by their start points, because a wrap lies within a segment.
         segment = np.cumsum([isinstance(item, RoutePoint) for item, _ in steps]) - 1
         wraps = {s: end for s, (_, end) in zip(segment, steps) if isinstance(end, Wrap)}
         if not wraps:

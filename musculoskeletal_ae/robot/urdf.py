@@ -99,7 +99,7 @@ def parse_xml(file: Path, text: str) -> ET.Element:
             level, depth = [child for element in level for child in element], depth + 1
         if depth > DEEPEST:
             raise ValueError(f'elements are nested {depth} levels deep; legal: at most {DEEPEST}')
-        # The URDF parser ignores a default namespace.
+        # Remove a default namespace, because the URDF parser ignores it too.
         if space := root.tag.rpartition('}')[0]:
             for element in root.iter():
                 element.tag = element.tag.removeprefix(space + '}')
@@ -208,7 +208,7 @@ def _check(part: str, element: ET.Element) -> None:
         if (text := element.get(attribute)) is None:
             continue
         try:
-            # Python accepts 1_000 and the digits of other alphabets; the URDF parser does not.
+            # Refuse 1_000 and digits of other alphabets, which only Python accepts as numbers.
             values = [float(word) for word in text.split() if word.isascii() and '_' not in word]
         except ValueError:
             values = []

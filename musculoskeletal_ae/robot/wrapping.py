@@ -152,7 +152,7 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
             good = -1e4
         if good > best:
             best, arc = good, (way * (end - start)) % (2.0 * math.pi)
-            # Rounding may turn an arc of length zero into one of almost a full turn.
+            # Exclude almost full turns, because rounding may make one of an arc of length zero.
             wraps = not crosses and arc < 2.0 * math.pi - 1e-9
             length = math.sqrt(far**2 - r * r) + math.sqrt(near**2 - r * r) + r * arc
             # The tangent at the point of contact has the direction of rotation.

@@ -56,12 +56,12 @@ def test_unknown_values_are_shown_with_the_missing_topic():
 def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
     node = graph.host(bringup_status.BringupStatus, robot='arm26')
     node.anomalies.append(0.5)
-    node._measured(np.zeros(2))
-    node._estimated(np.ones(2))
+    node._on_measured_posture(np.zeros(2))
+    node._on_estimate(np.ones(2))
     node._print()
     assert 'error 1.414 rad  A 0.500' in capsys.readouterr().out
     node.measured = node.measured[0] - 2.0, node.measured[1]
-    node._estimated(np.ones(2))
+    node._on_estimate(np.ones(2))
     node._print()
     assert 'error waits for joint_states' in capsys.readouterr().out
 

@@ -65,7 +65,7 @@ def test_a_hand_pose_is_reached_and_one_in_another_frame_refused(arm):
     wanted = robot.kinematics.end_effector_pose(HERE).translation
     place = message.pose.position
     place.x, place.y, place.z = wanted.tolist()
-    message.pose.orientation.w = 0.0  # position only
+    message.pose.orientation.w = 0.0  # a target without an orientation
     message.header.frame_id = 'elsewhere'
     publisher.publish(message)
     graph.wait(lambda: rejected['target_pose: wrong frame'] == 1, 'the rejection')

@@ -73,7 +73,7 @@ def test_the_simulator_rests_at_the_tension_bias_before_a_command(arm, arm26, co
     arm.wait(lambda: markers, 'markers')
     muscles = [m for m in markers[-1].markers if m.ns == 'muscles']
     assert len(muscles) == 6
-    assert all((m.color.r, m.color.g) == (0.0, 1.0) for m in muscles)  # green at bias
+    assert all((m.color.r, m.color.g) == (0.0, 1.0) for m in muscles)  # green at T_bias
     assert {m.header.frame_id for m in markers[-1].markers} == {arm26.root_link}
     assert arm.node.count_publishers('joint_states') == 0
 

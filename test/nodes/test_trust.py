@@ -200,7 +200,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
 
 
 def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
-    # Without the length the estimate is so wrong that the controller does not start.
+    # Without the length of this muscle, the estimate is too wrong for the controller to start.
     muscle = 'deltoid_anterior'
     graph.host(HardwareEmulator, robot='arm26', seed=0, ruptured_muscles=[muscle])
     graph.listen(Float64MultiArray, 'muscle_states')
