@@ -45,6 +45,7 @@ LATEST = 10.0  # longest time from a rupture to its isolation [s]
 KINDS = {
     'stiffness': {'actuation': 'stiffness'},
     'position': {'actuation': 'position'},
+    'position-current': {'actuation': 'position', 'tension_source': 'current'},
     'position-none': {'actuation': 'position', 'tension_source': 'none'},
 }
 HEAD = (

@@ -17,7 +17,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 PERIOD = 0.01  # [s] between two readings
 
@@ -51,7 +51,7 @@ for theta in robot.random_postures(options.postures, rng):
         learner.step(time, read.theta, read.tension, read.length)
     estimates = [
         # Bone-side tension: T minus the tendon friction that the network has learned.
-        mae.estimate(end_tension(mae.friction, read.tension, sliding), read.length).theta
+        mae.estimate(mae.transmission.end(read.tension, sliding), read.length).theta
         for mae in (initial, learner.mae)
     ]
     errors.append([np.linalg.norm(estimate - read.theta) for estimate in estimates])

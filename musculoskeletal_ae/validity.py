@@ -18,6 +18,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 
 MOST_ENTRIES = 10_000  # far more than any arm needs; longer messages are rejected unread
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)  # [N], [N·m] at the end effector
@@ -47,23 +48,23 @@ def read_muscle_states(
     muscles: int,
     isolated: Sequence[int] | Ints = (),
     unknown: float = 0.0,
-    needs_tension: bool = True,
+    source: TensionSource = TENSION_SENSOR,
 ) -> Array:
-    """Return length [m], tension [N] and temperature of a Float64MultiArray, (3, M).
+    """Return length [m], tension T_read [N] and temperature of a Float64MultiArray, (3, M).
 
     A temperature of NaN means that it is not measured. Isolated muscles may have any values:
     those not finite or beyond ±MOST_ISOLATED are replaced by `unknown`, temperatures by NaN.
-    Without `needs_tension`, tensions may have any values as well, and are returned as NaN.
+    Motor currents are converted to T_read. If `source` knows no tension, tensions may have any
+    values as well, and are returned as NaN.
     """
     values = _values(message, len(QUANTITIES), muscles)
     usable = np.isfinite(values)
-    if not needs_tension:
-        values[1], usable[1] = np.nan, True
+    values[1] = source.from_message(values[1])
+    usable[1] |= not source.is_known
     if len(isolated) == 0 and usable.all():
         return values
     replaced = ~(np.abs(values) < MOST_ISOLATED) & np.isin(np.arange(muscles), isolated)
-    if not needs_tension:
-        replaced[1] = False
+    replaced[1] &= source.is_known
     values[replaced] = unknown
     values[2, replaced[2]] = np.nan
     usable |= replaced

@@ -30,6 +30,7 @@ def sample(length, tension, robot=ROBOT, temperature=30.0):
         time=0.0,
         length=states[0],
         length_read=states[0],
+        tension_read=states[1],
         motor_tension=states[1],
         bone_tension=states[1],
         sliding=np.zeros(robot.muscle_count),

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.signals.friction import Transmission
+
 
 class ExactMae:
     """The methods of a `Mae` that control uses, computed from the geometric model."""
@@ -12,6 +14,7 @@ class ExactMae:
     def __init__(self, robot: Any) -> None:
         self.robot = robot
         self.friction = np.zeros(robot.muscle_count)
+        self.transmission = Transmission(self.friction)
         self.elasticity = self.touch = None
         self.offset = 0.0  # [m] on every length, to tell two networks apart
         self.fail: Exception | None = None

@@ -144,7 +144,7 @@ def read_streams(
         muscle_stream.use_body(_body_at(came, muscle_stream.body, isolated, offsets))
         sample = muscle_stream.take(interface.reading(message), came)
         has_offsets.append(muscle_stream.body.offsets.known)
-        return np.array([sample.length, sample.motor_tension, sample.temperature])
+        return np.array([sample.length, sample.tension_read, sample.temperature])
 
     def posture(message: Any, _: float) -> Array:
         theta = read_posture(message, joints, some=True)

@@ -224,7 +224,7 @@ class Controller:
     def use(self, mae: Mae) -> None:
         """Use another network, which has been validated."""
         self.mae, self.watchdog.has_checkpoint = mae, True
-        self.stream.use_friction(mae.friction)
+        self.stream.use_transmission(mae.transmission)
         robot = self.robot.with_elasticity(mae.elasticity)
         if robot is not self.robot:
             self.robot = robot

@@ -23,7 +23,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
@@ -63,6 +63,13 @@ def check_method(robot: Robot, settings: Settings) -> None:
     Raises:
         MusculoskeletalError: If they cannot; the text names the reason and the legal methods.
     """
+    if robot.tension_source.is_current and settings.method in BY_TENSION:
+        legal = tuple(method for method in METHODS if method not in BY_TENSION)
+        raise MusculoskeletalError(
+            f'method {settings.method!r} regulates measured tensions, and tension_source of '
+            'muscles.yaml is current: the friction of a resting drive hides the force of a hand; '
+            f'legal: {", ".join(legal)}'
+        )
     if robot.knows_tension:
         return
     legal = WITHOUT_TENSION.get(settings.preset, OTHERS_WITHOUT_TENSION)

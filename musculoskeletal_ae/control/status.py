@@ -99,9 +99,22 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         warnings.append('the length offsets are unknown, so the arm can only explore gently')
     if not robot.knows_tension:
         values['tension'] = f'tension_source: none: {NO_TENSION}'
+    elif robot.tension_source.is_current:
+        values['tension'] = f'tension_source: current: {_learned(core)}'
     if tense := core.watchdog.overload.tense:
         warnings.append(f'too much tension: {", ".join(tense)}')
     return warnings + _heat_warnings(core, values)
+
+
+def _learned(core: Controller) -> str:
+    """Return the learned friction of the drives, or that it has not been learned."""
+    drive = None if core.mae is None else core.mae.transmission.drive
+    if drive is None:
+        return 'the friction of the drives has not been learned; tensions are inaccurate'
+    each = zip(core.robot.muscles, np.exp(drive[0]), drive[2], strict=True)
+    return 'learned scale and friction of the drives: ' + ', '.join(
+        f'{name} {scale:.2f} and {friction:.0f} N' for name, scale, friction in each
+    )
 
 
 def _heat_warnings(core: Controller, values: dict[str, str]) -> list[str]:

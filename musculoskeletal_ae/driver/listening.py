@@ -20,7 +20,7 @@ from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import length_range
+from musculoskeletal_ae.signals.limits import length_range, reading_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.validity import (
@@ -58,7 +58,7 @@ MOST_SAMPLES = 400
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},
-    'tension': {'mN': 1e-3, 'cN': 1e-2},
+    'tension': {'mN': 1e-3, 'cN': 1e-2},  # mA of motor currents
     'temperature': {'m°C': 1e-3, 'c°C': 1e-2, 'tenths of °C': 0.1},
 }
 
@@ -99,9 +99,12 @@ class Listening:
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
         (low, high), most = length_range(robot), robot.tension.max
         ones, beyond, (coldest, hottest) = np.ones_like(most), BEYOND[not zeroed], TEMPERATURES
+        least, most = -0.02 * most, 1.1 * most
+        if robot.tension_source.is_current:  # includes drive friction, and its scale is not learned
+            least, most = reading_range(robot)
         #: range of possible values, (3, M)
-        self._low = np.stack([low - beyond, -0.02 * most, coldest * ones])
-        self._high = np.stack([high + beyond, 1.1 * most, hottest * ones])
+        self._low = np.stack([low - beyond, least, coldest * ones])
+        self._high = np.stack([high + beyond, most, hottest * ones])
 
     @property
     def count(self) -> int:
@@ -122,7 +125,7 @@ class Listening:
         with self._rejecting(topic):
             reading = self._motors.reading(message)
             states = read_muscle_states(
-                reading, self._robot.muscle_count, needs_tension=self._robot.knows_tension
+                reading, self._robot.muscle_count, source=self._robot.tension_source
             )
             self._read.append((states, self._theta))
 
@@ -217,7 +220,7 @@ class Listening:
             )
             if possible.all() and (not what or is_usual):
                 if what:
-                    verdict.failed(what, **texts)
+                    verdict.failed(self._of_source(what), **texts)
                     return False
                 verdict.passed('unit')
                 if np.isnan(states[2]).any():
@@ -227,8 +230,15 @@ class Listening:
                 return True
         for row, m in np.argwhere(~possible).tolist():
             value, low, high = distinct(states[row, m], self._low[row, m], self._high[row, m])
-            verdict.failed(QUANTITIES[row], m, value=f'{value}, possible {low} to {high},')
+            what = self._of_source(QUANTITIES[row])
+            verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
         return False
+
+    def _of_source(self, fault: str) -> str:
+        """Return the fault of motor currents that corresponds to one of tensions."""
+        if not self._robot.tension_source.is_current:
+            return fault
+        return fault.replace('tension', 'current')
 
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
         """Check T and temperature in `states` (3, M) of modules without commands."""

@@ -49,6 +49,10 @@ ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]; prismatic joints: time
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
+CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
+#: errors of a motor current as a measure of tension: standard deviations of the logarithm of the
+#: scale and of the offset [N], and mean drive friction as a share of T_limit
+CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
 ACCELERATION_NOISE = 0.05  # [m/s²]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
 
@@ -202,6 +206,12 @@ class Arm(ABC):
         self._rng = np.random.default_rng([seed, 0x5E45])
         self._heat_rng = np.random.default_rng([seed, 0x4EA7])
         self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))
+        rng, count = np.random.default_rng([seed, 0xD21E]), robot.muscle_count
+        #: of readings of motor currents: factor of the tension, offset [N], drive friction [N]
+        self._current_scale = np.exp(rng.normal(0.0, CURRENT_SCALE, count))
+        self._current_zero = rng.normal(0.0, CURRENT_ZERO, count)
+        share = DRIVE_FRICTION * rng.uniform(0.5, 1.5, count)
+        self._drive_friction: Array = share * robot.description.tension.limit
         self._wrench = np.zeros(6)
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
@@ -383,10 +393,20 @@ class Arm(ABC):
             np.where(ruptured, 0.0, np.maximum(measured, 0.0)),
             noisy(housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION, rng),
         )
+        if self.robot.tension_source.is_current:
+            readings = readings._replace(tension=self._read_currents(tension))
         readings = self.faults.apply(readings)
         if not self.robot.knows_tension:
             readings = readings._replace(tension=np.full_like(readings.tension, np.nan))
         return readings
+
+    def _read_currents(self, tension: Array) -> Array:
+        """Return T_read of the motor currents [N] for raw T [N] (M,), with drive friction."""
+        muscle = self._muscle
+        pull = np.where(muscle.ruptured > 0.0, 0.0, tension)
+        pull = pull + self._drive_friction * muscle.sliding
+        read = self._current_scale * pull + self._current_zero
+        return noisy(read, CURRENT_NOISE, CURRENT_RESOLUTION, self._rng)
 
     @property
     def hand(self) -> pin.SE3:

@@ -155,7 +155,7 @@ class Estimator:
         reduced = mae.without(isolated)
         self.health.use(reduced)
         self.contact.use(reduced)
-        self.stream.use_friction(reduced.friction)
+        self.stream.use_transmission(reduced.transmission)
         self.state.use(mae, isolated)
         self._use_body(self.body.with_isolated(isolated))
         if self.calibration is not None:

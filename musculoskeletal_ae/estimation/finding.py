@@ -102,6 +102,7 @@ def observe(
         time=math.nan,
         length=length,
         length_read=length,
+        tension_read=motor_tension,
         motor_tension=motor_tension,
         bone_tension=bone_tension,
         sliding=unknown,

@@ -56,8 +56,8 @@ class HealthyTorque:
         self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Update σ from T [N] and l [m], (M,), of a healthy arm, dt [s] after the previous ones."""
-        end = self._direction.end_tension(self._mae.friction, tension, length)
+        """Update σ from T_read [N] and l [m], (M,), of a healthy arm, dt [s] after the last."""
+        end = self._direction.end_tension(self._mae.transmission, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._contact.step(theta, end, dt).torque
         if np.linalg.norm(self._contact.velocity / self._radian) < MOVING:

@@ -49,8 +49,8 @@ class ContactLoop(ClosedLoop):
     def contact(self, exploring: bool = False) -> Contact:
         """Advance by one message; return its contact estimate."""
         _ = self.explore() if exploring else self.step()
-        length, friction = self._read.length, self.mae.friction
-        end = self._friction.end_tension(friction, self._read.tension, length)
+        length, transmission = self._read.length, self.mae.transmission
+        end = self._friction.end_tension(transmission, self._read.tension, length)
         return self._contact.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
     def contacts_during(self, duration: float, exploring: bool = False) -> list[Contact]:

@@ -16,6 +16,7 @@ from musculoskeletal_ae.experiments.recording import (
     Recording,
     columns,
     end_tensions,
+    motor_tensions,
     rows_between,
 )
 from musculoskeletal_ae.mae.mae import Mae
@@ -125,7 +126,8 @@ def run_detector(robot: Robot, mae: Mae, recording: Recording) -> DetectorOutput
     health.use(mae)
     bone_tensions = end_tensions(mae, recording)
     restored = mae.estimate(bone_tensions, recording.length)
-    messages = zip(recording.length, recording.tension, bone_tensions, strict=True)
+    tensions = motor_tensions(mae, recording)
+    messages = zip(recording.length, tensions, bone_tensions, strict=True)
     for n, (length, tension, bone_tension) in enumerate(messages):
         command = recording.command[n]
         demand = None if robot.follows_position else robot.demanded(length, command)

@@ -108,7 +108,7 @@ def teach_and_evaluate(
             samples.append(len(learner.samples))
             errors.append(error(mae))
         _, sensor, length, tension, _ = row
-        end = direction.end_tension(mae.friction, tension, length)
+        end = direction.end_tension(mae.transmission, tension, length)
         running.append(float(np.linalg.norm(mae.estimate(end, length).theta - sensor)))
         learner.step(n * SAMPLE_TIME, sensor, tension, length)
         rows.append(row)

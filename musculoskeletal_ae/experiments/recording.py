@@ -21,7 +21,7 @@ from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
-from musculoskeletal_ae.signals.friction import FrictionDirection, directions, end_tension
+from musculoskeletal_ae.signals.friction import FrictionDirection, directions
 
 PAID_OUT = 0.1  # a muscle this much longer than its command is slack in any posture [m]
 SAMPLE_TIME = 0.01  # time between two messages [s]; the modules report at 100 Hz
@@ -39,7 +39,7 @@ class Recording(NamedTuple):
     theta: Array  # true joint angles [rad], (N, D)
     theta_sensor: Array  # joint-sensor readings [rad], (N, D)
     length: Array  # measured lengths [m], (N, M)
-    tension: Array  # measured tensions [N], (N, M)
+    tension: Array  # measured tensions T_read [N], (N, M)
     command: Array  # l_target [m], (N, M)
 
     def part(self, rows: slice) -> Recording:
@@ -91,10 +91,10 @@ class ClosedLoop:
 
     def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (for subclasses)
         """Estimate θ [rad] (D,) from the readings at `now` [s]."""
-        friction, length = self.mae.friction, read.length
+        length = read.length
         if not self.arm.robot.knows_tension:
             return self.mae.estimate(self.arm.robot.assumed_tension, length).theta
-        end = self._direction.end_tension(friction, read.tension, length)
+        end = self._direction.end_tension(self.mae.transmission, read.tension, length)
         return self.mae.estimate(end, length).theta
 
     def on_command(self, command: Command | None, now: float) -> None:
@@ -202,8 +202,12 @@ def mean_error(estimate: Array, truth: Array) -> float:
 
 def end_tensions(mae: Mae, recording: Recording) -> Array:
     """Return T_end [N] (N, M) of a recording by a network's friction, as the nodes compute it."""
-    direction = directions(recording.length)
-    return end_tension(mae.friction, recording.tension, direction)
+    return mae.transmission.end(recording.tension, directions(recording.length))
+
+
+def motor_tensions(mae: Mae, recording: Recording) -> Array:
+    """Return T [N] (N, M) of a recording, as the nodes compute it."""
+    return mae.transmission.motor(recording.tension, directions(recording.length))
 
 
 def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
@@ -215,7 +219,7 @@ def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae]
     part = recording.part(np.s_[::stride])
 
     def error(mae: Mae) -> float:
-        tension = end_tension(mae.friction, part.tension, direction)
+        tension = mae.transmission.end(part.tension, direction)
         return mean_error(mae.estimate(tension, part.length).theta, part.theta)
 
     return error

@@ -29,8 +29,10 @@ from musculoskeletal_ae.learning import springs
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.signals.friction import end_tension
+from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
 
+#: largest |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
+LARGEST_DRIVE = np.array([LARGEST_GAIN, 1.0, 1.0])
 FEATURES = 60  # number of random features drawn for each muscle
 WIDTH = 0.35  # width of the kernel that the features approximate, as a share of the joint ranges
 #: Share of the variance of the features that is dropped with the directions that vary least. These
@@ -48,7 +50,9 @@ class Layout:
     δ has three values for each route point.
     """
 
-    def __init__(self, points: Ints, weights: Array, features: int) -> None:
+    def __init__(
+        self, points: Ints, weights: Array, features: int, with_drive: bool = False
+    ) -> None:
         end = 3 * len(points)
         self.points = points  # indices of the muscle's route points
         #: weight of each line between consecutive route points in the muscle's length
@@ -57,8 +61,11 @@ class Layout:
         #: κ: logarithms of force, rate and wire_stretch relative to their nominal values
         self.elastic = slice(end, end + 3)
         self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
-        self.size = end + 6 + features
-        self.rest = slice(end + 6, self.size)  # v [m]
+        last = end + 6 + features
+        self.rest = slice(end + 6, last)  # v [m]
+        #: γ, b/T_limit and F/T_limit of `Transmission` where motor currents are measured
+        self.drive = slice(last, last + 3 * with_drive)
+        self.size = last + 3 * with_drive
 
 
 class ResidualModel(NamedTuple):
@@ -137,6 +144,9 @@ class CalibratedBody:
             smooth: The residual model of each muscle; None to draw new ones.
         """
         self.robot, routes = robot, robot.routes
+        self._has_drive, limit = robot.tension_source.is_current, robot.description.tension.limit
+        #: units of the parameters of a drive: γ, b and F, (3, M)
+        self.drive_units: Array = np.array([np.ones_like(limit), limit, limit])
         if smooth is None:
             rng = np.random.default_rng([seed, 0xF0])
             theta = robot.random_postures(POSTURES, np.random.default_rng([seed, 0xF1]))
@@ -147,7 +157,7 @@ class CalibratedBody:
             points = np.union1d(routes.first[segments], routes.second[segments])
             weights = np.zeros(len(points) - 1)  # 0 between the end of a branch and the next one
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
-            self.layouts.append(Layout(points, weights, own.basis.shape[1]))
+            self.layouts.append(Layout(points, weights, own.basis.shape[1], self._has_drive))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         # The next fit starts from these values:
         #: joint-sensor offsets [rad], (D,)
@@ -194,6 +204,43 @@ class CalibratedBody:
         value = self.parameters[m][self.layouts[m].friction]
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 
+    @property
+    def drive(self) -> Array | None:
+        """γ, b [N] and F [N] of every muscle, (3, M); None for tension sensors."""
+        count = len(self.layouts)
+        return np.array([*map(self._drive, range(count))]).T if self._has_drive else None
+
+    def _drive(self, m: int) -> Array:
+        """Return γ, b [N] and F [N] of one muscle, (3,)."""
+        own = self.parameters[m][self.layouts[m].drive]
+        drive: Array = self.drive_units[:, m] * np.clip(own, -LARGEST_DRIVE, LARGEST_DRIVE)
+        return drive
+
+    @property
+    def transmission(self) -> Transmission:
+        """What lies between readings of tension and T_end."""
+        return Transmission(self.frictions(), self.drive)
+
+    def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
+        """Return T_end [N] (N,) of one muscle, and its derivatives by μ, γ, b and F (N, 1 or 4).
+
+        Args:
+            m: The muscle.
+            tension: T or T_read [N], (N,).
+            direction: Direction of sliding s, (N,).
+        """
+        passed = np.exp(-self.friction(m) * direction)
+        if not self._has_drive:
+            end = tension * passed
+            return end, -(direction * end)[:, None]
+        gain, offset, drive_friction = self._drive(m)
+        scaled = np.exp(gain) * tension
+        motor = scaled - offset - drive_friction * direction
+        pulls = passed * (motor > 0.0)
+        end = motor * pulls
+        slopes = -direction * end, scaled * pulls, -pulls, -direction * pulls
+        return end, np.stack(slopes, axis=1) * np.append(1.0, self.drive_units[:, m])
+
     def crept(self, age: Array) -> Array:
         """Return the creep of each muscle since each sample [m], (N, M), for ages a (N,)."""
         rates = [p[at.creep] for p, at in zip(self.parameters, self.layouts, strict=True)]
@@ -232,9 +279,9 @@ class CalibratedBody:
             absolute, at_zero = absolute[:-1], absolute[-1]
             fixed = absolute - at_zero + self.parameters[m][layout.offset]
             fixed += self.smooth[m].at(theta) @ self.parameters[m][layout.rest]
-            elastic, friction = self.elastic(m), self.friction(m)
+            elastic = self.elastic(m)
             for lengths, s in zip(result, direction, strict=True):
-                end = end_tension(friction, tension[:, m], s[:, m])
+                end, _ = self.end(m, tension[:, m], s[:, m])
                 lengths[:, m] = fixed - elastic.elongation(absolute, end)
         return result
 
@@ -264,7 +311,8 @@ class CalibratedBody:
         whole = norm @ layout.weights + poses.detour[:, m]
         absolute, at_zero = whole[:-1], whole[-1]
         elastic = self.elastic(m)
-        end = np.maximum(end_tension(self.friction(m), tension, direction), 0.0)
+        end, by_losses = self.end(m, tension, direction)
+        end = np.maximum(end, 0.0)
         length = absolute - at_zero - elastic.elongation(absolute, end)
         length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]
         length -= age * parameters[layout.creep]
@@ -279,7 +327,9 @@ class CalibratedBody:
             ],
             axis=1,
         )
-        jacobian[:, layout.friction] = elastic.compliance(absolute, end) * end * direction
+        by_losses = -elastic.compliance(absolute, end)[:, None] * by_losses
+        jacobian[:, layout.friction] = by_losses[:, 0]
+        jacobian[:, layout.drive] = by_losses[:, 1:]
         jacobian[:, layout.offset], jacobian[:, layout.creep] = 1.0, -np.asarray(age)
         jacobian[:, layout.rest] = smooth
         return length, jacobian

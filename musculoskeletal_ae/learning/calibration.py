@@ -26,7 +26,6 @@ from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStor
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
-from musculoskeletal_ae.signals.friction import end_tension
 
 CAPACITY = 4000  # default of the largest number of kept messages
 SPACING = 0.1  # time between kept messages [s]
@@ -190,7 +189,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     if len(healthy.messages) < 2:
         return None
     tension, length, direction = np.split(healthy.messages.astype(float), 3, axis=1)
-    tension = end_tension(mae.friction, tension, direction)
+    tension = mae.transmission.end(tension, direction)
     state = mae.estimate(tension, length)
     error = residuals(state, tension, length, mae.isolated)
     sound = ~_glitches(error)

@@ -169,7 +169,7 @@ class SampleCollector:
             sample = replace(
                 sample,
                 length=np.where(used, sample.length, 0.0),
-                motor_tension=np.where(used, sample.model_tension, 0.0),
+                tension_read=np.where(used, sample.learned_tension, 0.0),
                 sliding=np.where(used, sample.sliding, 0.0),
             )
         return self._pairing.muscles(time, sample)
@@ -194,7 +194,7 @@ class SampleCollector:
         message = paired.message
         reading = Sample(
             theta,
-            message.model_tension,
+            message.learned_tension,
             message.length,
             message.sliding,
             self._spread,

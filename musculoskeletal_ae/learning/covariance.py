@@ -137,4 +137,4 @@ def ellipsoids(covariance: Array, error: Array) -> Array:
 
 def observed_theta(mae: Mae, observed: Observations) -> Array:
     """Return θ [rad] (N, D) as a network estimates it from observations."""
-    return mae.estimate(observed.end_tension(mae.friction), observed.length).theta
+    return mae.estimate(observed.end_tension(mae.transmission), observed.length).theta

@@ -100,7 +100,7 @@ def _reopened(
 ) -> MusclePrior:
     """Return a wide prior around a muscle's earlier parameters if it was changed, else `prior`."""
     # Exclude tensions of 0 N, which mean that the muscle was isolated.
-    before = ~observed.known[:, m] & (observed.tension[:, m] > 0.0)
+    before = ~observed.known[:, m] & (observed.tension[:, m] != 0.0)
     if before.sum() < LEAST_BEFORE_CHANGE:
         return prior
     poses = body.poses(observed.theta)
@@ -197,6 +197,7 @@ class MuscleFit:
 
 NETWORK_STATES = 400  # number of states at which the network is evaluated
 NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
+FIXED = 1e-6  # prior spread of a parameter that a fit must not change
 
 
 def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
@@ -212,12 +213,16 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     tension = rng.uniform(robot.tension.bias, robot.tension.limit, shape)
     everything = np.ones(shape, dtype=bool)
     lengths = mae.lengths(theta, tension)
-    observed = Observations(theta, tension, lengths, np.zeros(shape), everything)
+    read = mae.transmission.reading(tension, np.zeros(shape))
+    observed = Observations(theta, read, lengths, np.zeros(shape), everything)
     poses = body.poses(theta)
     for m, layout in enumerate(body.layouts):
-        mean = PRIOR.mean(layout)
+        mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
+        spread[layout.drive] = FIXED  # these lengths carry no information about the drive either
         if mae.touch is not None:  # these lengths carry no information about friction
             mean[layout.friction] = mae.friction[m]
-        prior = MusclePrior(mean, PRIOR.spread(layout))
+            if mae.touch.drive is not None:
+                mean[layout.drive] = mae.touch.drive[:, m] / body.drive_units[:, m]
+        prior = MusclePrior(mean, spread)
         problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
         body.parameters[m] = problem.run()

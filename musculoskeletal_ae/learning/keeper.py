@@ -103,10 +103,10 @@ class CheckpointKeeper:
     ) -> None:
         """Process a plausible message, `dt` [s] after the previous one, and measured θ (D,)."""
         self._time += dt
-        self.validation.message(message.model_tension, message.length, self._time, theta)
+        self.validation.message(message.learned_tension, message.length, self._time, theta)
         # The healthy torque is used for contact detection. It cannot be computed without tensions.
         if self.mae is not None and not is_anomaly and self._knows_tension:
-            self._torque.step(message.motor_tension, message.length, dt)
+            self._torque.step(message.tension_read, message.length, dt)
 
     def forget_messages(self) -> None:
         """Discard the messages used for validation, for example after the body state changed."""

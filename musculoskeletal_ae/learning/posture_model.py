@@ -23,7 +23,6 @@ from musculoskeletal_ae.learning import springs
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
-from musculoskeletal_ae.signals.friction import end_tension
 
 DIFFERENCE = 1e-6  # step of the finite differences [rad] or [m]
 #: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]; for prismatic
@@ -143,9 +142,11 @@ class PostureModel:
             length[:, m] = observed.length[:, m] - l_m[0]
             by_body.append(j_m[0])
             slope[:, m, turns] = (l_m[1:] - l_m[0]).T / DIFFERENCE
-            end[:, m] = end_tension(body.friction(m), tension, direction)
+            end[:, m], by_losses = body.end(m, tension, direction)
             block = (j_m[1:] - j_m[0]) * (end[:, m, None] / DIFFERENCE)
-            block[:, :, body.layouts[m].friction] -= direction * end[:, m] * slope[:, m, turns].T
+            layout, arms = body.layouts[m], slope[:, m, turns].T
+            block[:, :, layout.friction] += by_losses[:, 0] * arms
+            block[:, :, layout.drive] += arms[:, :, None] * by_losses[:, 1:]
             torque_by_body[:, turns, columns[m]] = block.swapaxes(0, 1)
         muscular = end[:, :, None] * slope
         nominal = self._kinematics.elasticity
@@ -200,7 +201,9 @@ class PostureModel:
         moved = np.flatnonzero(~(np.abs(own - at) < REUSED_MOTION * radian).all(axis=1))
         hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
         self._bent.theta[np.ix_(moved, joints)] = own[moved]
+        read, direction = self.observed.tension[moved], self.observed.direction[moved]
+        tension = self.body.transmission.motor(read, direction)
         self._bent.stiffness[np.ix_(moved, joints, joints)] = np.einsum(
-            'nm,nmij->nij', self.observed.tension[moved], hessian
+            'nm,nmij->nij', tension, hessian
         )
         return self._bent.stiffness[:, joints[:, None], joints]

@@ -34,6 +34,10 @@ class Prior:
     offset: float = 0.001  # σ of the offset of the length sensor [m]
     creep: float = 1e-5  # σ of the creep of a tendon from one sample to the next [m]
     smooth: float = 0.002  # σ of the parameters of the residual model [m]
+    #: σ of the logarithm of a motor current's scale, and of its offset and drive friction as shares
+    #: of T_limit
+    drive: tuple[float, float, float] = (0.2, 0.05, 0.1)
+    drive_friction_mean: float = 0.08  # mean of the drive friction as a share of T_limit
 
     def spread(self, layout: Layout) -> Array:
         """Return the prior spread s of every parameter of a muscle."""
@@ -43,12 +47,14 @@ class Prior:
         spread[layout.friction] = self.friction
         spread[layout.offset], spread[layout.creep] = self.offset, self.creep
         spread[layout.rest] = self.smooth
+        spread[layout.drive] = self.drive[: layout.drive.stop - layout.drive.start]
         return spread
 
     def mean(self, layout: Layout) -> Array:
         """Return the prior mean of every parameter of a muscle."""
         mean = np.zeros(layout.size)
         mean[layout.friction] = self.friction_mean
+        mean[layout.drive][2:] = self.drive_friction_mean
         return mean
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.signals.friction import end_tension
+from musculoskeletal_ae.signals.friction import Transmission
 
 CAPACITY = 400  # default of the largest number of samples in a store
 #: Tendon creep is estimated once the number of accepted samples exceeds this share of the capacity,
@@ -102,13 +102,13 @@ class Observations:
         """Return (θ, T, l)."""
         return State(self.theta, self.tension, self.length)
 
-    def end_tension(self, friction: Array) -> Array:
+    def end_tension(self, transmission: Transmission) -> Array:
         """Return the tension at the elastic elements [N], (N, M), which a network takes as input.
 
         Args:
-            friction: Tendon friction μ of each muscle, (M,).
+            transmission: What lies between the readings and the elastic elements.
         """
-        return end_tension(friction, self.tension, self.direction)
+        return transmission.end(self.tension, self.direction)
 
     def with_all_angles(self) -> Observations:
         """Return the samples with all joint angles measured."""

@@ -41,6 +41,7 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     joints: tuple[str, ...]
     muscles: tuple[str, ...]
+    tension_source: str
     samples: tuple[SavedSample, ...]
     network: bytes | None
 
@@ -49,7 +50,7 @@ def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedS
     """Return the state to be saved: the samples of a store, and a checkpoint's content."""
     stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
     saved = tuple(_saved(number, sample, known) for number, sample, known in stored)
-    return SavedState(robot.joints, robot.muscles, saved, network)
+    return SavedState(robot.joints, robot.muscles, robot.tension_source.kind, saved, network)
 
 
 def _saved(number: int, sample: Sample, known: Bools) -> SavedSample:
@@ -95,6 +96,11 @@ def from_bytes(data: bytes, robot: Robot) -> SavedState:
             f'the state belongs to a robot with joints {", ".join(state.joints)} and muscles '
             f'{", ".join(state.muscles)}; this robot has {", ".join(robot.joints)} and '
             f'{", ".join(robot.muscles)}'
+        )
+    if state.tension_source != robot.tension_source.kind:
+        raise StateError(
+            f'the state was learned with tension_source {state.tension_source!r}; this robot has '
+            f'{robot.tension_source.kind!r}'
         )
     for sample in state.samples:
         if not _fits(sample, robot, len(state.muscles)):

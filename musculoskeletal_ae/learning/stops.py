@@ -139,7 +139,7 @@ class Stops:
         # Samples from before the change of a muscle give no torque balance, because its earlier
         # torque cannot be computed from its new parameters. A tension of 0 N, however, means that
         # the muscle was only isolated.
-        changed = ~observed.known & (observed.tension > 0.0)
+        changed = ~observed.known & (observed.tension != 0.0)
         #: joints whose torque balance is informative, (N, D)
         self.is_balanced = ~(changed @ robot.routes.crossed)
         if not robot.knows_tension:

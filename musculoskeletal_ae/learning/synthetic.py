@@ -56,7 +56,8 @@ def synthetic_samples(
     tension = held_tensions(robot, count, rng)
     # Draw directions mostly near −1 and 1, where sliding leaves them most of the time.
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
-    length, scattered = body.lengths(theta, tension, np.zeros(shape), UNKNOWN_FRICTION * direction)
+    read = body.transmission.reading(tension, np.zeros(shape))
+    length, scattered = body.lengths(theta, read, np.zeros(shape), UNKNOWN_FRICTION * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
     true, entered = State(theta, tension, length), State(theta, tension, scattered)
     return TrainingData(entered.scaled(), true.scaled())

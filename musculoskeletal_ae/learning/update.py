@@ -124,7 +124,7 @@ class BodyUpdater(Updater):
         if len(real) == 0:
             return
         real = real[self._rng.integers(len(real), size=len(data.entered[places]))]
-        state = real.state()._replace(tension=real.end_tension(self.body.frictions()))
+        state = real.state()._replace(tension=real.end_tension(self.body.transmission))
         data.entered[places] = state.scaled()
         length = real.length + self.body.crept(real.age)
         data.true[places] = state._replace(length=length).scaled()

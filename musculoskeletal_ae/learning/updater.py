@@ -71,13 +71,15 @@ class Updater(ABC):
         before = self._mae.without(job.isolated)
         before = before if job.statistics_hold else uncalibrated(before)
         if self.body is not None:
-            touch = TouchStatistics(self.body.frictions(), np.ones(self._robot.joint_count))
+            touch = TouchStatistics(
+                self.body.frictions(), np.ones(self._robot.joint_count), drive=self.body.drive
+            )
             mae = replace(mae, touch=touch)
             if self.body.elasticity.is_present:
                 mae = replace(mae, elasticity=self.body.elasticity)
         mae = recalibrated(mae, before.anomaly, job.healthy, samples)
         if fit is not None and self.body is not None:
-            tension, judging = job.observed.end_tension(mae.friction), job.healthy.judging
+            tension, judging = job.observed.end_tension(mae.transmission), job.healthy.judging
             covariance = estimate_covariance(mae, self.body, fit, tension, self._seed, judging)
             mae = replace(mae, covariance=covariance)
         self._mae = mae

@@ -30,6 +30,7 @@ from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
+from musculoskeletal_ae.signals.friction import LARGEST_GAIN
 
 FORMAT_VERSION = 1  # version of the file format
 #: largest size of a checkpoint [bytes]; the networks of the shipped arms have a hundredth of it
@@ -76,6 +77,7 @@ class Metadata(Strict, frozen=True):
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None  # None: no touch statistics
     uncertain: bool  # whether the covariance of the estimates is included
+    drive: bool = False  # whether γ, b and F of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
 
     def __post_init__(self) -> None:
@@ -125,6 +127,8 @@ class Metadata(Strict, frozen=True):
             shapes['anomaly.postures'] = self.anomaly_postures, len(self.joints)
         if self.touch_time is not None:
             shapes |= {'touch.friction': (len(self.muscles),), 'touch.spread': (len(self.joints),)}
+        if self.touch_time is not None and self.drive:
+            shapes['touch.drive'] = 3, len(self.muscles)
         if self.uncertain:
             shapes['covariance'] = len(self.joints), len(self.joints)
         if self.elastic:
@@ -148,6 +152,8 @@ def to_bytes(mae: Mae) -> bytes:
     touch = mae.touch
     if touch is not None:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
+        if touch.drive is not None:
+            tensors['touch.drive'] = touch.drive
     if mae.covariance is not None:
         tensors['covariance'] = mae.covariance
     if (springs := mae.elasticity) is not None:
@@ -162,6 +168,7 @@ def to_bytes(mae: Mae) -> bytes:
         'anomaly_thresholds': {} if anomaly is None else dict(anomaly.thresholds),
         'anomaly_postures': 0 if anomaly is None else len(anomaly.postures),
         'touch_time': None if touch is None else touch.time,
+        'drive': touch is not None and touch.drive is not None,
         'uncertain': mae.covariance is not None,
         'elastic': mae.elasticity is not None,
     }
@@ -259,6 +266,10 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
         value_text, limit = distinct(most, LARGEST_FRICTION)
         problem = f'tensor touch.friction has a value of ±{value_text}; legal: at most {limit}'
         raise CheckpointError(problem)
+    if (most := np.abs(tensors.get('touch.drive', np.zeros((3, 1)))[0]).max()) > LARGEST_GAIN:
+        value_text, limit = distinct(most, LARGEST_GAIN)
+        problem = f'tensor touch.drive has a gain of ±{value_text}; legal: at most {limit}'
+        raise CheckpointError(problem)
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
             _check_covariance(name, tensors[name])
@@ -311,7 +322,8 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
     touch = None
     if meta.touch_time is not None:
         friction, spread = tensors['touch.friction'], tensors['touch.spread']
-        touch = TouchStatistics(friction, spread, meta.touch_time)
+        drive = tensors.get('touch.drive')
+        touch = TouchStatistics(friction, spread, meta.touch_time, drive)
     elasticity = None
     if meta.elastic:
         parts = ('stiffness', 'preload', 'damping')
@@ -338,6 +350,11 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
                 f'made for {kind} {", ".join(network_names)}; '
                 f'this robot has {", ".join(robot_names)}, in this order'
             )
+    if mae.transmission.drive is not None and not robot.tension_source.is_current:
+        raise CheckpointError(
+            'learned with motor currents (tension_source: current); '
+            f'this robot has tension_source: {robot.tension_source.kind}'
+        )
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)
     with np.errstate(all='ignore'):

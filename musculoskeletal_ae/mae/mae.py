@@ -44,6 +44,7 @@ from musculoskeletal_ae.mae.units import (
 )
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
+from musculoskeletal_ae.signals.friction import Transmission
 
 #: (weight, bias) of one layer
 Layer = tuple[Array, Array]
@@ -422,6 +423,11 @@ class Mae:
             healthy = self.anomaly.covariance[muscles:, muscles:][rows] / LENGTH_SCALE**2
             weight[rows] = np.linalg.inv(healthy + LENGTH_NOISE**2 * np.eye(len(used)))
         return weight
+
+    @property
+    def transmission(self) -> Transmission:
+        """What lies between readings of tension and T_end, as far as it has been learned."""
+        return Transmission(self.friction, None if self.touch is None else self.touch.drive)
 
     @property
     def friction(self) -> Array:

@@ -102,6 +102,9 @@ class TouchStatistics:
     friction: Array  # tendon friction μ of each muscle, (M,): T = T_end e^{±μ}
     spread: Array  # root mean square of τ_ext of the healthy moving arm [N·m], (D,); positive
     time: float = 0.0  # duration of the motion in which `spread` was measured [s]
+    #: γ, b [N] and F [N] of motor currents (`signals.friction.Transmission`), (3, M); None for
+    #: tension sensors
+    drive: Array | None = None
 
     @property
     def calibrated(self) -> bool:

@@ -156,7 +156,8 @@ class Arm(Shell):
     def publish_state(
         self, theta: Array, length: Array, tension: Array, temperature: Array
     ) -> None:
-        """Publish θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,)."""
+        """Publish θ [rad] (D,), l [m], T_read [N] and temperatures [°C] (M,)."""
+        tension = self.robot.tension_source.to_message(tension)
         stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
         if motors is not None and is_heard(motors):
             message = motor_message(self.motors, length, tension, stamp)

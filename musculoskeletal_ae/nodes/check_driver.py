@@ -127,7 +127,7 @@ class CheckDriver:
         read = partial(
             import_heavy('musculoskeletal_ae.validity').read_muscle_states,
             muscles=self.robot.muscle_count,
-            needs_tension=self.robot.knows_tension,
+            source=self.robot.tension_source,
         )
         publisher = self.node.create_publisher(Float64MultiArray, self.command, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)

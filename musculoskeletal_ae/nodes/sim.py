@@ -92,7 +92,8 @@ class Sim(Arm):
         arm.command, arm.wrench, arm.fixed = self.command[None], self.wrench[None], self.fixed[None]
         state = arm.step(elapsed)
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
-        self.publish_state(state.theta[0], state.length[0], state.tension[0], temperature)
+        read = arm.mae.transmission.reading(state.tension[0], state.slid[0])
+        self.publish_state(state.theta[0], state.length[0], read, temperature)
 
     def _lines(self) -> list[Line]:
         if self.arm is None:

@@ -126,7 +126,7 @@ class View(Node):
         def muscles(message: Any) -> Array:
             reading = self.motors.reading(message)
             return read_muscle_states(
-                reading, robot.muscle_count, self._isolated(), math.nan, robot.knows_tension
+                reading, robot.muscle_count, self._isolated(), math.nan, robot.tension_source
             )
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [

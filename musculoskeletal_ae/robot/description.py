@@ -33,6 +33,7 @@ from musculoskeletal_ae.robot.muscle_file import (
     TensionEntry,
 )
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
+from musculoskeletal_ae.robot.tension_source import CURRENT, TensionSource
 from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
 from musculoskeletal_ae.schema import Strict, convert
 
@@ -49,10 +50,16 @@ LEAST_EIGENVALUE = -1e-9
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
 STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
 SPEED_DEFAULT = 0.1  # speed of a module that follows positions [m/s]
+#: scale of a motor current in `with_modules` [N/A]: 0.03 N·m/A, a gear of 20 and a spool of 10 mm
+NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (
     'the tension is unknown, so these are not available: contact estimation, tension control, the '
     'torque balance, tension and heat limits, and the detection of slack and ruptured tendons by '
     'tension'
+)
+BY_CURRENT = (
+    'tensions are motor currents; their scale, offset and drive friction are learned, and tension '
+    'limits are as inaccurate as these until then'
 )
 
 
@@ -130,7 +137,7 @@ class RobotDescription:
     tension: TensionRange
     #: whether the modules follow l_target itself instead of regulating tension
     follows_position: bool
-    knows_tension: bool  # whether the modules measure tension
+    tension_source: TensionSource
     speed: Array  # speed of modules that follow positions [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,)
     release: Array
@@ -156,8 +163,10 @@ class RobotDescription:
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if self.follows_position:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
-        if not self.knows_tension:
+        if not self.tension_source.is_known:
             lines.append(f'tension_source is none: {NO_TENSION}')
+        if (scale := self.tension_source.newton_per_ampere) is not None:
+            lines.append(f'tension_source is current, {shown(scale)} N/A: {BY_CURRENT}')
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines
@@ -228,7 +237,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         stiffness=np.array(stiffness),
         tension=TensionRange(**_columns(tension)),
         follows_position=follows_position,
-        knows_tension=content.tension_source != 'none',
+        tension_source=_read_tension_source(content),
         speed=np.array(speed),
         release=np.array(release),
         end_effectors=_read_end_effectors(content, model, couplings, order, fail),
@@ -250,6 +259,14 @@ def _entries(entry: Strict | None) -> dict[str, float]:
     """Return the values of the keys that an entry of the file contains."""
     entries: dict[str, float] = {} if entry is None else to_builtins(entry)
     return entries
+
+
+def _read_tension_source(content: MuscleFile) -> TensionSource:
+    if content.tension_source != CURRENT:
+        return TensionSource(content.tension_source)
+    drives = [muscle.drive or content.drive for muscle in content.muscles]
+    scales = [drive.newton_per_ampere for drive in drives if drive is not None]
+    return TensionSource(CURRENT, np.array(scales))
 
 
 def _or(value: float | UnsetType, default: float) -> float:
@@ -478,10 +495,11 @@ def with_modules(
 ) -> RobotDescription:
     """Return the description with another kind of muscle modules and their default values."""
     follows_position, ones = actuation == 'position', np.ones(len(description.muscles))
+    scale = ones * NEWTON_PER_AMPERE if tension_source == CURRENT else None
     return replace(
         description,
         follows_position=follows_position,
-        knows_tension=tension_source != 'none',
+        tension_source=TensionSource(tension_source, scale),
         stiffness=ones * (math.inf if follows_position else STIFFNESS_DEFAULT),
         speed=ones * (SPEED_DEFAULT if follows_position else math.inf),
         release=np.full_like(ones, math.nan),

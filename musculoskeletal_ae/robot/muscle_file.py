@@ -44,6 +44,19 @@ class TensionEntry(Strict, frozen=True):
     max: Positive | UnsetType = UNSET
 
 
+class DriveEntry(Strict, frozen=True):
+    """A motor whose current is measured instead of a tension."""
+
+    torque_constant: Positive  # [N·m/A]
+    gear: Positive  # turns of the motor for one of the spool
+    spool_radius: Positive  # [m]
+
+    @property
+    def newton_per_ampere(self) -> float:
+        """Tension per current without friction [N/A]."""
+        return self.torque_constant * self.gear / self.spool_radius
+
+
 class RouteEntry(Strict, frozen=True):
     """A point of a route or, with `wrap`, a surface that the tendon wraps around."""
 
@@ -96,6 +109,7 @@ class MuscleEntry(Strict, frozen=True):
     stiffness: Positive | UnsetType = UNSET
     speed: Positive | UnsetType = UNSET
     release: Positive | UnsetType = UNSET
+    drive: DriveEntry | None = None
     tension: TensionEntry = TensionEntry()
 
     def __post_init__(self) -> None:
@@ -154,7 +168,8 @@ class MuscleFile(Strict, frozen=True):
     muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
     series_elastic: ElasticEntry | None = None
     actuation: Literal['stiffness', 'position'] = 'stiffness'
-    tension_source: Literal['sensor', 'none'] = 'sensor'
+    tension_source: Literal['sensor', 'current', 'none'] = 'sensor'
+    drive: DriveEntry | None = None  # of motors whose current is measured
     stiffness: Positive | UnsetType = UNSET  # K_stiff of muscle stiffness control [N/m]
     speed: Positive | UnsetType = UNSET  # speed of a module that follows positions [m/s]
     release: Positive | UnsetType = UNSET  # length that a stop pays out without a tension [m]
@@ -177,15 +192,31 @@ class MuscleFile(Strict, frozen=True):
             raise ValueError('expected end_effector or end_effectors, got both')
         self._check_actuation()
 
+    def _check_drives(self) -> None:
+        """Check that motors are described if their currents are measured, and only then."""
+        owners = [each.name for each in self.muscles if each.drive is not None]
+        if self.tension_source == 'current':
+            if self.drive is None and len(owners) < len(self.muscles):
+                raise ValueError(
+                    "tension_source 'current' needs drive: {torque_constant: [N·m/A], gear: ratio, "
+                    'spool_radius: [m]}, of the robot or of each muscle'
+                )
+        elif self.drive is not None or owners:
+            raise ValueError(
+                f'drive needs tension_source: current, and it is {self.tension_source!r}; remove '
+                'drive, or set tension_source: current'
+            )
+
     def _check_actuation(self) -> None:
         """Check that no key belongs to the other kind of actuation."""
         is_position = self.actuation == 'position'
-        if self.tension_source == 'none' and not is_position:
+        if self.tension_source != 'sensor' and not is_position:
             raise ValueError(
-                "tension_source 'none' needs actuation: position, and actuation is 'stiffness', by "
-                'which a module regulates tension; publish the tension by which it regulates '
-                '(tension_source: sensor), or set actuation: position'
+                f'tension_source {self.tension_source!r} needs actuation: position, and actuation '
+                "is 'stiffness', by which a module regulates tension; publish the tension by which "
+                'it regulates (tension_source: sensor), or set actuation: position'
             )
+        self._check_drives()
         foreign = ('stiffness',) if is_position else ('speed', 'release')
         needed = 'actuation: stiffness' if is_position else 'actuation: position'
         for key in foreign:

@@ -36,7 +36,7 @@ class Robot:
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
         self.stiffness = description.stiffness
         self.follows_position, self.speed = description.follows_position, description.speed
-        self.knows_tension = description.knows_tension
+        self.tension_source = description.tension_source
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
@@ -73,6 +73,7 @@ class Robot:
             stiffness=whole.stiffness[muscles],
             speed=whole.speed[muscles],
             release=whole.release[muscles],
+            tension_source=whole.tension_source.of_muscles(muscles),
             tension=TensionRange(*tension),
             joint_elasticity=whole.joint_elasticity.of_joints(joints),
         )
@@ -125,6 +126,11 @@ class Robot:
     def fastest(self, rate_limit: float) -> Array:
         """Return the largest rate of each length command [m/s] (M,), with a given limit."""
         return np.minimum(rate_limit, self.speed)
+
+    @property
+    def knows_tension(self) -> bool:
+        """Whether the modules measure tensions or motor currents."""
+        return self.tension_source.is_known
 
     @property
     def assumed_tension(self) -> Array:

@@ -6,8 +6,10 @@
 T is the motor-side tension and T_end the bone-side tension. s is 1 after winding in, when T is
 higher than T_end, and −1 after paying out. In between, friction reverses gradually. The network
 models the body without friction. Therefore its tension is T_end, into which measured values of T
-have to be converted.
+have to be converted (`Transmission`).
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +21,7 @@ REVERSAL = 0.0004  # b: sliding distance over which friction reverses [m]
 NOISE = 0.00013
 LATEST = 0.07  # weight a of the newest deviation in the running mean ē
 SPIKE = 0.0002  # distance to which a reading outside the range of the last two is limited [m]
+LARGEST_GAIN = 1.5  # largest |γ| of `Transmission`
 
 
 def slid(direction: Array, way: Array, moved: Array) -> Array:
@@ -33,10 +36,44 @@ def slid(direction: Array, way: Array, moved: Array) -> Array:
     return after
 
 
-def end_tension(friction: Array | float, tension: Array, direction: Array) -> Array:
-    """Return T_end [N] (..., M) from T [N] (..., M), μ (M,) and s (..., M)."""
-    end: Array = tension * np.exp(-friction * direction)
-    return end
+@dataclass(frozen=True, eq=False)
+class Transmission:
+    """What lies between the reading of a module and the bone-side tension.
+
+        T = max(0, e^γ T_read − b − F s),   T_end = T e^{−μ s}
+
+    A tension sensor reads T itself. A motor current, converted to T_read [N] by
+    `robot.tension_source`, has an error of scale γ and an offset b. It also drives the friction F
+    of motor and gear, which opposes the motion. It can be negative, but a tendon does not push.
+
+    Attributes:
+        friction: Tendon friction μ, (M,).
+        drive: γ, b [N] and F [N] of motor currents, (3, M); None for tension sensors.
+    """
+
+    friction: Array
+    drive: Array | None = None
+
+    def motor(self, read: Array, direction: Array) -> Array:
+        """Return T [N] (..., M) from T_read [N] and s, (..., M) each."""
+        if self.drive is None:
+            return read
+        gain, offset, friction = self.drive
+        tension: Array = np.exp(gain) * read - offset - friction * direction
+        return np.maximum(tension, 0.0)
+
+    def end(self, read: Array, direction: Array) -> Array:
+        """Return T_end [N] (..., M) from T_read [N] and s, (..., M) each."""
+        end: Array = self.motor(read, direction) * np.exp(-self.friction * direction)
+        return end
+
+    def reading(self, motor: Array, direction: Array) -> Array:
+        """Return T_read [N] (..., M) from T [N] and s, (..., M) each."""
+        if self.drive is None:
+            return motor
+        gain, offset, friction = self.drive
+        read: Array = (motor + offset + friction * direction) * np.exp(-gain)
+        return read
 
 
 class FrictionDirection:
@@ -75,9 +112,9 @@ class FrictionDirection:
         self._direction = slid(self._direction, -np.sign(moved), moved)
         return self._direction
 
-    def end_tension(self, friction: Array | float, tension: Array, length: Array) -> Array:
-        """Update s with the next l [m] (M,); return T_end [N] (M,) for T [N] (M,) and μ (M,)."""
-        return end_tension(friction, tension, self.step(length))
+    def end_tension(self, transmission: Transmission, read: Array, length: Array) -> Array:
+        """Update s with the next l [m] (M,); return T_end [N] (M,) for T_read [N] (M,)."""
+        return transmission.end(read, self.step(length))
 
     def reset(self) -> None:
         """Discard all lengths, for example after a jump of the clock."""

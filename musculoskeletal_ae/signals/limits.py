@@ -27,6 +27,10 @@ class Limits(NamedTuple):
     estimate_outside: float = 0.5
     lowest_tension: float = -0.1  # lowest tension, as a fraction of `tension.max`
     highest_tension: float = 1.1  # highest tension, as a fraction of `tension.max`
+    #: lowest motor current as a tension, as a fraction of `tension.max`; it includes drive friction
+    lowest_current: float = -1.0
+    #: highest motor current as a tension, as a fraction of `tension.max`; its scale is uncertain
+    highest_current: float = 3.0
     lowest_temperature: float = -40.0  # lowest temperature of a muscle module [°C]
     highest_temperature: float = 200.0  # highest temperature of a muscle module [°C]
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
@@ -59,6 +63,14 @@ TENSION = 'tension beyond the maximum'
 LENGTH = 'length beyond what the joints allow'
 TEMPERATURE = 'impossible temperature'
 LENGTH_JUMPED = 'length jumped'
+
+
+def reading_range(robot: Robot) -> tuple[Array, Array]:
+    """Return the lowest and the highest plausible reading T_read of every muscle [N], (M,) each."""
+    most, low, high = robot.description.tension.max, LIMITS.lowest_tension, LIMITS.highest_tension
+    if robot.tension_source.is_current:
+        low, high = LIMITS.lowest_current, LIMITS.highest_current
+    return low * most, high * most
 
 
 def length_range(robot: Robot, outside: float = 0.0) -> tuple[Array, Array]:

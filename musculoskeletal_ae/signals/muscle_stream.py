@@ -23,7 +23,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
+from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 from musculoskeletal_ae.signals.limits import (
     LENGTH,
     LENGTH_JUMPED,
@@ -32,6 +32,7 @@ from musculoskeletal_ae.signals.limits import (
     TENSION,
     Persistence,
     longest_lengths,
+    reading_range,
 )
 from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states
 
@@ -57,7 +58,10 @@ class MuscleSample:
         time: Time of reception by the caller's clock [s].
         length: l, with the length offset removed [m].
         length_read: l as the sensor measured it [m].
-        motor_tension: Motor-side tension T [N]; NaN where it is not known.
+        tension_read: T_read [N], the reading of the tension sensor, or the motor current converted
+            to newtons; NaN where tension is not known.
+        motor_tension: Motor-side tension T [N]; NaN where it is not known. It equals T_read for
+            tension sensors, and for motor currents until their friction has been learned.
         bone_tension: Bone-side tension T_end, with tendon friction removed [N]. Where tension is
             not known, it is the tension that models assume (`Robot.assumed_tension`).
         sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.
@@ -71,6 +75,7 @@ class MuscleSample:
     time: float
     length: Array
     length_read: Array
+    tension_read: Array
     motor_tension: Array
     bone_tension: Array
     sliding: Array
@@ -87,6 +92,12 @@ class MuscleSample:
         )
         return tension
 
+    @property
+    def learned_tension(self) -> Array:
+        """T_read [N] (M,), or the tension that models assume where it is not known."""
+        tension: Array = np.where(np.isnan(self.tension_read), self.bone_tension, self.tension_read)
+        return tension
+
     def shifted(self, offset: Array) -> MuscleSample:
         """Return the same sample with lengths reduced by `offset` [m], (M,)."""
         newest = self.newest.copy()
@@ -99,15 +110,11 @@ class LevelCheck:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        most, longest = robot.description.tension.max, longest_lengths(robot)
-        ones = np.ones_like(most)
+        longest = longest_lengths(robot)
+        (least, most), ones = reading_range(robot), np.ones_like(longest)
         #: lowest and highest l [m], T [N] and temperature [°C], (3, M)
-        self._low = np.array(
-            [-longest, LIMITS.lowest_tension * most, LIMITS.lowest_temperature * ones]
-        )
-        self._high = np.array(
-            [longest, LIMITS.highest_tension * most, LIMITS.highest_temperature * ones]
-        )
+        self._low = np.array([-longest, least, LIMITS.lowest_temperature * ones])
+        self._high = np.array([longest, most, LIMITS.highest_temperature * ones])
         self._slack = LIMITS.slack_share * robot.description.tension.bias
 
     def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
@@ -249,7 +256,7 @@ class MuscleStream:
         """
         self._robot = robot
         self.body = body or BodyState.healthy(robot.muscle_count)
-        self._friction: Array | float = 0.0
+        self.use_transmission(Transmission(np.zeros(robot.muscle_count)))
         self._levels = LevelCheck(robot)
         #: the last messages as measured, (3, M) each
         self._readings: deque[Array] = deque(maxlen=window)
@@ -267,9 +274,12 @@ class MuscleStream:
         self._readings.clear()
         self._time = math.inf
 
-    def use_friction(self, friction: Array | float) -> None:
-        """Remove tendon friction with the coefficients μ, (M,), from now on."""
-        self._friction = friction
+    def use_transmission(self, transmission: Transmission) -> None:
+        """Remove friction and errors of the readings of tension from now on; at first, none."""
+        if self._robot.tension_source.is_current and transmission.drive is None:
+            nothing = np.zeros((3, self._robot.muscle_count))
+            transmission = replace(transmission, drive=nothing)  # a tendon does not push
+        self._transmission = transmission
 
     def use_body(self, body: BodyState) -> None:
         """Use another body state from now on."""
@@ -301,7 +311,7 @@ class MuscleStream:
                 message,
                 muscle_count,
                 self.body.isolated,
-                needs_tension=self._robot.knows_tension,
+                source=self._robot.tension_source,
             )
         except MessageError as error:
             raw = None
@@ -311,7 +321,7 @@ class MuscleStream:
         return self.take_states(states, time, now)
 
     def take_states(self, states: Array, time: float, now: float | None = None) -> MuscleSample:
-        """Check and convert values as measured: l [m], T [N] and temperature [°C], (3, M).
+        """Check and convert values as measured: l [m], T_read [N] and temperature [°C], (3, M).
 
         `take` describes the times.
 
@@ -336,12 +346,14 @@ class MuscleStream:
         read = states if len(self._readings) == 1 else median_of_rows(np.array(self._readings))
         length = read[0] - offsets.offset
         sliding = self._direction.step(length)
-        end = end_tension(self._friction, read[1], sliding)
+        newest[1] = self._transmission.motor(newest[1], sliding)
+        end = self._transmission.end(read[1], sliding)
         return MuscleSample(
             time=time,
             length=length,
             length_read=read[0],
-            motor_tension=read[1],
+            tension_read=read[1],
+            motor_tension=self._transmission.motor(read[1], sliding),
             bone_tension=end if self._robot.knows_tension else self._robot.assumed_tension,
             sliding=sliding,
             temperature=self._temperatures.step(read[2], now),

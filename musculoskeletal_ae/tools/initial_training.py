@@ -39,7 +39,7 @@ from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.friction import directions, end_tension
+from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
@@ -155,7 +155,7 @@ def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
         if recorded != isolated:
             isolated, reduced = recorded, mae.without(recorded)
             stream.use_body(stream.body.with_isolated(recorded))
-            stream.use_friction(reduced.friction)
+            stream.use_transmission(reduced.transmission)
             health.reset()
             health.use(reduced)
         states = np.array([recording.length[row], recording.tension[row], recording.tension[row]])
@@ -227,7 +227,7 @@ def learn(
         if learner.mae is not newest:
             newest = learner.mae
             mae = newest.without(isolated)
-            stream.use_friction(mae.friction)
+            stream.use_transmission(mae.transmission)
             health.use(mae)
         states = np.array([length, tension, np.full(len(length), np.nan)])
         learner.joints(at, theta)
@@ -258,7 +258,7 @@ def _finding(
 
 def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages, for joints with sensors."""
-    tension = end_tension(mae.friction, recording.tension, directions(recording.length))
+    tension = mae.transmission.end(recording.tension, directions(recording.length))
     estimate = np.empty_like(recording.theta)
     for isolated in np.unique(recording.isolated, axis=0):
         rows = (recording.isolated == isolated).all(axis=1)

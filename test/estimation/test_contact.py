@@ -14,7 +14,7 @@ from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
-from musculoskeletal_ae.signals.friction import FrictionDirection
+from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 
 ARM = Robot.load('musashi_left_arm')
 THETA = np.array([0.1, -0.4, 0.2, -1.0, 0.1])
@@ -80,7 +80,9 @@ def test_known_tendon_friction_is_not_taken_for_a_force():
     for friction in (0.0, 0.1):
         core, sliding = observer(), FrictionDirection()
         for row in (*wound, *[length] * 100):
-            end = sliding.end_tension(np.full(10, friction), tension * np.exp(0.1), row)
+            end = sliding.end_tension(
+                Transmission(np.full(10, friction)), tension * np.exp(0.1), row
+            )
             contact = core.step(THETA, end, DT)
         errors.append(np.abs(contact.torque).max())
     assert errors[1] < 0.05 < 0.2 < errors[0]

@@ -173,8 +173,8 @@ def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_sample
         exact = SimpleNamespace(
             estimate=lambda *observed, e=estimate: SimpleNamespace(theta=e(*observed))
         )
-        tension = observed.end_tension(body.frictions())
+        tension = observed.end_tension(body.transmission)
         covariance = estimate_covariance(exact, body, fit, tension, seed, None)
-        error = estimate(test.end_tension(body.frictions()), test.length) - test.theta
+        error = estimate(test.end_tension(body.transmission), test.length) - test.theta
         inside.append((ellipsoids(covariance, error) <= 1.0).mean())
     assert np.mean(inside) > 0.65  # measured: 0.76; 0.55 if samples counted as independent

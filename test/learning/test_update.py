@@ -95,7 +95,7 @@ def test_the_covariance_covers_95_percent_of_validation_messages(arm26, initial,
 
     def inside(**parts):
         mae = BodyUpdater(arm26, initial).update(job(store, steps=100, **parts)).mae
-        tension = fresh.end_tension(mae.friction)
+        tension = fresh.end_tension(mae.transmission)
         off = mae.estimate(tension, fresh.length).theta - fresh.theta
         distance = np.einsum('ni,ni->n', off, np.linalg.solve(mae.covariance, off.T).T)
         return (distance <= chi2.ppf(0.95, 2)).mean()
@@ -219,7 +219,7 @@ def test_removing_tendon_friction_improves_the_estimate(learned):
     observed = stage.store(500).observations()
     read, end = (
         error(mae, observed.theta, tension, observed.length)
-        for tension in (observed.tension, observed.end_tension(mae.friction))
+        for tension in (observed.tension, observed.end_tension(mae.transmission))
     )
     assert end < 0.8 * read
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
@@ -160,7 +161,7 @@ def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
 
 def test_tendon_friction_is_removed_by_the_direction_of_sliding():
     stream = MuscleStream(ROBOT)
-    stream.use_friction(np.full(M, 0.1))
+    stream.use_transmission(Transmission(np.full(M, 0.1)))
     for n in range(100):  # every tendon is wound in, so T exceeds T_end
         states = resting()
         states[0] -= 1e-4 * n

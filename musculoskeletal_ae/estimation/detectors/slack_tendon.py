@@ -31,6 +31,8 @@ STRETCH = 1.5
 #: STRETCH without calibrated statistics: a network that has not learned the arm can estimate a
 #: stretch of up to 1.5 for a healthy slack tendon
 UNCALIBRATED_STRETCH = 3.0
+#: STRETCH with motor currents, whose tensions are uncertain because of drive friction
+CURRENT_STRETCH = 2.0
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
 
@@ -128,6 +130,8 @@ class SlackTendon(Detector):
         tension[list(isolated)] = 0.0
         is_calibrated = mae.anomaly is not None and mae.anomaly.calibrated
         share = STRETCH if is_calibrated else UNCALIBRATED_STRETCH
+        if is_calibrated and robot.tension_source.is_current:
+            share = CURRENT_STRETCH
         stretch = mae.lengths(theta, tension) - sample.length
         is_stretched: Bools = stretch > share * robot.elongation(robot.description.tension.bias)
         return is_stretched

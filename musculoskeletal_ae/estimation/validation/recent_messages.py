@@ -9,7 +9,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.signals.friction import FrictionDirection, end_tension
+from musculoskeletal_ae.signals.friction import FrictionDirection
 
 SPAN = 10.0  # time that the kept messages cover [s]
 SPACING = 0.1  # shortest time between two kept messages [s]
@@ -52,7 +52,7 @@ class RecentMessages:
         """Keep a message if the arm is healthy and the last kept message is old enough.
 
         Args:
-            tension: T [N], (M,).
+            tension: T_read [N], (M,).
             length: l [m], (M,).
             now: Time of the message [s].
             theta: Measured θ [rad], (D,), or None.
@@ -75,7 +75,7 @@ class RecentMessages:
         tension = np.array([message.tension for message in self._messages])
         length = np.array([message.length for message in self._messages])
         direction = np.array([message.direction for message in self._messages])
-        return end_tension(mae.friction, tension, direction), length
+        return mae.transmission.end(tension, direction), length
 
     def drop_after(self, time: float) -> None:
         """Discard the messages that are newer than a time [s]."""

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How muscle modules report tension: `tension_source` of muscles.yaml.
+
+    T_read = i k_t n / r
+
+i is a motor current, k_t the motor's torque constant, n the gear ratio and r the radius of the
+spool. T_read also contains the friction of motor and gear, an offset, and the error of k_t, which
+online learning identifies (`signals.friction.Transmission`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+
+#: the module has a tension sensor; it measures its motor current; it measures neither
+SENSOR, CURRENT, NONE = 'sensor', 'current', 'none'
+
+
+@dataclass(frozen=True, eq=False)
+class TensionSource:
+    """Source of the tensions of one arm.
+
+    Attributes:
+        kind: SENSOR, CURRENT or NONE.
+        newton_per_ampere: k_t n / r of each muscle [N/A], (M,); None unless `kind` is CURRENT.
+    """
+
+    kind: str = SENSOR
+    newton_per_ampere: Array | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether tensions are known at all."""
+        return self.kind != NONE
+
+    @property
+    def is_current(self) -> bool:
+        """Whether motor currents are measured instead of tensions."""
+        return self.newton_per_ampere is not None
+
+    def of_muscles(self, muscles: Ints) -> TensionSource:
+        """Return the source of some of the muscles."""
+        if self.newton_per_ampere is None:
+            return self
+        return TensionSource(self.kind, self.newton_per_ampere[muscles])
+
+    def from_message(self, values: Array) -> Array:
+        """Return T_read [N] (M,) from the values of a message, in [N] or [A]; NaN if unknown."""
+        if not self.is_known:
+            return np.full_like(values, np.nan)
+        return values if self.newton_per_ampere is None else values * self.newton_per_ampere
+
+    def to_message(self, tension: Array) -> Array:
+        """Return the values of a message, in [N] or [A], from T_read [N] (M,)."""
+        return tension if self.newton_per_ampere is None else tension / self.newton_per_ampere
+
+
+TENSION_SENSOR = TensionSource()

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scale, offset and drive friction of motor currents are learned from rests."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.exceptions import CheckpointError, StateError
+from musculoskeletal_ae.learning import saved_state
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.body_fit import BodyFit
+from musculoskeletal_ae.learning.fit import fit_to_network
+from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.residuals import TouchStatistics
+from musculoskeletal_ae.robot.description import with_modules
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.signals.friction import Transmission
+
+SENSORS = Robot.load('arm26')
+ROBOT = Robot(with_modules(SENSORS.description, 'position', 'current'))
+COUNT = ROBOT.muscle_count
+LIMIT = ROBOT.tension.limit
+
+
+def rests(count, seed):
+    """Return noisy rests of an individual, their true T_end and the true transmission."""
+    rng, true = np.random.default_rng(seed), Individual(ROBOT, seed)
+    drive = np.array(
+        [
+            rng.normal(0.0, 0.15, COUNT),
+            rng.normal(0.0, 0.02, COUNT) * LIMIT,
+            rng.uniform(0.05, 0.15, COUNT) * LIMIT,
+        ]
+    )
+    transmission = Transmission(true.tendon_friction, drive)
+    theta = ROBOT.random_postures(count, rng)
+    jacobian = true.muscle_jacobian(theta)
+    held, end = ROBOT.kinematics.weight_torque(theta), np.empty((count, COUNT))
+    for n in range(count):
+        wanted = rng.uniform(0.1, 0.6, COUNT) * LIMIT
+        end[n] = least_tension(jacobian[n], held[n], ROBOT.tension.bias, LIMIT, wanted)[0]
+    direction = rng.choice([-1.0, 1.0], end.shape)
+    motor = end * np.exp(true.tendon_friction * direction)
+    read = transmission.reading(motor, direction) + rng.normal(0.0, 0.2, end.shape)
+    length = true.muscle_lengths(theta, end) + rng.normal(0.0, 2e-5, end.shape)
+    known = np.ones(end.shape, dtype=bool)
+    return Observations(theta, read, length, direction, known), end, transmission
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_tensions_of_currents_are_recovered_from_rests(seed):
+    observed, _, true = rests(120, seed)
+    fit = BodyFit(ROBOT, None)
+    body = fit.fit(observed, observed.theta) and fit.body
+    held_out, held_end, _ = rests(100, seed)
+    before = np.abs(held_out.tension - held_end).mean()
+    after = np.abs(body.transmission.end(held_out.tension, held_out.direction) - held_end).mean()
+    assert after < 0.4 * before
+    error = np.abs(body.drive[2] - true.drive[2]).mean()  # drive friction
+    assert error < 0.5 * np.abs(0.08 * LIMIT - true.drive[2]).mean() + 0.01 * LIMIT.mean()
+
+
+def test_derivatives_by_the_drive_are_those_of_the_length():
+    observed, _, _ = rests(20, 3)
+    body = CalibratedBody(ROBOT)
+    rng = np.random.default_rng(0)
+    for parameters, layout in zip(body.parameters, body.layouts, strict=True):
+        parameters[layout.drive] = rng.normal(0.0, 0.05, 3)
+    poses, m, step = body.poses(observed.theta), 2, 1e-6
+    at = body.layouts[m].drive
+    smooth = body.smooth[m].at(observed.theta)
+
+    def lengths():
+        column = observed.tension[:, m], observed.direction[:, m]
+        return body.linearised(poses, smooth, *column, m, np.zeros(20))
+
+    _, jacobian = lengths()
+    for k in range(at.start, at.stop):
+        body.parameters[m][k] += step
+        above, _ = lengths()
+        body.parameters[m][k] -= 2.0 * step
+        below, _ = lengths()
+        body.parameters[m][k] += step
+        np.testing.assert_allclose(jacobian[:, k], (above - below) / (2 * step), atol=1e-6)
+
+
+def test_a_checkpoint_carries_the_transmission_and_fits_only_motor_currents(trained):
+    drive = np.array([[0.1], [3.0], [15.0]]) * np.ones(COUNT)
+    touch = TouchStatistics(np.full(COUNT, 0.05), np.ones(2), 90.0, drive)
+    data = checkpoint.to_bytes(replace(trained['default'], touch=touch))
+    mae = checkpoint.from_bytes(data, ROBOT)
+    np.testing.assert_array_equal(mae.transmission.drive, drive)
+    with pytest.raises(CheckpointError, match=r'learned with motor currents .* sensor'):
+        checkpoint.from_bytes(data, SENSORS)
+    body = CalibratedBody(ROBOT)
+    fit_to_network(body, mae)  # the learner of another machine continues with it
+    np.testing.assert_allclose(body.drive, drive, rtol=1e-3)
+    excessive = replace(touch, drive=drive + np.array([[9.0], [0.0], [0.0]]))
+    wrong = checkpoint.to_bytes(replace(trained['default'], touch=excessive))
+    with pytest.raises(CheckpointError, match=r'touch\.drive has a gain of'):
+        checkpoint.from_bytes(wrong)
+
+
+def test_samples_of_tension_sensors_are_not_mixed_with_motor_currents():
+    store = SampleStore()
+    quiet = np.zeros(COUNT)
+    store.add(Sample(np.zeros(2), quiet, quiet, quiet))
+    data = saved_state.to_bytes(saved_state.collect(SENSORS, store, None))
+    saved_state.from_bytes(data, SENSORS)
+    with pytest.raises(StateError, match="tension_source 'sensor'; this robot has 'current'"):
+        saved_state.from_bytes(data, ROBOT)
