@@ -36,8 +36,8 @@ class Calibrating:
     Only differences of lengths are used, so that the length offsets cancel. θ_est and G may be
     wrong; muscle stiffness control turns these errors into tension errors, which are limited.
     Goals cover the whole joint range. Each is approached by a short step and held with random
-    tensions. The calibration needs such varied postures and tensions: the posture follows from the
-    way in which G turns tension into torque.
+    tensions. The calibration needs such varied postures and tensions, because it infers the
+    posture from the torques that the tensions exert through G.
     """
 
     def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:

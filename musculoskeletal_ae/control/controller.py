@@ -13,7 +13,7 @@ Plans assume no tension in isolated muscles, and their modules are commanded to 
 muscle that is isolated during an anomaly is the suspect. While the arm is stopped, the suspect is
 wound in slightly to verify the fault; the arm resumes when the anomaly is over.
 
-`now` is the time of a steady clock [s], `time` that of the messages [s].
+`now` is the time of a steady clock [s], and `time` is the time of the messages' clock [s].
 """
 
 from __future__ import annotations
@@ -480,7 +480,7 @@ class Controller:
 
         Args:
             now: Time of the steady clock [s].
-            time: Time of the messages [s]; None if it is the same clock.
+            time: Time of the messages' clock [s]; None if this is the steady clock.
         """
         # The rate limit applies to the time between publications. Therefore the time in which the
         # last command was computed is subtracted.

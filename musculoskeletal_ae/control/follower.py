@@ -57,8 +57,8 @@ SHARE = 0.7
 #: points, each piece of the trajectory has at least one
 MOST_MOMENTS = 12_500
 BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
-#: error above which an arm with isolated muscles has fallen [rad], for prismatic joints times RACK
-#: [m]
+#: error above which an arm with isolated muscles has fallen [rad]; for prismatic joints, the error
+#: divided by RACK counts
 FALLEN = 0.2
 FALLING = 2.0  # time after the end of a trajectory from which on the arm can count as fallen [s]
 SETTLING = 0.8  # time after the end for which the feedback of the motion continues [s]

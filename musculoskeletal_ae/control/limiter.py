@@ -57,7 +57,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
-#: largest difference between the length of a real muscle and that of the model [m]
+#: largest difference between the lengths of a real muscle and of its model [m]
 LENGTH_MARGIN = 0.03
 #: For modules that follow positions: fraction of the remaining stretch up to T_limit that one
 #: command may use. The rest covers errors of L_e and the age of T.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declares the steps of remedies: identifiers for programs, and texts for users.
 
-A remedy is a sequence of steps, to be taken in order. /diagnostics has it twice: the value `remedy`
-is a sentence, and `remedy steps` lists the identifiers.
+A remedy is a sequence of steps, to be taken in order. /diagnostics contains it twice: the value
+`remedy` is a text for users, and `remedy steps` lists the identifiers.
 """
 
 from collections.abc import Iterable

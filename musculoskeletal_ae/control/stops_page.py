@@ -14,9 +14,9 @@ INTRODUCTION = """\
 This page is generated from the code: `python -m musculoskeletal_ae.control.stops_page > \
 doc/reference/stops.md`. While the arm is *running*, the mode that the controller reports is \
 what the arm does: {activities}. Otherwise the mode is one of {states}. A program compares these \
-identifiers and those of the causes: the latched topic `controller_mode` has the mode, or the \
-mode and the cause as `stopped:operator_stop`. The values `mode` and `stop cause` of the \
-controller in `/diagnostics` contain the same identifiers.
+identifiers and the identifiers of the causes. The latched topic `controller_mode` contains the \
+mode, or the mode and the cause as in `stopped:operator_stop`. The values `mode` and `stop cause` \
+of the controller in `/diagnostics` contain the same identifiers.
 
 ## Modes
 

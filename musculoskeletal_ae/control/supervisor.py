@@ -34,7 +34,7 @@ class StopState(Enum):
 
     RUNNING = 'running'
     PAUSED = 'paused'  # stopped by an auto-recoverable cause
-    STOPPED = 'stopped'  # latched
+    STOPPED = 'stopped'  # stopped until a reset or a verification
     VERIFYING = 'verifying'  # stopped; a suspect muscle is wound in
     RESUMING = 'resuming'  # the suspect is verified; the arm continues once no cause is present
 
@@ -101,7 +101,7 @@ class Supervisor:
 
     @property
     def mode(self) -> str:
-        """The mode: the identifier of the activity while running, else that of the stop state."""
+        """The mode: the identifier of the activity while running, otherwise of the stop state."""
         return (self.activity if self.state is StopState.RUNNING else self.state).value
 
     @property

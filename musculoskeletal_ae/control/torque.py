@@ -28,7 +28,7 @@ class TorqueControl:
         τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
         T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
 
-    G is that of the network at (θ, T) (paper, §III-E, third; Kawamura 2016), and θ is the
+    The network computes G at (θ, T) (paper, §III-E, third; Kawamura 2016), and θ is the
     low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius RACK.
     With both gains zero, only gravity is compensated and `effort` exerted; the arm then does not
     keep its posture.

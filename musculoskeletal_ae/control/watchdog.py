@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The watchdog: detects stop causes from the age of data, load and temperature.
 
-`now` is the time of a steady clock [s], which determines ages. `time` is that of the messages [s],
-which determines the change of commands. If the messages' clock is slow, as in a slow simulator, the
-allowed age grows in proportion, up to 1/`SLOWEST`. A fast clock does not shorten it. Pauses of the
-controller itself do not count as age.
+`now` is the time of a steady clock [s], which determines ages. `time` is the time of the messages'
+clock [s], which determines the change of commands. If the messages' clock is slow, as in a slow
+simulator, the allowed age grows in proportion, up to 1/`SLOWEST`. A fast clock does not shorten it.
+Pauses of the controller itself do not count as age.
 """
 
 from __future__ import annotations

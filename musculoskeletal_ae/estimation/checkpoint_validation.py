@@ -11,14 +11,14 @@ Four checks compare a candidate with the geometric model, the arm and the networ
                                   detect a rupture
 
 The first network is only subject to the first and the last check, because its error on a body that
-differs from its model is not known beforehand. A network that a user has chosen is not subject to
+differs from its model cannot be predicted. A network that a user has chosen is not subject to
 the third. All limits leave a margin to the values of healthy networks: initial and learned ones of
 both presets, on both shipped robots and both emulator models. `python -m bench gate` prints these
 values, and the values of networks that must be rejected.
 
 A candidate without a calibrated detector inherits the detector in use, which would otherwise be
 switched off. A muscle that was repaired within the last RELEARNING_TIME seconds may be relearned,
-and its residuals then differ from those of the calibration. The inherited detector ignores this
+and its residuals then differ from the calibrated ones. The inherited detector ignores this
 muscle and judges all others, until a network with a calibrated detector of its own takes over.
 
 When an anomaly is detected, networks that have been in use for less than PROOF seconds are

@@ -143,9 +143,9 @@ class Estimator:
     def use(self, mae: Mae) -> None:
         """Use another network and its healthy statistics, without the isolated muscles.
 
-        The isolated muscles are those of the network until the first finding or call of `isolate`
-        or `keep_isolated`; from then on they are those of this estimator. A running length
-        calibration starts again, because its estimate depends on the network.
+        The network determines the isolated muscles until the first finding or call of `isolate` or
+        `keep_isolated`; from then on, this estimator determines them. A running length calibration
+        starts again, because its estimate depends on the network.
 
         Raises:
             numpy.linalg.LinAlgError: If its statistics are singular; the previous network stays in
@@ -162,7 +162,7 @@ class Estimator:
             self.calibration = LengthCalibration(self.robot, reduced, self.calibration.posture)
 
     def keep_isolated(self) -> None:
-        """Stop taking the isolated muscles from networks."""
+        """Keep the present isolated muscles when another network is used."""
         self._follows_network = False
 
     def isolate(self, muscles: Iterable[int]) -> None:

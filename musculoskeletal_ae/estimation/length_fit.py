@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fit the length offsets, and the postures of all moments, to readings of length and tension.
+"""Fits the length offsets, and the postures of all moments, to readings of length and tension.
 
     l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
     0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more equations while the arm moves slowly
 
-l and G are those of the network (①). If the joint angles were measured, o is the mean residual of
+The network computes l and G through ①. If the joint angles were measured, o is the mean residual of
 the first line. Otherwise o and the postures of all moments are estimated together, by maximum
 likelihood with noise of Student's distribution. Because muscles outnumber joints and G changes with
 the posture, only one o explains all moments of a moving arm. The second line already restricts
@@ -35,7 +35,7 @@ LENGTH_NOISE = 0.0004  # standard deviation of the network's error of a length [
 TORQUE_NOISE = 0.4
 LIMIT_NOISE = 0.05  # standard deviation of the excess of a joint angle over its limits [rad]
 NOISE_FACTORS = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
-ISOLATED_WEIGHT = 1e-6  # weight of an isolated muscle's length relative to the others
+ISOLATED_WEIGHT = 1e-6  # weight of an isolated muscle's length relative to a used muscle's
 FREEDOM = 4.0  # degrees of freedom of Student's distribution
 AT_STOP = 0.03  # distance from a joint limit below which the stop may carry torque [rad]
 

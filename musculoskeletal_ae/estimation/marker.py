@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compute joint angles from the pose of a marker at the end effector, reported by a camera."""
+"""Computes joint angles from the pose of a marker at the end effector, reported by a camera."""
 
 import pinocchio as pin
 
@@ -8,7 +8,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-# With a larger error, the pose is that of another marker, or the camera is not calibrated.
+# With a larger error, the camera sees another marker or is not calibrated.
 MARKER_DISTANCE = 0.05  # largest error of the position [m]
 MARKER_ANGLE = 0.3  # largest error of the orientation [rad]
 

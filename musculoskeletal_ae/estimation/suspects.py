@@ -3,7 +3,7 @@
 
 The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
 
- 1. Rupture. The muscle has no tension, and its readings disagree with those of the others.
+ 1. Rupture. The muscle has no tension, and its readings disagree with the other muscles.
  2. Finding. A detector of `health.py` names the muscle, within half a second. The finding is
     latched: the estimator publishes `anomaly_detected`, and the controller stops the arm.
  3. Isolation. The suspect is isolated at once: estimation and control continue without it.

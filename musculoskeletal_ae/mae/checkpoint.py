@@ -71,11 +71,12 @@ class Metadata(Strict, frozen=True):
     preset: str
     version: Count
     training: Annotated[str, Meta(max_length=10_000)]
-    anomaly_calibrated: bool | None  # None: no anomaly statistics
+    anomaly_calibrated: bool | None  # None if there are no anomaly statistics
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
-    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None  # None: no touch statistics
+    #: duration of motion in the touch statistics [s]; None if there are no touch statistics
+    touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
     uncertain: bool  # whether the covariance of the estimates is included
     drive: bool = False  # whether γ, b and F of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included

@@ -113,7 +113,7 @@ def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Arra
 
 
 def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generator) -> Array:
-    """Return each sample with its twin, a close neighbour of the same T.
+    """Return each sample with its twin, a close neighbour with the same T.
 
     Args:
         robot: The geometric model.

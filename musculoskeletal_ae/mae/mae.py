@@ -193,7 +193,7 @@ class Stack:
         return (product(x, weight) + bias).astype(np.float64)
 
     def with_pullback(self, values: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the output, and the function from its gradient to that of the input."""
+        """Return the output, and a function from dL/d(output) to dL/d(input)."""
         x, slopes = values.astype(np.float32), []
         for (weight, bias), activation in zip(self.layers, self.activations):
             x, slope = activation.with_slope(product(x, weight), bias)

@@ -59,7 +59,7 @@ class Network(nn.Module):
     """The network of D joints and M muscles.
 
     Its layers have D+2M+3, *hidden, D+M, *reversed hidden and D+2M units. With several groups, each
-    group has such a block with its own D, M and hidden layers.
+    group has a block of such layers with its own D, M and hidden layers.
     """
 
     mean: Tensor
@@ -186,7 +186,7 @@ class TorchLengths:
     def lengths_with_pullback(
         self, theta: Array, tension: Array
     ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the same as `Mae.lengths_with_pullback`."""
+        """Return lengths and their pullback, as `Mae.lengths_with_pullback` does."""
         angles, tensions = self._tensor(theta, requires_grad=True), self._tensor(tension)
         values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
         mask = torch.zeros(len(theta), dtype=torch.long, device=values.device)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert raw messages of the muscle modules to checked samples for all other parts."""
+"""Converts raw messages of the muscle modules to checked samples for all other parts."""

@@ -300,7 +300,7 @@ class MuscleStream:
         Args:
             message: The message.
             time: Time of reception by the caller's clock [s].
-            now: Time of reception by a steady clock [s]; None if `time` is of a steady clock.
+            now: Time of reception by a steady clock [s]; None if `time` is by a steady clock.
 
         Raises:
             RejectionError: If the message is invalid or implausible.

@@ -20,7 +20,7 @@ Message = TypeVar('Message')
 
 @dataclass(frozen=True)
 class Paired(Generic[Message]):
-    """A message of the muscle modules, with the θ of the same time if there is one.
+    """A message of the muscle modules, with the θ nearest to it in time, if there is one.
 
     Attributes:
         time: Time of reception of the message [s].

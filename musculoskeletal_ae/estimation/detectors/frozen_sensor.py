@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a sensor whose reading stays exactly the same while its muscle moves.
+"""Detects a sensor whose reading stays exactly the same while its muscle moves.
 
 The readings of a working sensor contain noise. Therefore a constant reading is a fault even if it
 hardly disturbs the estimate. The other muscles show whether the muscle moves.
@@ -14,7 +14,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
 FROZEN_TIME = 1.0  # duration of identical readings after which a sensor may be frozen [s]
-MOVED = 0.006  # motion of the muscle, predicted from the others, that proves it [m]
+MOVED = 0.006  # predicted motion of the muscle above which its constant reading is a fault [m]
 
 
 class FrozenSensor(Detector):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a winch that does not move although its tension is far from the commanded one.
+"""Detects a winch that does not move although its tension is far from the commanded one.
 
     |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
 

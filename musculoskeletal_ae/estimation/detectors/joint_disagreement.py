@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect that muscle lengths and joint sensors indicate different postures.
+"""Detects that muscle lengths and joint sensors indicate different postures.
 
     g = l − ①(θ, T_end),   θ from joint sensors; g is the median over COUNT · SPACING seconds
     Δ = g − g_usual,       g_usual: median of g in healthy messages

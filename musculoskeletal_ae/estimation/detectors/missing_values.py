@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a muscle whose sensors report NaN for some time.
+"""Detects a muscle whose sensors report NaN for some time.
 
 Messages with NaN are rejected, so that nothing is estimated meanwhile. If only one muscle has NaN,
 its sensor is faulty, and a verification is not necessary.

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect an anomaly by the Mahalanobis distance of the network's residual.
+"""Detects an anomaly by the Mahalanobis distance of the network's residual.
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),  e = (T_est − T, l_est − l)      (arXiv 2407.08050)
 
 A, the size of e, is published, but its healthy value varies with the posture. The decision is based
 on d instead, which relates the residual of every muscle to its healthy spread. The healthy
-statistics μ and Σ have to be measured on the real arm: with those of the geometric model, most
-healthy postures would count as anomalous. Without calibrated statistics, d is not evaluated.
+statistics μ and Σ have to be measured on the real arm: with statistics of the geometric
+model, most healthy postures would count as anomalous. Without calibrated statistics, d is not
+evaluated.
 
 Threshold. It grows with the distance to the nearest calibrated posture (`unfamiliarity`), where the
 network is less accurate, and in proportion to a tension above T_limit, which networks have rarely

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a muscle without tension although a tension is commanded: its tendon ruptured or is slack.
+"""Detects a muscle without tension although tension is commanded: it ruptured or is slack.
 
     T < slack_share · T_ref for DEAD_TIME, and not being wound in
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detect a muscle module whose drag, cooling or tension sensor has changed, by its thermal model.
+"""Detects a muscle module whose drag, cooling or tension sensor has changed, by its thermal model.
 
 `heat.py` estimates the constants of the model. Only a module with a hot winding is a finding; a
 cool one is reported in /diagnostics without stopping the arm.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check that a candidate network agrees with joint sensors, or else with the network in use.
+"""Checks that a candidate network agrees with joint sensors, or else with the network in use.
 
 Three quantities are compared:
 
@@ -8,8 +8,9 @@ Three quantities are compared:
     shape     the change of l through ① from posture to posture, on the fixed states
 
 If joint sensors measured the postures, they are the reference. The median error of each joint and
-muscle may then be ANGLE_WORSE times that of the network in use, or ANGLE_FLOOR and LENGTH_FLOOR if
-that is more. The shape is compared only if the candidate's mean error of length is the larger one.
+muscle may then be ANGLE_WORSE times the error of the network in use, or ANGLE_FLOOR and
+LENGTH_FLOOR if that is more. The shape is compared only if the candidate's mean error of length is
+the larger one.
 
 Without joint sensors, the network in use is the reference. The median differences may be up to
 ANGLE_MOVED and LENGTH_MOVED, and the relative difference in shape up to SHAPE_MOVED. With too few
@@ -39,7 +40,7 @@ ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
 ANGLE_MOVED = 0.45  # largest difference of θ from a learned network [rad]
 ANGLE_MOVED_INITIAL = 0.8  # largest difference of θ from an initial network [rad]
 LENGTH_MOVED = 0.07  # largest difference of a length from either network [m]
-# A minute of learning changed the shape of an initial network by 0.32 and that of a learned one by
+# A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
 SHAPE_MOVED = 0.3  # largest relative difference in shape from a learned network
 SHAPE_MOVED_INITIAL = 0.42  # largest relative difference in shape from an initial network

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check the calibrated detector of a candidate network, or give it the detector in use.
+"""Checks the calibrated detector of a candidate network, or give it the detector in use.
 
 A calibrated detector must stay below its threshold on the recent messages, and must respond to
 a ruptured muscle. The measure is the median over the messages of d divided by its threshold.

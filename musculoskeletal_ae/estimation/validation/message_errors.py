@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check how well a candidate network explains recent messages of the arm.
+"""Checks how well a candidate network explains recent messages of the arm.
 
 Three errors are compared: T and l through ②, and l through ① at the θ that ② estimates. The median
 error of each muscle may be WORSE times the median error of the network in use, or FLOOR if that is

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a candidate network on fixed random states of the geometric model.
+"""Checks a candidate network on fixed random states of the geometric model.
 
     ①         restores θ, T and l of the geometric model, and its G
-    ②, ③      restore θ, T and l, where l is that of ①
+    ②, ③      restore θ, T and l, where l is computed by ①
 
-The lengths of a real arm differ from those of the model by centimetres, so ② and ③ are compared
-with the lengths of ① rather than with the model's. A series elastic element may be much softer than
-that of the model, and most of that difference is elongation. ① is therefore compared with lengths
+The lengths of a real arm differ from the model's by centimetres, so ② and ③ are compared with the
+lengths of ① rather than with the model's. Most of the difference is elongation, because a series
+elastic element may be much softer than its model. ① is therefore compared with lengths
 of the model whose elongation is multiplied, for each muscle, by the factor that fits the slope of
 the differences over the elongation. Constant differences of lengths do not change the slope.
 
@@ -19,8 +19,8 @@ deviation of the true values. A network with a constant output has a relative er
 holds the largest permitted values.
 
 Where muscles determine a joint only poorly, for example because several postures have the same
-lengths, a relative error of θ up to UNDETERMINED times that of the best affine map of (T, l) is
-permitted. This does not apply to the mean error.
+lengths, a relative error of θ up to UNDETERMINED times the error of the best affine map of (T, l)
+is permitted. This does not apply to the mean error.
 """
 
 from collections.abc import Iterator
