@@ -70,7 +70,7 @@ def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
 def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
     """Return what stands for the tensions [N]: those assumed, or T_bias with the effort on top."""
     if not with_effort:
-        return lambda run: np.tile(robot.assumed_tension, (len(run.length), 1))
+        return lambda run: np.tile(robot.actuation.assumed_tension, (len(run.length), 1))
     strong = np.quantile(np.abs(training.effort), 0.95)
 
     def scaled(run: Run) -> Array:

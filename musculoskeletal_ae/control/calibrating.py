@@ -57,7 +57,7 @@ class Calibrating:
     def step(self, inputs: Inputs) -> Command | None:
         """Return the next length command."""
         if self._ramp is None or (self._ramp.done and self._rested >= REST):
-            speed = float(self._robot.fastest(SPEED).min())
+            speed = float(self._robot.actuation.fastest(SPEED).min())
             self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, speed)
             self._rested = 0.0
         if self._ramp.done:

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot import actuation
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-LENGTH, TENSION = 'length', 'tension'
+LENGTH, TENSION = actuation.LENGTH, actuation.TENSION
 
 
 class Command(NamedTuple):
@@ -54,6 +55,5 @@ def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
     tension = np.maximum(sample.model_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
-    if robot.follows_position:
-        return Command(LENGTH, sample.length.copy())
-    return Command(LENGTH, robot.length_for(sample.length, sample.motor_tension, tension))
+    length, motor = sample.length, sample.motor_tension
+    return Command(LENGTH, robot.actuation.unchanging_length(length, motor))

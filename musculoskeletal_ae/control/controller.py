@@ -419,7 +419,7 @@ class Controller:
             return f'stopped: {condition}'
         if wanted and self.settings.method == 'float':
             return 'method float: the arm is guided by hand; set another method first'
-        if wanted and not (self.robot.knows_tension or self.stream.body.offsets.known):
+        if wanted and not (self.robot.tension_source.is_known or self.stream.body.offsets.known):
             return (
                 'the length offsets are unknown, and exploration cannot determine them without '
                 'tensions (tension_source: none); call estimator/zero with a stated posture'

@@ -12,14 +12,9 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 REPLAN = 5.0  # change of a relevant tension limit that requires a new plan [N]
 CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times RACK [m]
-#: largest relief [m]: covers length errors and the tension that friction retains in a tendon
-RELIEF = 0.01
 #: Largest estimated error that is not corrected [rad], for prismatic joints times RACK [m]. It is
 #: about the error of the estimate. Without a dead band, an arm with friction would never rest.
 DEADBAND = 0.03
-#: largest relief of modules that follow positions [m]; covers errors of a network that has not
-#: learned the arm yet, which such modules turn into slack or into tension
-POSITION_RELIEF = 0.03
 RELIEF_INTERVAL = 0.1  # time between two computations of the needless tension [s]
 SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
 
@@ -43,7 +38,7 @@ class RestFeedback:
     """Integrates the estimated error and the needless tension slowly while the arm rests.
 
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
-        dr/dt = gain (T − T*)/K_stiff,           |r| ≤ RELIEF        where T > T*
+        dr/dt = gain (T − T*)/K_stiff,           |r| ≤ R             where T > T*
               = gain min(T_end − T*, 0)/K_stiff                      elsewhere
         (T and T_end are clipped to T_bias … T_limit)
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
@@ -57,8 +52,7 @@ class RestFeedback:
     because friction already supports the arm there.
 
     Modules that follow positions do not hold T_bias. For them K_stiff is the stiffness of the
-    series elastic element, T may be below T_bias, and |r| ≤ POSITION_RELIEF: a slack tendon is
-    wound in.
+    series elastic element, T may be below T_bias, and R is larger: a slack tendon is wound in.
 
     Attributes:
         correction: c [rad], (D,).
@@ -106,11 +100,10 @@ class RestFeedback:
         correction = self.correction + gain * dt * beyond
         self.correction = np.clip(correction, -self.largest, self.largest)
         self._unsolved += dt
-        if self._unsolved >= RELIEF_INTERVAL and self._robot.knows_tension:
-            robot, bias = self._robot, self._robot.tension.bias
-            lowest = np.zeros_like(bias) if robot.follows_position else bias
-            largest = POSITION_RELIEF if robot.follows_position else RELIEF
-            share = gain * self._unsolved / robot.tension_per_length(pull.motor)
+        if self._unsolved >= RELIEF_INTERVAL and self._robot.tension_source.is_known:
+            actuation, bias = self._robot.actuation, self._robot.tension.bias
+            lowest, largest = actuation.kept_tension, actuation.largest_relief
+            share = gain * self._unsolved / actuation.tension_per_length(pull.motor)
             self._unsolved = 0.0
             bone = np.clip(pull.bone, lowest, limit)
             least = least_tension(jacobian, -jacobian.T @ bone, bias, limit).tension

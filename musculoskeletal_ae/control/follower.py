@@ -22,7 +22,7 @@ A trajectory that is too fast for the muscle modules is slowed as a whole before
 (`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
 rest feedback (`feedback.RestFeedback`) continues from c.
 
-Where no tension is known, T is `Robot.assumed_tension` in every posture, as in the samples from
+Where no tension is known, T is `Actuation.assumed_tension` in every posture, as in the samples from
 which the network was learned (doc/explanation/method.md).
 
 Method `stiffness` minimises ‖T − T_K‖² instead, where `methods.stiffness_command` computes T_K for
@@ -102,7 +102,8 @@ class Stiffening:
             self._near = solution.tension if near is None else near
             self.solution = solution
         # Use half of that part, because the series elastic elements stretch as well.
-        rates = robot.fastest(settings.rate_limit) * robot.tension_per_length(self._near)
+        actuation = robot.actuation
+        rates = actuation.fastest(settings.rate_limit) * actuation.tension_per_length(self._near)
         largest = 0.5 * (1.0 - SHARE) * rates * dt
         self._near = self._near + np.clip(solution.tension - self._near, -largest, largest)
         return self._near
@@ -252,7 +253,7 @@ class Follower:
             length = self._held(inputs)
         length = np.where(self._robot.used, length, sent)
         if self._blend is None:
-            rate_limit = float(self._robot.fastest(self._settings.rate_limit).min())
+            rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
             self._blend = Ramp(sent - length, np.zeros_like(length), BLENDING, rate_limit)
         return Command(LENGTH, length + self._blend.step(dt))
 
@@ -297,20 +298,19 @@ class Follower:
         speed = jacobian @ at.velocity
         self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
-        low = robot.tension.bias
-        if not robot.follows_position:
-            low = low + robot.stiffness * lag * np.maximum(speed, 0.0)
+        actuation, low = robot.actuation, robot.tension.bias
+        low = low + actuation.tension_of_lag(lag, np.maximum(speed, 0.0))
         loss = np.exp(self._friction * self._sliding)
         near: Array | float = 0.0
         if self._is_stiff:
             near = self.stiffening.step(mae, trajectory, self.time, self.effort, inputs.limit, dt)
-        if robot.knows_tension:
+        if actuation.knows_tension:
             self.tension, self.missing_torque = least_tension(
                 jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
             )
             self._motor = self.tension * loss
         else:
-            self.tension = self._motor = robot.assumed_tension
+            self.tension = self._motor = actuation.assumed_tension
         length = mae.lengths(at.theta + self._shift, self.tension)
         return length + msc_compensation(robot, self._motor) + lag * speed
 
@@ -340,5 +340,5 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]
-    fastest = SHARE * robot.fastest(settings.rate_limit)
+    fastest = SHARE * robot.actuation.fastest(settings.rate_limit)
     return float(max(1.0, (np.abs(speed) / fastest).max()))

@@ -59,12 +59,6 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
 #: largest difference between the lengths of a real muscle and of its model [m]
 LENGTH_MARGIN = 0.03
-#: For modules that follow positions: fraction of the remaining stretch up to T_limit that one
-#: command may use. The rest covers errors of L_e and the age of T.
-SHARE = 0.7
-#: For modules that follow positions: fraction of the tension error that one length command
-#: corrects.
-ADMITTANCE = 0.5
 RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
 
@@ -120,9 +114,9 @@ class CommandLimiter:
         if self.command.kind == kind:
             return self.command
         if kind == TENSION:
-            if self._robot.follows_position:
-                return unchanging(self._robot, TENSION, sample)
-            return Command(TENSION, self._robot.demanded(sample.length, self.command.value))
+            before, tension = self.command.value, sample.motor_tension
+            present = self._robot.actuation.present_tension(sample.length, before, tension)
+            return Command(TENSION, present)
         return Command(LENGTH, self._length_demanding(self.command.value, sample))
 
     def _length_demanding(self, tension: Array, sample: MuscleSample) -> Array:
@@ -139,8 +133,9 @@ class CommandLimiter:
 
     def largest_change(self, kind: str, dt: float) -> Array:
         """Return the largest change of a command within dt [s]: [m] or [N], (M,)."""
-        robot, rate = self._robot, self._robot.fastest(self._settings.rate_limit) * dt
-        return rate if kind == LENGTH else rate * robot.tension_per_length(robot.tension.bias)
+        actuation, bias = self._robot.actuation, self._robot.tension.bias
+        rate = actuation.fastest(self._settings.rate_limit) * dt
+        return rate if kind == LENGTH else rate * actuation.tension_per_length(bias)
 
     def limit(
         self,
@@ -162,8 +157,10 @@ class CommandLimiter:
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
         """
-        if desired.kind == TENSION and self._robot.follows_position:
-            desired = self._by_admittance(desired.value, sample)
+        actuation = self._robot.actuation
+        if desired.kind == TENSION:
+            length, tension = sample.length, sample.motor_tension
+            desired = Command(*actuation.command_for(length, tension, desired.value))
         kind = desired.kind
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
@@ -175,9 +172,8 @@ class CommandLimiter:
             value = np.clip(value, self._robot.tension.bias, limit)
         else:
             shortest = self._shortest(before, change, sample, limit, dt)
-            # A module that follows positions winds in by its lead even if the arm is blocked.
-            if not self._robot.follows_position:
-                shortest -= lead * (sample.motor_tension * sample.usable <= limit)
+            is_relaxed = sample.motor_tension * sample.usable <= limit
+            shortest -= actuation.usable_lead(lead) * is_relaxed
             value = np.maximum(value, shortest)
         if not np.isfinite(value).all():
             return None
@@ -188,28 +184,15 @@ class CommandLimiter:
             self._last_length = self._last_length[0], self._last_length[1] + dt
         return self.command
 
-    def _by_admittance(self, tension: Array, sample: MuscleSample) -> Command:
-        """Return the lengths that move the measured tensions towards desired ones [N] (M,)."""
-        robot, measured = self._robot, np.maximum(sample.motor_tension, 0.0)
-        goal = measured + ADMITTANCE * (tension - measured)
-        return Command(LENGTH, robot.length_for(sample.length, measured, goal))
-
     def _shortest(
         self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
         """Return the shortest length [m] (M,) that demands no tension above the limit."""
-        robot = self._robot
+        robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable
-        if robot.follows_position:
-            depth = robot.elongation(limit) - robot.elongation(tension)
-            depth, most = np.where(depth > 0.0, SHARE * depth, depth), robot.release
-            # Where the tension is not known, a command may not run further ahead of the module than
-            # what stretches it from T_bias to T_limit.
-            is_known = np.isfinite(tension)
-            depth, tension = np.where(is_known, depth, most), np.where(is_known, tension, 0.0)
-        else:
-            depth = most = -msc_compensation(robot, limit)
-        per_length = robot.tension_per_length(limit)
+        depth, most = actuation.depth(tension, limit), actuation.largest_depth(limit)
+        tension = np.where(np.isfinite(tension), tension, 0.0)
+        per_length = actuation.tension_per_length(limit)
         self._relief = np.clip(
             self._relief + RELIEF * dt * (tension - limit) / per_length, 0.0, most
         )

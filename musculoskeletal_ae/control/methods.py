@@ -70,7 +70,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
             'muscles.yaml is current: the friction of a resting drive hides the force of a hand; '
             f'legal: {", ".join(legal)}'
         )
-    if robot.knows_tension:
+    if robot.tension_source.is_known:
         return
     legal = WITHOUT_TENSION.get(settings.preset, OTHERS_WITHOUT_TENSION)
     if settings.method not in legal:

@@ -143,15 +143,16 @@ class LengthRamps:
         return Command(LENGTH, self._command.copy())
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
-        self._tension = inputs.pull.motor if goal.tension is None else goal.tension
-        if not self._robot.knows_tension:
-            goal = goal._replace(method=FIRST if goal.method == SECOND else goal.method)
-            self._tension = self._robot.assumed_tension
+        actuation = self._robot.actuation
+        tension = inputs.pull.motor if goal.tension is None else goal.tension
+        self._tension = actuation.known_tension(tension)
+        if goal.method == SECOND and not actuation.knows_tension:
+            goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit
         self.solution = None  # in case the next line raises an exception
         self.solution = self._solve(goal, inputs.mae, self._tension)
         length = np.where(self._robot.used, self.solution.length, self._command)
-        rate_limit = float(self._robot.fastest(self._settings.rate_limit).min())
+        rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
         self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)
         self._remaining = max(goal.duration, self._ramp.duration)
 

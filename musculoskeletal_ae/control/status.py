@@ -97,7 +97,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
         values['unknown length offsets'] = robot.names(unknown)
         warnings.append('the length offsets are unknown, so the arm can only explore gently')
-    if not robot.knows_tension:
+    if not robot.tension_source.is_known:
         values['tension'] = f'tension_source: none: {NO_TENSION}'
     elif robot.tension_source.is_current:
         values['tension'] = f'tension_source: current: {_learned(core)}'

@@ -8,12 +8,12 @@ K_stiff times the rate limit.
 Modules that follow positions hold no tension of their own. Each is paid out until its measured
 tension is T_bias, and then stays: a tendon that no weight loads is not paid out further, and an arm
 that its muscles carry is let down slowly. A muscle whose tension is not known is paid out by
-`Robot.release`, counted from the start of the release.
+`Actuation.release`, counted from the start of the release.
 
 After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
 once the other muscles are paid out. Winding ends when its measured tension, or the tension that
 muscle stiffness control demands, has risen by `LARGEST_RISE`. It also ends when its command has
-fallen by `DEPTH`, independently of its sensors.
+fallen by `Actuation.winding_depth`, independently of its sensors.
 """
 
 from __future__ import annotations
@@ -29,9 +29,6 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 PAYING_OUT = 1.5  # duration of the release before a suspect is wound in [s]
 LARGEST_RISE = 30.0  # rise of a suspect's tension at which winding in ends [N]
-#: largest distance by which a suspect is wound in [m]; `Robot.release` for modules that follow
-#: positions
-DEPTH = 0.015
 SPEED = 0.02  # speed at which a suspect is wound in [m/s]
 
 
@@ -108,18 +105,16 @@ class SafeStop:
             change = self._limiter.largest_change(TENSION, dt)
             return Command(TENSION, np.maximum(self._robot.tension.bias, last.value - change))
         change = self._limiter.largest_change(LENGTH, dt)
-        longest = self._limiter.longest
-        if self._robot.follows_position:
-            value = self._paid_out(last.value, change, sample, is_fresh)
-            if winds and self.suspect is not None:
-                m = self.suspect
-                value[m] = self._wound(m, float(last.value[m]), sample, dt)
-            return Command(LENGTH, value)
-        # With l_target at the measured length, muscle stiffness control demands only T_bias. If the
-        # length is out of date, the muscle is paid out to its largest possible length.
-        end = sample.length if is_fresh else np.maximum(sample.length, longest)
-        # The length sensor of an isolated muscle may be faulty.
-        end = np.where(self._robot.used, end, np.minimum(end, longest))
+        if self._released_from is None:
+            self._released_from = np.maximum(last.value, sample.length)
+        end = self._robot.actuation.released(
+            last.value,
+            self._released_from,
+            sample.length,
+            sample.motor_tension,
+            self._limiter.longest,
+            is_fresh,
+        )
         value = np.minimum(last.value + change, np.maximum(end, last.value))
         if winds and self.suspect is not None:
             value[self.suspect] = self._wound(
@@ -127,37 +122,12 @@ class SafeStop:
             )
         return Command(LENGTH, value)
 
-    def _paid_out(self, last: Array, change: Array, sample: MuscleSample, is_fresh: bool) -> Array:
-        """Return the next lengths of modules that follow positions [m], (M,)."""
-        robot, whole = self._robot, self._robot.description.tension
-        if self._released_from is None:
-            self._released_from = np.maximum(last, sample.length)
-        end = self._released_from + robot.release
-        tension = sample.motor_tension
-        if is_fresh:
-            # The tension sensor of an isolated muscle may be faulty.
-            is_known = np.isfinite(tension) & robot.used
-            excess = robot.elongation(tension) - robot.elongation(whole.bias)
-            measured = sample.length + np.maximum(excess, 0.0)
-            # Where the tension is low enough, the module stays where it is commanded to be.
-            measured = np.where(tension > whole.bias, np.maximum(measured, last), last)
-            end = np.where(is_known, measured, end)
-        end = np.minimum(end, self._limiter.longest)
-        return np.minimum(last + change, np.maximum(end, last))
-
     def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:
         """Return the suspect's next length command [m]; `command` is its last one."""
         if self._wound_from is None:
             self._wound_from = command
         length, tension, _ = sample.newest[:, muscle]
-        rise = tension - self._robot.description.tension.bias[muscle]
-        if not self._robot.follows_position:
-            rise = max(rise, self._robot.stiffness[muscle] * (length - command))
-        if rise > LARGEST_RISE:
+        actuation = self._robot.actuation
+        if actuation.rise(muscle, length, command, tension) > LARGEST_RISE:
             return command
-        # A module that follows positions may have to take up slack first. `Robot.release` stretches
-        # its tendon from T_bias to T_limit, whatever the tension sensor reads.
-        depth = DEPTH
-        if self._robot.follows_position:
-            depth = float(self._robot.release[muscle])
-        return max(command - SPEED * dt, self._wound_from - depth)
+        return max(command - SPEED * dt, self._wound_from - actuation.winding_depth(muscle))

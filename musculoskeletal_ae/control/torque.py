@@ -83,7 +83,8 @@ class TorqueControl:
         # Scale the changes of all tensions by the same factor. If the old and the new tensions hold
         # the arm, all tensions in between then hold it as well.
         change = tension - self._command
-        rates = robot.tension_per_length(self._command) * robot.fastest(self._settings.rate_limit)
+        actuation, rate_limit = robot.actuation, self._settings.rate_limit
+        rates = actuation.tension_per_length(self._command) * actuation.fastest(rate_limit)
         fastest = rates * dt
         share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
         self._command = self._command + change * share

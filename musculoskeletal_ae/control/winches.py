@@ -62,8 +62,7 @@ class Winches:
         self._speed = speed = (length - before) / since
         lacking = length - command + msc_compensation(self._robot, tension)
         is_usable = (np.abs(speed) > WINDING) & self._robot.used
-        if not self._robot.follows_position:
-            is_usable &= length > command
+        is_usable &= self._robot.actuation.is_pulling(length, command)
         self._products -= float(lacking[is_usable] @ speed[is_usable])
         self._squares += float(speed[is_usable] @ speed[is_usable])
 

@@ -175,8 +175,7 @@ class Listening:
             if len(known):
                 few = np.linspace(0, len(known) - 1, min(len(known), MOST_SAMPLES)).astype(int)
                 length, tension = states[known[few], :2].swapaxes(0, 1)
-                if not self._robot.knows_tension:
-                    tension = np.tile(self._robot.assumed_tension, (len(length), 1))
+                tension = self._robot.actuation.known_tension(tension)
                 self._judge_lengths_and_joints(verdict, theta[known[few]], length, tension)
             else:
                 lacking = np.isnan(theta).all(axis=0)
@@ -191,7 +190,7 @@ class Listening:
         if len(states) > 10:
             # A driver may publish more often than it reads the modules. Temperatures are not
             # compared, because they may stay the same.
-            rows = 2 if self._robot.knows_tension else 1
+            rows = len(self._robot.tension_source.measured(states[0, :2]))
             same: Bools = states[1:, :rows] == states[:-1, :rows]
             repeated, stuck = same.all(axis=(1, 2)).mean(), same.all(axis=(0, 1))
             if repeated > MOST_REPEATED:
@@ -210,8 +209,7 @@ class Listening:
         for what, texts, meant in _readings(states):
             possible = (meant >= self._low) & (meant <= self._high)
             possible[2] |= np.isnan(meant[2])
-            if not self._robot.knows_tension:
-                possible[1] = True
+            possible[1] |= not self._robot.tension_source.is_known
             # Without a command, T must be close to T_bias in the right interpretation.
             pulls = np.median(meant[1] / self._robot.tension.bias)
             warm = meant[2][~np.isnan(meant[2])]
@@ -243,8 +241,8 @@ class Listening:
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
         """Check T and temperature in `states` (3, M) of modules without commands."""
         bias = self._robot.tension.bias
-        if self._robot.follows_position:  # T is what the posture gives
-            bias = np.full_like(bias, np.nan)
+        # Of modules that follow positions, T is what the posture gives.
+        bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
         for unit, newtons in TENSION_UNITS.items():
             if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():
                 verdict.failed('tension unit', unit=unit)
@@ -326,9 +324,9 @@ class Listening:
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)
-        moved: Bools = np.ptp(model, axis=0) > MOVED
-        if robot.follows_position:  # a hand moves the joints, but the modules hold their lengths
-            moved[:] = False
+        # A hand moves the joints, but modules that follow positions hold their lengths.
+        least = robot.actuation.choose(MOVED, math.inf)
+        moved: Bools = np.ptp(model, axis=0) > least
 
         def misfit(error: Array) -> Array:
             # On a moved arm, length offsets do not affect this comparison. On an arm at rest, the
@@ -338,7 +336,7 @@ class Listening:
 
         fit = np.array([misfit(column[:, None] - model) for column in length.T])
         if not moved.any():
-            better = 'pass --move' if robot.follows_position else 'move the arm by hand'
+            better = robot.actuation.choose('move the arm by hand', 'pass --move')
             verdict.notes.append(f'{better} for a better check of sign and order')
             fit = np.maximum(fit, fit.T)  # at rest, only pairwise exchanges can be recognised
         rows, best = linear_sum_assignment(fit)

@@ -80,7 +80,7 @@ class Positioning(MotionTest):
         except RunAwayError as error:
             muscle, detail = error.args
             self.verdict.failed('position ran away', muscle, detail=detail)
-            self._target[muscle] += self._robot.release[muscle]
+            self._target[muscle] += self._robot.actuation.release[muscle]
             end = self._now + RELEASE
             while self._now < end:
                 yield

@@ -65,9 +65,8 @@ class Verdict:
         texts = FAULTS[what]
         if muscles:
             first, robot = muscles[0], self.robot
-            values['law'] = LAW.format(robot.tension.bias[first], robot.stiffness[first])
-            if robot.follows_position:
-                values['law'] = POSITION_LAW
+            law = LAW.format(robot.tension.bias[first], robot.stiffness[first])
+            values['law'] = robot.actuation.choose(law, POSITION_LAW)
         muscles = muscles or tuple(range(self.robot.muscle_count))
         self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))

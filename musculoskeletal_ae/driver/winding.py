@@ -148,7 +148,7 @@ class Winding(MotionTest):
             length, tension, _ = self._recent[-1][1]
             tensions = self._robot.tension
             most = np.minimum(np.maximum(tensions.limit, self._highest), tensions.max)
-            asked = np.minimum(self._robot.demanded(length, self._target), most)
+            asked = np.minimum(self._demanded(length), most)
             self._tame_at[~(tension > asked + self._run_away)] = self._now
             if (wild := self._now - self._tame_at > MOMENT).any():
                 m = int(wild.argmax())
@@ -159,10 +159,16 @@ class Winding(MotionTest):
                 detail = f'l fell by {1e3 * fell.max():.0f} mm'
                 raise RunAwayError(int(fell.argmax()), detail, 0.0)
 
+    def _demanded(self, length: Array) -> Array:
+        """Return the tensions that the commands demand at l [m] (..., M), [N] (..., M)."""
+        demand = self._robot.actuation.demanded(length, self._target)
+        assert demand is not None  # such modules are tested by `Positioning`
+        return demand
+
     def _mean(self) -> _Reading:
         readings = np.array([states for _, states in self._recent])
         # The demand is averaged, because it is a nonlinear function of the noisy l.
-        demand = self._robot.demanded(readings[:, 0], self._target)
+        demand = self._demanded(readings[:, 0])
         clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
         length, tension, third = readings.mean(axis=0)
         return _Reading(length, tension, third, clipped)
@@ -194,7 +200,7 @@ class Winding(MotionTest):
         start = last = self._now
         while True:
             length = self._recent[-1][1][0]
-            lacking = self._robot.demanded(length, self._target)[m] < level
+            lacking = self._demanded(length)[m] < level
             going_on = lacking and home - self._target[m] < FURTHEST + further
             if self._now - start >= HOLD and not going_on:
                 break

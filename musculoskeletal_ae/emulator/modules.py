@@ -232,7 +232,8 @@ class Arm(ABC):
         spread = self._heat_rng.normal(0.0, HEAT_SPREAD, (5, self.robot.muscle_count))
         thermal = (one * np.exp(factor) for one, factor in zip(mean, spread, strict=True))
         robot, ones = self.robot, np.ones(self.robot.muscle_count)
-        follows, speed = ones * robot.follows_position, np.minimum(SPEED_LIMIT, robot.speed)
+        follows = ones * robot.actuation.choose(0.0, 1.0)
+        speed = robot.actuation.fastest(SPEED_LIMIT)
         limits = tension.bias, tension.max
         return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
@@ -313,7 +314,7 @@ class Arm(ABC):
         Raises:
             MusculoskeletalError: If the modules follow positions; nothing changes then.
         """
-        if self.robot.follows_position:
+        if not self.robot.actuation.follows_tensions:
             raise MusculoskeletalError(
                 'actuation: position: the modules follow lengths only; send length commands'
             )
@@ -396,9 +397,7 @@ class Arm(ABC):
         if self.robot.tension_source.is_current:
             readings = readings._replace(tension=self._read_currents(tension))
         readings = self.faults.apply(readings)
-        if not self.robot.knows_tension:
-            readings = readings._replace(tension=np.full_like(readings.tension, np.nan))
-        return readings
+        return readings._replace(tension=self.robot.tension_source.known(readings.tension))
 
     def _read_currents(self, tension: Array) -> Array:
         """Return T_read of the motor currents [N] for raw T [N] (M,), with drive friction."""

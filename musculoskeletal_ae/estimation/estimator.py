@@ -198,7 +198,7 @@ class Estimator:
                 'the learner'
             )
         check_stated_posture(self.robot, posture)
-        if not posture and not self.robot.knows_tension:
+        if not posture and not self.robot.tension_source.is_known:
             raise MusculoskeletalError(
                 'without tensions (tension_source: none), lengths can be calibrated only in a '
                 'known posture; hold the arm still and set the parameter stated_posture'
@@ -327,7 +327,7 @@ class Estimator:
         finding = self.health.step(observation)
         detected = self._handle(finding, now)
         contact = None
-        if known and self.robot.knows_tension:
+        if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, elapsed)
         self.output = Output(

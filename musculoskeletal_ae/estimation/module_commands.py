@@ -31,8 +31,8 @@ class ModuleCommands:
         Length commands demand a tension that depends on l [m] (M,). Nothing is demanded if the
         command is out of date, or if the modules follow positions.
         """
-        if now - self._time > COMMAND_AGE or robot.follows_position:
+        if now - self._time > COMMAND_AGE:
             return None
         if self._length is None:
-            return self._tension
-        return robot.demanded(length, self._length)
+            return self._tension if robot.actuation.follows_tensions else None
+        return robot.actuation.demanded(length, self._length)

@@ -124,11 +124,12 @@ class SuspectHandling:
 
     def _law(self, muscle: int) -> ModuleLaw:
         robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])
-        if not robot.follows_position:
-            return ModuleLaw(bias, float(robot.stiffness[muscle]))
         elastic = robot.series_elastic.of(muscle)
         at_zero = robot.routes.length_at_zero[muscle]
-        return PositionLaw(bias, lambda tension: float(elastic.elongation(at_zero, tension)))
+        return robot.actuation.choose(
+            ModuleLaw(bias, float(robot.stiffness[muscle])),
+            PositionLaw(bias, lambda tension: float(elastic.elongation(at_zero, tension))),
+        )
 
     def conclude(self, verdict: Verdict, isolated: Iterable[int], now: float) -> tuple[int, ...]:
         """End the verification with a verdict; return the muscles that are isolated from now on."""

@@ -130,7 +130,7 @@ def run_detector(robot: Robot, mae: Mae, recording: Recording) -> DetectorOutput
     messages = zip(recording.length, tensions, bone_tensions, strict=True)
     for n, (length, tension, bone_tension) in enumerate(messages):
         command = recording.command[n]
-        demand = None if robot.follows_position else robot.demanded(length, command)
+        demand = robot.actuation.demanded(length, command)
         state = State(*(part[n] for part in restored))
         message = observe(mae, length, tension, bone_tension, SAMPLE_TIME, demand, state, command)
         finding = health.step(message)

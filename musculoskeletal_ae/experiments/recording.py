@@ -91,11 +91,9 @@ class ClosedLoop:
 
     def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (for subclasses)
         """Estimate θ [rad] (D,) from the readings at `now` [s]."""
-        length = read.length
-        if not self.arm.robot.knows_tension:
-            return self.mae.estimate(self.arm.robot.assumed_tension, length).theta
-        end = self._direction.end_tension(self.mae.transmission, read.tension, length)
-        return self.mae.estimate(end, length).theta
+        end = self._direction.end_tension(self.mae.transmission, read.tension, read.length)
+        known = self.arm.robot.actuation.known_tension(end)
+        return self.mae.estimate(known, read.length).theta
 
     def on_command(self, command: Command | None, now: float) -> None:
         """Handle the command at `now` [s]; subclasses override this."""
@@ -170,10 +168,11 @@ def record(
             off = script(arm, SAMPLE_TIME * len(rows)) if script else None
             share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step.duration))
             command = start + share * (goal - start)
-            if off is None or robot.follows_position:
+            demand = robot.actuation.demanded(read.length, command)
+            if off is None or demand is None:
                 arm.command_length(command if off is None else command + off * PAID_OUT)
             else:
-                arm.command_tension(np.where(off, 0.0, robot.demanded(read.length, command)))
+                arm.command_tension(np.where(off, 0.0, demand))
             arm.step(SAMPLE_TIME)
             read = arm.sense()
             rows.append((arm.theta, read.theta, read.length, read.tension, command))

@@ -90,7 +90,7 @@ class CheckpointKeeper:
         self.validation = CheckpointValidator(robot)
         self.publication = Publication()
         self.rejected, self.last_rejected = 0, ''
-        self._torque, self._knows_tension = HealthyTorque(robot), robot.knows_tension
+        self._torque, self._has_torque = HealthyTorque(robot), robot.tension_source.is_known
         self._samples = samples
         self._is_validating = is_validating
         self._time = 0.0  # time of the last message, as the sum of all `dt` [s]
@@ -105,7 +105,7 @@ class CheckpointKeeper:
         self._time += dt
         self.validation.message(message.learned_tension, message.length, self._time, theta)
         # The healthy torque is used for contact detection. It cannot be computed without tensions.
-        if self.mae is not None and not is_anomaly and self._knows_tension:
+        if self.mae is not None and not is_anomaly and self._has_torque:
             self._torque.step(message.tension_read, message.length, dt)
 
     def forget_messages(self) -> None:

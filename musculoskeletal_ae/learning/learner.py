@@ -89,7 +89,7 @@ class Learner:
                 angles nor tensions.
             StateError: If the directory cannot be used.
         """
-        if joint_source == NONE and not robot.knows_tension:
+        if joint_source == NONE and not robot.tension_source.is_known:
             raise MusculoskeletalError(
                 f'joint_source {NONE!r}: without joint angles the learner needs tensions, and '
                 f'tension_source of muscles.yaml is none; legal: {SENSOR}, {MARKER}'

@@ -142,7 +142,7 @@ class Stops:
         changed = ~observed.known & (observed.tension != 0.0)
         #: joints whose torque balance is informative, (N, D)
         self.is_balanced = ~(changed @ robot.routes.crossed)
-        if not robot.knows_tension:
+        if not robot.tension_source.is_known:
             self.is_balanced[:] = False
         #: stop of each joint that is at one [rad], otherwise NaN
         self._at = np.full(model.by_sensor.shape, np.nan)

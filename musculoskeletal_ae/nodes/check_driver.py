@@ -182,11 +182,9 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
         MusculoskeletalError: If the options name an unknown muscle, or too small a tension.
     """
     muscles = robot.muscle_indices(options.muscles or [])
-    if robot.follows_position:
-        kind: Any = import_heavy('musculoskeletal_ae.driver.positioning').Positioning
-    else:
-        kind = import_heavy('musculoskeletal_ae.driver.winding').Winding
-    return kind(verdict, muscles, options.tension)
+    winding: Any = import_heavy('musculoskeletal_ae.driver.winding').Winding
+    positioning = import_heavy('musculoskeletal_ae.driver.positioning').Positioning
+    return robot.actuation.choose(winding, positioning)(verdict, muscles, options.tension)
 
 
 def _check(options: Namespace, arguments: list[str]) -> int:

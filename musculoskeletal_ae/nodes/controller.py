@@ -141,7 +141,7 @@ class Controller(Shell):
         }
         # Modules that follow positions need no tension commands, because the limiter turns tensions
         # into lengths.
-        by_tension = value in BY_TENSION and not self.robot.follows_position
+        by_tension = value in BY_TENSION and self.robot.actuation.follows_tensions
         if by_tension and followed[LENGTH] and not followed[TENSION]:
             # Refuse the method, because a driver that gets no commands pays the muscles out.
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)

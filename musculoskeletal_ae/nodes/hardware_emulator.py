@@ -66,7 +66,7 @@ class HardwareEmulator(Arm):
                 )
             self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_length_commands(self.arm.command_length)
-        if not self.robot.follows_position:
+        if self.robot.actuation.follows_tensions:
             self.follow_muscles('muscle_tension_command', self.arm.command_tension)
         self.follow_wrench('hardware_emulator', self.arm.set_wrench)
         serve(self, Trigger, 'hardware_emulator/reset', self._reset)

@@ -93,7 +93,7 @@ class LatentSimulation:
             terms.append(Term(POSTURE_WEIGHT, row[forced], fixed[forced]))
             z = mae.encode(Mask.THETA_LENGTH, theta=theta, length=length)
         state = mae.decode(descend(mae, z, terms, SEARCH))
-        least = 0.0 * robot.tension.bias if robot.follows_position else robot.tension.bias
+        least = robot.actuation.kept_tension
         return (
             np.clip(state.theta, robot.lower, robot.upper),
             np.clip(state.tension, least, robot.tension.max),

@@ -62,12 +62,19 @@ class DefaultPreset:
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
         """Return the detector that uses d, and those for slack tendons and jammed modules."""
-        from musculoskeletal_ae.estimation.detectors.jammed_module import JammedModule
+        from musculoskeletal_ae.estimation.detectors.jammed_module import (
+            JammedModule,
+            JammedPosition,
+        )
         from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
-        from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
+        from musculoskeletal_ae.estimation.detectors.slack_tendon import (
+            SlackTendon,
+            StretchedTendon,
+        )
 
-        slack = SlackTendon(robot, settings)
-        return ResidualDistance(robot, settings, slack), [slack, JammedModule(robot)]
+        slack = robot.actuation.choose(SlackTendon, StretchedTendon)(robot, settings)
+        jammed = robot.actuation.choose(JammedModule, JammedPosition)(robot)
+        return ResidualDistance(robot, settings, slack), [slack, jammed]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
         """Return the methods of the paper except `proposed`, which follows a trajectory here."""

@@ -28,10 +28,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
+from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
 from musculoskeletal_ae.robot.jumps import jumping_muscles
 from musculoskeletal_ae.robot.kinematics import RACK
-from musculoskeletal_ae.robot.robot import DESIRED_SHARE, Robot
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
@@ -180,7 +181,7 @@ def judge(setting: Setting) -> RobotCheck:
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
     # Modules that follow positions also hold a muscle at T_bias, so that it counts as taut.
-    is_taut = robot.follows_position | (tension[held] > bias + SLACK_MARGIN)
+    is_taut = tension[held] > robot.actuation.kept_tension + SLACK_MARGIN
     taut = np.where(is_taut, k, 0.0)
     full, sided = (
         setting.springs + joint_stiffness(jacobian[held], hessian[held], x, tension[held])

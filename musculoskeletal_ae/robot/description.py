@@ -22,6 +22,7 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot import series_elastic
+from musculoskeletal_ae.robot.actuation import POSITION
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, resolved
@@ -135,8 +136,7 @@ class RobotDescription:
     #: K_stiff of muscle stiffness control [N/m], (M,); infinite for modules that follow positions
     stiffness: Array
     tension: TensionRange
-    #: whether the modules follow l_target itself instead of regulating tension
-    follows_position: bool
+    actuation: str  # STIFFNESS or POSITION of `robot.actuation`
     tension_source: TensionSource
     speed: Array  # speed of modules that follow positions [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,)
@@ -161,7 +161,7 @@ class RobotDescription:
     def joint_notes(self) -> list[str]:
         """Lines about coupled joints, the kind of muscle modules, and joints held fixed."""
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
-        if self.follows_position:
+        if self.actuation == POSITION:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
         if not self.tension_source.is_known:
             lines.append(f'tension_source is none: {NO_TENSION}')
@@ -212,7 +212,7 @@ def load_description(robot: str | Path) -> RobotDescription:
     links = [str(frame.name) for frame in body_frames(model)]
     elastic_default = series_elastic.DEFAULT | _entries(content.series_elastic)
     tension_default = _read_tension('$.tension', content.tension, TENSION_DEFAULT, fail)
-    follows_position = content.actuation == 'position'
+    follows_position = content.actuation == POSITION
     stiffness_default = math.inf if follows_position else _or(content.stiffness, STIFFNESS_DEFAULT)
     speed_default = _or(content.speed, SPEED_DEFAULT) if follows_position else math.inf
     routes, elastic, tension, stiffness, warnings = [], [], [], [], list[str]()
@@ -236,7 +236,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         series_elastic=SeriesElastic(**_columns(elastic)),
         stiffness=np.array(stiffness),
         tension=TensionRange(**_columns(tension)),
-        follows_position=follows_position,
+        actuation=content.actuation,
         tension_source=_read_tension_source(content),
         speed=np.array(speed),
         release=np.array(release),
@@ -494,11 +494,11 @@ def with_modules(
     description: RobotDescription, actuation: str, tension_source: str = 'sensor'
 ) -> RobotDescription:
     """Return the description with another kind of muscle modules and their default values."""
-    follows_position, ones = actuation == 'position', np.ones(len(description.muscles))
+    follows_position, ones = actuation == POSITION, np.ones(len(description.muscles))
     scale = ones * NEWTON_PER_AMPERE if tension_source == CURRENT else None
     return replace(
         description,
-        follows_position=follows_position,
+        actuation=actuation,
         tension_source=TensionSource(tension_source, scale),
         stiffness=ones * (math.inf if follows_position else STIFFNESS_DEFAULT),
         speed=ones * (SPEED_DEFAULT if follows_position else math.inf),

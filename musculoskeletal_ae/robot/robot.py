@@ -12,6 +12,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.actuation import ACTUATIONS, Actuation
 from musculoskeletal_ae.robot.description import RobotDescription, TensionRange, load_description
 from musculoskeletal_ae.robot.groups import groups
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
@@ -19,8 +20,6 @@ from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
 from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.stiffness import muscle_stiffness
-
-DESIRED_SHARE = 0.3  # tension of a well-tensed arm, as a share of T_limit
 
 
 class Robot:
@@ -35,8 +34,9 @@ class Robot:
         self.isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
         self.stiffness = description.stiffness
-        self.follows_position, self.speed = description.follows_position, description.speed
         self.tension_source = description.tension_source
+        #: what the modules make of commands, and what they report of tensions
+        self.actuation: Actuation = ACTUATIONS[description.actuation](self)
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
         self.kinematics = Kinematics(
@@ -79,78 +79,9 @@ class Robot:
         )
         return Robot(description)
 
-    def demanded(self, length: Array, command: Array) -> Array:
-        """Return the tensions [N] (M,) that MSC demands, not limited to T_max.
-
-        NaN for modules that follow positions, which demand no tension.
-
-        Args:
-            length: l [m], (M,).
-            command: l_target [m], (M,).
-        """
-        if self.follows_position:
-            return np.full(np.shape(length), np.nan)
-        demand: Array = self.tension.bias + np.maximum(0.0, self.stiffness * (length - command))
-        return demand
-
     def elongation(self, tension: Array) -> Array:
         """Return L_e [m] (M,) at the tendon lengths of θ = 0 and T [N] (M,)."""
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
-
-    def tension_per_length(self, tension: Array) -> Array:
-        """Return the change of tension per change of a length command [N/m], (M,).
-
-        It is K_stiff of MSC. For modules that follow positions, it is the stiffness of the series
-        elastic elements at T [N], (M,).
-        """
-        if not self.follows_position:
-            return self.stiffness
-        stiffness: Array = 1.0 / self.series_elastic.compliance(self.routes.length_at_zero, tension)
-        return stiffness
-
-    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
-        """Return the length command [m] (M,) that gives other tensions in the same posture.
-
-            l_target = l − (T_wanted − T_bias)/K_stiff        MSC
-            l_target = l + L_e(T) − L_e(T_wanted)             modules that follow positions
-
-        Args:
-            length: l [m], (M,).
-            tension: T at that length [N], (M,).
-            wanted: T_wanted [N], (M,).
-        """
-        if self.follows_position:
-            return length + self.elongation(tension) - self.elongation(wanted)
-        return length - (wanted - self.tension.bias) / self.stiffness
-
-    def fastest(self, rate_limit: float) -> Array:
-        """Return the largest rate of each length command [m/s] (M,), with a given limit."""
-        return np.minimum(rate_limit, self.speed)
-
-    @property
-    def knows_tension(self) -> bool:
-        """Whether the modules measure tensions or motor currents."""
-        return self.tension_source.is_known
-
-    @property
-    def assumed_tension(self) -> Array:
-        """Tension that models and plans use where it is not known [N], (M,).
-
-        It is the tension of a well-tensed arm, from which `check_robot` starts.
-        """
-        whole = self.description.tension
-        return np.maximum(whole.bias, DESIRED_SHARE * whole.limit)
-
-    @property
-    def release(self) -> Array:
-        """Length that a stop pays out where no tension is known [m], (M,).
-
-        By default it is the length that lowers a tension from T_limit to T_bias in one posture.
-        """
-        whole = self.description.tension
-        usual = self.elongation(whole.limit) - self.elongation(whole.bias)
-        stated = self.description.release
-        return np.where(np.isnan(stated), usual, stated)
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
         """Return the indices of the named muscles in T and l.
@@ -177,6 +108,7 @@ class Robot:
         reduced.isolated = tuple(sorted(muscles))
         used = reduced.used = ~np.isin(np.arange(self.muscle_count), reduced.isolated)
         reduced.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
+        reduced.actuation = type(self.actuation)(reduced)
         return reduced
 
     def with_elasticity(self, elasticity: JointElasticity | None) -> Robot:

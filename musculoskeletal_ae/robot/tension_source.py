@@ -50,9 +50,16 @@ class TensionSource:
 
     def from_message(self, values: Array) -> Array:
         """Return T_read [N] (M,) from the values of a message, in [N] or [A]; NaN if unknown."""
-        if not self.is_known:
-            return np.full_like(values, np.nan)
-        return values if self.newton_per_ampere is None else values * self.newton_per_ampere
+        scale = self.newton_per_ampere
+        return self.known(values if scale is None else values * scale)
+
+    def known(self, tension: Array) -> Array:
+        """Return T_read [N] (..., M), or NaN if tensions are unknown."""
+        return tension if self.is_known else np.full_like(tension, np.nan)
+
+    def measured(self, rows: Array) -> Array:
+        """Return those of the rows l and T_read, (2, ...), that are measured."""
+        return rows if self.is_known else rows[:1]
 
     def to_message(self, tension: Array) -> Array:
         """Return the values of a message, in [N] or [A], from T_read [N] (M,)."""

@@ -63,7 +63,7 @@ class MuscleSample:
         motor_tension: Motor-side tension T [N]; NaN where it is not known. It equals T_read for
             tension sensors, and for motor currents until their friction has been learned.
         bone_tension: Bone-side tension T_end, with tendon friction removed [N]. Where tension is
-            not known, it is the tension that models assume (`Robot.assumed_tension`).
+            not known, it is the tension that models assume (`Actuation.assumed_tension`).
         sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.
         temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
         usable: Which muscles are not isolated.
@@ -330,9 +330,8 @@ class MuscleStream:
         """
         now = time if now is None else now
         offsets = self.body.offsets
-        if not self._robot.knows_tension:
-            states = states.copy()
-            states[1] = np.nan
+        states = states.copy()
+        states[1] = self._robot.tension_source.known(states[1])
         newest = states.copy()
         newest[0] -= offsets.offset
         problem = self._problem(states, newest, now)
@@ -354,7 +353,7 @@ class MuscleStream:
             length_read=read[0],
             tension_read=read[1],
             motor_tension=self._transmission.motor(read[1], sliding),
-            bone_tension=end if self._robot.knows_tension else self._robot.assumed_tension,
+            bone_tension=self._robot.actuation.known_tension(end),
             sliding=sliding,
             temperature=self._temperatures.step(read[2], now),
             usable=self.body.used,

@@ -403,11 +403,13 @@ class QuasiStatics:
         # A noisy fit may return a slightly negative friction, which would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         bias, most = robot.tension.bias, robot.tension.max
-        stiffness, span, loose = robot.stiffness, (most - bias) / robot.stiffness, 0.0 * most
-        if robot.follows_position:
-            stiffness, bias = np.full_like(most, RIGID), 0.0 * bias
-            span = loose = np.full_like(most, FARTHEST)
-        muscles = stiffness, bias, most, span, loose, friction, robot.speed
+        farthest = np.full_like(most, FARTHEST)
+        stiffness, span, loose = robot.actuation.choose(
+            (robot.stiffness, (most - bias) / robot.stiffness, 0.0 * most),
+            (np.full_like(most, RIGID), farthest, farthest),
+        )
+        kept, speed = robot.actuation.kept_tension, robot.actuation.speed
+        muscles = stiffness, kept, most, span, loose, friction, speed
         units = elastic.force, elastic.rate, elastic.wire_stretch, robot.routes.length_at_zero
         joints = robot.lower, robot.upper, self._viscosity
         self.body = Body(*map(np.array, (*muscles, *units, *joints)))
@@ -417,8 +419,9 @@ class QuasiStatics:
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
         """Return the arms h [s] later; `SimulatedBody.step` describes the arguments."""
-        if self._robot.follows_position:
-            command = np.where(np.isfinite(command), command, state.followed)
+        # Without a command, modules that follow positions hold theirs.
+        held = self._robot.actuation.choose(command, state.followed)
+        command = np.where(np.isfinite(command), command, held)
         passed = np.exp(-self.body.friction * state.slid)
         end = passed * state.tension
         length, pullback = self._mae.lengths_with_pullback(state.theta, end)

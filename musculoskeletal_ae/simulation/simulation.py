@@ -172,7 +172,7 @@ class Simulation:
         if limits := self.limits():
             return Report('warn', f'at the limit: {", ".join(limits)}', values)
         commanded = np.isfinite(command).all()
-        waiting = 'holding its lengths' if self.robot.follows_position else 'resting at T_bias'
+        waiting = self.robot.actuation.choose('resting at T_bias', 'holding its lengths')
         return Report('ok', 'following commands' if commanded else waiting, values)
 
     def _advance(self, h: float) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.options import save_plot
+from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.checks import (
     COUNTED_ARM,
     REQUIRED_SHARE,
@@ -19,7 +20,7 @@ from musculoskeletal_ae.robot.checks import (
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.remedies import remedies
-from musculoskeletal_ae.robot.robot import DESIRED_SHARE, Robot
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.suggestion import suggest, write
 
 

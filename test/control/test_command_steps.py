@@ -96,7 +96,7 @@ class Arm(RuleBasedStateMachine):
                 assert (rise <= SMALL).all(), 'motion after a stop'
         elif command.kind == LENGTH:
             pull = np.maximum(self.core.sample.motor_tension, ROBOT.tension.bias)
-            demanded = ROBOT.demanded(length, value)
+            demanded = ROBOT.actuation.demanded(length, value)
             assert (demanded <= pull + stiffness * rate * 0.1 + SMALL)[self.core.robot.used].all()
         if command.kind == LENGTH:
             if self.last_length is not None:
@@ -110,7 +110,7 @@ class Arm(RuleBasedStateMachine):
 
     @staticmethod
     def demand(kind, value, length):
-        return value if kind == TENSION else ROBOT.demanded(length, value)
+        return value if kind == TENSION else ROBOT.actuation.demanded(length, value)
 
     # -- what happens ---------------------------------------------------------------------------
 

@@ -101,7 +101,7 @@ def test_changing_between_length_and_tension_commands_causes_no_step_in_tension(
     bench.target(REST)
     (sent,) = bench.step(200)[-1:]
     length, _ = rest_readings(ROBOT, REST)
-    demand = ROBOT.demanded(length, sent.value)
+    demand = ROBOT.actuation.demanded(length, sent.value)
     bench.configure(method='tension')
     first = bench.step()[0]
     assert first.kind == TENSION
@@ -110,7 +110,7 @@ def test_changing_between_length_and_tension_commands_causes_no_step_in_tension(
     bench.configure(method='proposed')
     back = bench.step()[0]
     assert back.kind == LENGTH
-    assert np.abs(ROBOT.demanded(length, back.value) - first.value).max() <= most + 1e-9
+    assert np.abs(ROBOT.actuation.demanded(length, back.value) - first.value).max() <= most + 1e-9
     assert np.abs(back.value - sent.value).max() <= 2.0 * bench.core.settings.rate_limit * DT + 1e-9
 
 

@@ -112,7 +112,7 @@ def test_across_changes_between_lengths_and_tensions_no_demand_and_no_length_mak
         desired = Command(LENGTH, length) if by_length else Command(TENSION, tension)
         sent = limiter.limit(desired, now, LIMIT, DT).value
         elapsed += DT
-        before, demand = demand, ROBOT.demanded(now.length, sent) if by_length else sent
+        before, demand = demand, ROBOT.actuation.demanded(now.length, sent) if by_length else sent
         assert (demand - before <= ROBOT.stiffness * rate * DT + 1e-6).all()
         if by_length:
             if last_length is not None:

@@ -296,7 +296,7 @@ def test_sudden_changes_of_planned_tension_slow_a_trajectory_little():
 def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench):
     bench.core.trajectory(points(OTHER))
     (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
-    demanded = np.array([ROBOT.demanded(length, c.value) for c in bench.step(400)])
+    demanded = np.array([ROBOT.actuation.demanded(length, c.value) for c in bench.step(400)])
     assert 0.9 < (demanded / limits.limit).max() <= 1.0 + 1e-9
 
 
@@ -307,7 +307,7 @@ def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
     for _ in range(4000):
         (command,) = bench.step()
         length, _ = rest_readings(ROBOT, REST, bench.tension)
-        demanded = np.clip(ROBOT.demanded(length, command.value), 0.0, ROBOT.tension.max)
+        demanded = np.clip(ROBOT.actuation.demanded(length, command.value), 0.0, ROBOT.tension.max)
         bench.tension = pull = pull + 0.3 * (demanded - pull)
         highest = max(highest, (pull - ROBOT.tension.limit).max())
     assert -20.0 < highest < 5.0  # [N]

@@ -98,7 +98,7 @@ def test_without_a_known_tension_a_stop_pays_out_the_stated_length():
     for unknown in (lambda *_: None, lambda _, command: sample(command, np.nan, ROBOT)):
         sent = stopped(unknown, 200)
         longest = CommandLimiter(ROBOT, Settings()).longest
-        np.testing.assert_allclose(sent[-1], np.minimum(ROBOT.release, longest))
+        np.testing.assert_allclose(sent[-1], np.minimum(ROBOT.actuation.release, longest))
 
 
 def test_a_stopped_suspect_is_wound_in_slightly_and_no_other_muscle():
@@ -107,7 +107,7 @@ def test_a_stopped_suspect_is_wound_in_slightly_and_no_other_muscle():
     assert (sent[:begun] == 0.0).all()
     others = np.arange(COUNT) != 2
     assert (sent[:, others] == 0.0).all()
-    assert -ROBOT.release[2] - 1e-9 <= sent[-1, 2] < -0.005
+    assert -ROBOT.actuation.release[2] - 1e-9 <= sent[-1, 2] < -0.005
 
 
 def test_the_length_command_is_the_length_itself():

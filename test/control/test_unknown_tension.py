@@ -53,8 +53,8 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
             np.array([read.length, tension, read.temperature]), 0.0
         )
         assert np.isnan(sample.motor_tension).all()
-        np.testing.assert_array_equal(sample.model_tension, ROBOT.assumed_tension)
-        np.testing.assert_array_equal(sample.bone_tension, ROBOT.assumed_tension)
+        np.testing.assert_array_equal(sample.model_tension, ROBOT.actuation.assumed_tension)
+        np.testing.assert_array_equal(sample.bone_tension, ROBOT.actuation.assumed_tension)
     with pytest.raises(RejectionError):  # lengths are still required
         MuscleStream(ROBOT).take_states(
             np.array([read.length + 5.0, read.tension, read.temperature]), 0.0
@@ -99,13 +99,13 @@ def test_no_command_runs_further_ahead_of_a_module_than_its_release(loop):
     limiter, sample = loop.core.limiter, loop.core.sample
     assert limiter.command is not None
     lead = sample.length - limiter.command.value
-    assert (lead <= ROBOT.release + 1e-9).all()
-    stuck = replace(sample, length=limiter.command.value + 0.5 * ROBOT.release)
+    assert (lead <= ROBOT.actuation.release + 1e-9).all()
+    stuck = replace(sample, length=limiter.command.value + 0.5 * ROBOT.actuation.release)
     far = limiter.command._replace(value=limiter.command.value - 1.0)
     before = limiter.command.value.copy()
     for _ in range(100):
         sent = limiter.limit(far, stuck, ROBOT.tension.limit, 0.01).value
-    assert (stuck.length - sent <= ROBOT.release + 1e-9).all()
+    assert (stuck.length - sent <= ROBOT.actuation.release + 1e-9).all()
     assert (sent < before).all()
 
 
@@ -115,7 +115,8 @@ def test_a_stop_pays_out_the_stated_length(loop):
     core.stop(StopCause.OPERATOR)
     loop.wait(3.0)
     paid_out = core.limiter.command.value - before
-    assert (paid_out > 0.5 * np.minimum(ROBOT.release, core.limiter.longest - before)).all()
+    most = np.minimum(ROBOT.actuation.release, core.limiter.longest - before)
+    assert (paid_out > 0.5 * most).all()
 
 
 def test_lengths_are_calibrated_in_a_stated_posture_only_and_nothing_explores_before(trained):
@@ -132,7 +133,7 @@ def test_lengths_are_calibrated_in_a_stated_posture_only_and_nothing_explores_be
 def test_the_estimator_estimates_from_lengths_and_names_what_is_unknown(trained):
     core, mae = Estimator(ROBOT), trained['default']
     core.use(mae)
-    length = mae.lengths(THETA, ROBOT.assumed_tension)
+    length = mae.lengths(THETA, ROBOT.actuation.assumed_tension)
     shake = np.random.default_rng(0)
     for n in range(100):
         noisy = length + 1e-4 * shake.normal(size=COUNT)

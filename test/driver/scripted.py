@@ -82,7 +82,7 @@ class Driver:
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
     ) -> Verdict:
         """Return the verdict of `Winding` or `Positioning`, without that of `Listening`."""
-        kind = Positioning if self.robot.follows_position else Winding
+        kind = self.robot.actuation.choose(Winding, Positioning)
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
             for _, rows in self.step():

@@ -103,7 +103,7 @@ def test_a_muscle_without_its_commanded_tension_is_an_anomaly(robot, mae, watch,
     assert not any(watched.findings(slack, messages))  # without a command, no tension is demanded
     watched.demand = np.full(6, 60.0)
     if by_length:
-        watched.demand = robot.demanded(slack.length, slack.length - 0.003)
+        watched.demand = robot.actuation.demanded(slack.length, slack.length - 0.003)
     findings = watched.findings(slack, messages)
     assert findings[0] is None
     assert (findings[-1].muscle, findings[-1].kind) == (2, Kind.SLACK_TENDON)
@@ -130,7 +130,7 @@ def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot,
         at = theta[n] if moves else theta[0]
         each = robot.muscle_lengths(at, tension)
         each[shortest] = length[n]
-        watched.demand = robot.demanded(each, each - 0.01)
+        watched.demand = robot.actuation.demanded(each, each - 0.01)
         _, _, finding = watched.step((tension, each), State(at, tension, each))
         kinds.add(finding and finding.kind)
     assert kinds == ({None} if moves else {None, Kind.SLACK_TENDON})
@@ -190,7 +190,7 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, w
         reported[0] = 140.0 if n < 200 else 60.0
         watched.demand = reported
         if kind == 'length':
-            watched.demand = robot.demanded(length, length - (reported - 30.0) / 1e4)
+            watched.demand = robot.actuation.demanded(length, length - (reported - 30.0) / 1e4)
         _, _, finding = watched.step((tension, length), state)
         if finding is not None and finding.kind is Kind.JAMMED_MODULE:
             findings.append((n, finding.muscle))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from exact_mae import rest_readings
 
-from musculoskeletal_ae.estimation.detectors.jammed_module import JAM_TIME, JammedModule
-from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SlackTendon
+from musculoskeletal_ae.estimation.detectors.jammed_module import JAM_TIME, JammedPosition
+from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
 from musculoskeletal_ae.estimation.finding import Kind, observe
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.verification import Outcome, PositionLaw, Verification
@@ -31,7 +31,7 @@ def readings(mae, shorter=0.0):
 
 @pytest.mark.parametrize(('shorter', 'is_found'), [(0.06, True), (0.0, False), (-0.02, False)])
 def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, is_found):
-    detector = SlackTendon(ROBOT, Detection())
+    detector = StretchedTendon(ROBOT, Detection())
     detector.use(mae)
     length, tension = readings(mae, shorter)
     message = observe(mae, length, tension, tension, DT)
@@ -47,7 +47,7 @@ def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, i
                                         (0.02, 490.0, False)]
 )  # fmt: skip
 def test_a_module_that_does_not_go_where_it_is_commanded_is_jammed(mae, behind, tension, is_found):
-    detector = JammedModule(ROBOT)
+    detector = JammedPosition(ROBOT)
     detector.use(mae)
     length, pull = mae.lengths(THETA, BIAS), BIAS.copy()
     pull[MUSCLE] = tension

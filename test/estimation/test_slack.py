@@ -29,7 +29,7 @@ def noticed(robot, mae, slack):
         for n in range(round(longest / DT)):
             wound = min(until, speed * n * DT) * np.eye(6)[MUSCLE]
             length = slack.length - wound + 1e-4 * rng.standard_normal(6)
-            demand, tension = robot.demanded(length, length - 0.003), slack.tension
+            demand, tension = robot.actuation.demanded(length, length - 0.003), slack.tension
             finding = health.step(observe(mae, length, tension, tension, DT, demand, state))
             if finding is not None:
                 assert (finding.muscle, finding.kind) == (MUSCLE, Kind.SLACK_TENDON)
@@ -78,7 +78,7 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
     kinds = []
     for n in range(60):
         length = start - 0.009 * n * DT * one
-        demand = robot.demanded(length, length - 0.003)
+        demand = robot.actuation.demanded(length, length - 0.003)
         finding = health.step(observe(calibrated, length, tension, tension, DT, demand))
         kinds.append(finding and finding.kind)
     assert (Kind.RESIDUAL_DISTANCE in kinds[:50]) == found

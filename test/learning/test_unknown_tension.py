@@ -16,7 +16,7 @@ ROBOT = Robot(
 
 def test_a_body_is_fitted_to_lengths_whatever_torque_the_assumed_tension_would_give():
     true, rng = Individual(ROBOT, 3), np.random.default_rng(0)
-    tension = np.tile(ROBOT.assumed_tension, (60, 1))
+    tension = np.tile(ROBOT.actuation.assumed_tension, (60, 1))
     theta = ROBOT.random_postures(60, rng)
     # The true tensions differ from the assumed ones, and do not balance the torque either.
     length = true.muscle_lengths(theta, tension * rng.uniform(0.8, 1.2, tension.shape))
@@ -27,7 +27,7 @@ def test_a_body_is_fitted_to_lengths_whatever_torque_the_assumed_tension_would_g
     # Joint sensors determine the postures.
     np.testing.assert_allclose(fitted.theta, theta, atol=0.02)
     held_out = ROBOT.random_postures(200, rng)
-    assumed = np.tile(ROBOT.assumed_tension, (200, 1))
+    assumed = np.tile(ROBOT.actuation.assumed_tension, (200, 1))
     after = np.abs(
         fit.body.lengths(held_out, assumed, 0.0 * assumed)[0]
         - true.muscle_lengths(held_out, assumed)

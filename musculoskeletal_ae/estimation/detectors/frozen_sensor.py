@@ -47,7 +47,7 @@ class FrozenSensor(Detector):
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)
-        if not robot.knows_tension:
+        if not robot.tension_source.is_known:
             is_same[1] = 0.0
         self._last = readings
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same

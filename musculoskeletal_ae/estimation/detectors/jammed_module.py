@@ -67,14 +67,21 @@ class JammedModule(Detector):
     def _is_far(self, observation: Observation) -> Bools | None:
         """Return which modules have not reached their command, (M,); None without a command."""
         tension, most = observation.sample.motor_tension, self._robot.tension.max
-        if self._robot.follows_position:
-            if observation.command is None:
-                return None
-            behind = np.abs(observation.sample.length - observation.command) > BEHIND
-            is_behind: Bools = behind & ~(tension > FULL * most)
-            return is_behind
         if observation.demand is None:
             return None
         demand = np.minimum(observation.demand, most)
         is_far: Bools = np.abs(tension - demand) > np.maximum(JAM, JAM_SHARE * demand)
+        return is_far
+
+
+class JammedPosition(JammedModule):
+    """Does the same for modules that follow positions."""
+
+    def _is_far(self, observation: Observation) -> Bools | None:
+        """Return which modules have not reached their command, (M,); None without a command."""
+        if observation.command is None:
+            return None
+        tension, most = observation.sample.motor_tension, self._robot.tension.max
+        behind = np.abs(observation.sample.length - observation.command) > BEHIND
+        is_far: Bools = behind & ~(tension > FULL * most)
         return is_far

@@ -26,7 +26,7 @@ class MissingValues(Detector):
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
         """Report a muscle that alone has reported NaN for SILENT; see `Detector`."""
-        known = states[:2] if self._robot.knows_tension else states[:1]
+        known = self._robot.tension_source.measured(states[:2])
         is_missing = ~np.isfinite(known).all(axis=0) & usable
         muscle = int(is_missing.argmax()) if np.count_nonzero(is_missing) == 1 else None
         if muscle != self._muscle or now - self._last > SILENT:

@@ -69,8 +69,6 @@ class SlackTendon(Detector):
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle that has been slack for DEAD_TIME and is not being wound in."""
-        if self._robot.follows_position:
-            return self._step_by_stretch(observation)
         sample, theta, dt = observation.sample, observation.estimate.state.theta, observation.dt
         tension, length = sample.motor_tension, sample.length
         demand = self._demand(observation)
@@ -104,7 +102,30 @@ class SlackTendon(Detector):
             muscle, Kind.SLACK_TENDON, 'it has no tension although the command demands it'
         )
 
-    def _step_by_stretch(self, observation: Observation) -> Finding | None:
+    def _demand(self, observation: Observation) -> Array | None:
+        """Return the demanded tension [N], (M,), or None if it is unknown.
+
+        Without a known command it is unknown, with one exception: while the estimate is
+        implausible, the controller sends no commands, and the modules hold T_bias. Then T_bias is
+        returned, unless all muscles are slack.
+        """
+        if observation.demand is not None:
+            return observation.demand
+        bias, theta = self._robot.tension.bias, observation.estimate.state.theta
+        is_implausible = share_outside(self._robot, theta).max() > LIMITS.estimate_outside
+        is_slack = observation.sample.motor_tension < LIMITS.slack_share * bias
+        if not is_implausible or is_slack[self._robot.used].all():
+            return None
+        return np.full(len(is_slack), bias)
+
+
+class StretchedTendon(SlackTendon):
+    """Measures how long each tendon of modules that follow positions has been stretched, but slack.
+
+    Such modules do not wind in slack by themselves, so `is_winding_in` stays False.
+    """
+
+    def step(self, observation: Observation) -> Finding | None:
         """Report a muscle that has been stretched without tension for DEAD_TIME."""
         sample, bias = observation.sample, self._robot.tension.bias
         is_slack = (sample.motor_tension < LIMITS.slack_share * bias) & self._robot.used
@@ -135,19 +156,3 @@ class SlackTendon(Detector):
         stretch = mae.lengths(theta, tension) - sample.length
         is_stretched: Bools = stretch > share * robot.elongation(robot.description.tension.bias)
         return is_stretched
-
-    def _demand(self, observation: Observation) -> Array | None:
-        """Return the demanded tension [N], (M,), or None if it is unknown.
-
-        Without a known command it is unknown, with one exception: while the estimate is
-        implausible, the controller sends no commands, and the modules hold T_bias. Then T_bias is
-        returned, unless all muscles are slack.
-        """
-        if observation.demand is not None:
-            return observation.demand
-        bias, theta = self._robot.tension.bias, observation.estimate.state.theta
-        is_implausible = share_outside(self._robot, theta).max() > LIMITS.estimate_outside
-        is_slack = observation.sample.motor_tension < LIMITS.slack_share * bias
-        if not is_implausible or is_slack[self._robot.used].all():
-            return None
-        return np.full(len(is_slack), bias)

@@ -1,0 +1,409 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What muscle modules make of their commands: `actuation` of muscles.yaml.
+
+    StiffnessControl   T = T_bias + max(0, K_stiff (l − l_target))          (paper, eq. 5)
+    PositionControl    l → l_target; T results from the stretch of the series elastic elements
+
+Control, safe stop and detectors get from `Robot.actuation` what differs between them. Neither asks
+which modules the arm has.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.robot.tension_source import TensionSource
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.robot.robot import Robot
+
+Choice = TypeVar('Choice')
+Kinded = tuple[str, Array]  # kind and value of a command
+
+LENGTH, TENSION = 'length', 'tension'  # kinds of commands
+STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
+
+DESIRED_SHARE = 0.3  # tension of a well-tensed arm, as a share of T_limit
+#: largest relief of needless tension by modules under stiffness control [m]; covers length errors
+#: and the tension that friction retains in a tendon
+RELIEF = 0.01
+#: the same of modules that follow positions [m]; covers errors of a network that has not learned
+#: the arm yet, which such modules turn into slack or into tension
+SLACK = 0.03
+#: share of the stretch that remains up to T_limit that a command to a module that follows positions
+#: may use; the rest covers errors of L_e and the age of T
+SHARE = 0.7
+#: share of a difference of tensions that a command to such a module removes
+ADMITTANCE = 0.5
+DEPTH = 0.015  # by which a suspect under stiffness control is wound in, at most [m]
+
+
+class Actuation(ABC):
+    """How the modules of one arm turn commands into tensions, and what they report of them.
+
+    Attributes:
+        source: Source of the tensions.
+        speed: Largest speed of each module [m/s], (M,); infinite if it is not known.
+        follows_tensions: Whether the modules follow tension commands, too.
+    """
+
+    follows_tensions: bool
+
+    def __init__(self, robot: Robot) -> None:
+        """Take the body; isolated muscles have a bias of 0."""
+        description = robot.description
+        self._robot, self._whole = robot, description.tension
+        self._stiffness, self._stated_release = description.stiffness, description.release
+        self.source: TensionSource = description.tension_source
+        self.speed: Array = description.speed
+
+    @property
+    def _bias(self) -> Array:
+        return self._robot.tension.bias
+
+    # -- tensions that are known -----------------------------------------------------------------
+
+    @property
+    def knows_tension(self) -> bool:
+        """Whether the modules measure tensions or motor currents."""
+        return self.source.is_known
+
+    @property
+    def assumed_tension(self) -> Array:
+        """Tension that models and plans use where it is not known [N], (M,).
+
+        It is that of a well-tensed arm, by which `check_robot` judges.
+        """
+        return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
+
+    def known_tension(self, measured: Array) -> Array:
+        """Return measured tensions [N], (..., M), or the assumed ones if none are measured."""
+        if self.knows_tension:
+            return measured
+        return np.full_like(measured, self.assumed_tension)
+
+    # -- commands and tensions -------------------------------------------------------------------
+
+    @abstractmethod
+    def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:
+        """Return the one of two parts that belongs to these modules."""
+
+    @property
+    @abstractmethod
+    def kept_tension(self) -> Array:
+        """Tension that the modules keep by themselves [N], (M,)."""
+
+    @abstractmethod
+    def demanded(self, length: Array, command: Array) -> Array | None:
+        """Return the tensions [N] (M,) that a length command demands, not limited to T_max.
+
+        None if length commands demand no tension.
+
+        Args:
+            length: l [m], (M,).
+            command: l_target [m], (M,).
+        """
+
+    @abstractmethod
+    def tension_per_length(self, tension: Array) -> Array:
+        """Return the change of tension per change of a length command [N/m], (M,), at T [N]."""
+
+    @abstractmethod
+    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
+        """Return the length command [m] (M,) that gives other tensions in the same posture.
+
+        Args:
+            length: l [m], (M,).
+            tension: T at that length [N], (M,).
+            wanted: T_wanted [N], (M,).
+        """
+
+    @abstractmethod
+    def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
+        """Return kind and value of the command that brings about tensions; see `length_for`."""
+
+    @abstractmethod
+    def unchanging_length(self, length: Array, tension: Array) -> Array:
+        """Return the length command [m] (M,) that keeps T [N] at l [m]."""
+
+    @abstractmethod
+    def present_tension(self, length: Array, command: Array, tension: Array) -> Array:
+        """Return the tension command [N] (M,) that continues a length command.
+
+        Args:
+            length: l [m], (M,).
+            command: l_target [m], (M,).
+            tension: T [N], (M,).
+        """
+
+    @abstractmethod
+    def is_pulling(self, length: Array, command: Array) -> Bools:
+        """Return which modules follow l_target instead of keeping T_bias, (M,)."""
+
+    @abstractmethod
+    def tension_of_lag(self, lag: float, speed: Array) -> Array:
+        """Return the tension [N] (M,) that a module needs to turn.
+
+        Args:
+            lag: λ, time by which the modules lag behind [s].
+            speed: Speed at which they pay out [m/s], (M,); not negative.
+        """
+
+    def fastest(self, rate_limit: float) -> Array:
+        """Return the largest rate of each length command [m/s] (M,), with a given limit."""
+        return np.minimum(rate_limit, self.speed)
+
+    # -- limits ----------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def largest_relief(self) -> float:
+        """Largest length by which rest feedback relieves a muscle [m]."""
+
+    @abstractmethod
+    def depth(self, tension: Array, limit: Array) -> Array:
+        """Return by how much a command may be shorter than the measured length [m], (M,).
+
+        Negative where the muscle has to be paid out.
+
+        Args:
+            tension: T [N], (M,); NaN where it is not known.
+            limit: T_limit [N], (M,).
+        """
+
+    @abstractmethod
+    def largest_depth(self, limit: Array) -> Array:
+        """Return the largest `depth` [m], (M,), for a T_limit [N]."""
+
+    @abstractmethod
+    def usable_lead(self, lead: Array | float) -> Array | float:
+        """Return how much further than `depth` a command may run ahead of a lagging module [m].
+
+        Args:
+            lead: Lag of each module behind its command while it winds in [m], scalar or (M,).
+        """
+
+    @property
+    def release(self) -> Array:
+        """Length that a stop pays out where no tension is known [m], (M,).
+
+        By default it is what takes a tension from T_limit to T_bias in the same posture.
+        """
+        usual = self._robot.elongation(self._whole.limit) - self._robot.elongation(self._whole.bias)
+        stated = self._stated_release
+        return np.where(np.isnan(stated), usual, stated)
+
+    @abstractmethod
+    def released(
+        self, last: Array, start: Array, length: Array, tension: Array, longest: Array,
+        is_fresh: bool,
+    ) -> Array:  # fmt: skip
+        """Return the lengths to which a stop pays the muscles out [m], (M,).
+
+        Args:
+            last: The last length command [m], (M,).
+            start: Length at which the release started [m], (M,).
+            length: l [m], (M,).
+            tension: T [N], (M,).
+            longest: Length at which each muscle is slack in any posture [m], (M,).
+            is_fresh: Whether l and T are up to date.
+        """
+
+    @abstractmethod
+    def rise(self, muscle: int, length: float, command: float, tension: float) -> float:
+        """Return by how much a muscle that is wound in pulls more than T_bias [N].
+
+        Args:
+            muscle: Index of the muscle.
+            length: l [m].
+            command: l_target [m].
+            tension: T [N].
+        """
+
+    @abstractmethod
+    def winding_depth(self, muscle: int) -> float:
+        """Return by how much a suspect muscle may be wound in, whatever its sensors read [m]."""
+
+
+class StiffnessControl(Actuation):
+    """Modules under muscle stiffness control, which keep T_bias by themselves."""
+
+    follows_tensions = True
+    largest_relief = RELIEF
+
+    def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:  # noqa: ARG002
+        """Return `by_stiffness`."""
+        return by_stiffness
+
+    @property
+    def kept_tension(self) -> Array:
+        """T_bias [N], (M,)."""
+        return self._bias
+
+    def demanded(self, length: Array, command: Array) -> Array:
+        """Return T_bias + max(0, K_stiff (l − l_target)) [N], (M,)."""
+        demand: Array = self._bias + np.maximum(0.0, self._stiffness * (length - command))
+        return demand
+
+    def tension_per_length(self, tension: Array) -> Array:  # noqa: ARG002
+        """Return K_stiff [N/m], (M,)."""
+        return self._stiffness
+
+    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:  # noqa: ARG002
+        """Return l − (T_wanted − T_bias)/K_stiff [m], (M,)."""
+        return length - (wanted - self._bias) / self._stiffness
+
+    def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:  # noqa: ARG002
+        """Return the tensions themselves."""
+        return TENSION, wanted
+
+    def unchanging_length(self, length: Array, tension: Array) -> Array:
+        """Return the command that demands T [N] at l [m], (M,)."""
+        return self.length_for(length, tension, np.maximum(tension, self._bias))
+
+    def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
+        """Return the demanded tensions [N], (M,)."""
+        return self.demanded(length, command)
+
+    def is_pulling(self, length: Array, command: Array) -> Bools:
+        """Return where l is larger than l_target, (M,)."""
+        pulling: Bools = length > command
+        return pulling
+
+    def tension_of_lag(self, lag: float, speed: Array) -> Array:
+        """Return K_stiff λ dl/dt [N], (M,)."""
+        tension: Array = self._stiffness * lag * speed
+        return tension
+
+    def depth(self, tension: Array, limit: Array) -> Array:  # noqa: ARG002
+        """Return (T_limit − T_bias)/K_stiff [m], (M,)."""
+        return self.largest_depth(limit)
+
+    def largest_depth(self, limit: Array) -> Array:
+        """Return (T_limit − T_bias)/K_stiff [m], (M,)."""
+        depth: Array = (limit - self._bias) / self._stiffness
+        return depth
+
+    def usable_lead(self, lead: Array | float) -> Array | float:
+        """Return the lead: the motor takes K_stiff λ dl/dt of the demand to turn."""
+        return lead
+
+    def released(
+        self, last: Array, start: Array, length: Array, tension: Array, longest: Array,  # noqa: ARG002
+        is_fresh: bool,
+    ) -> Array:  # fmt: skip
+        """Return the measured lengths [m] (M,), at which only T_bias is demanded."""
+        # If the length is out of date, the muscle is paid out to its largest possible length.
+        end = length if is_fresh else np.maximum(length, longest)
+        # The length sensor of an isolated muscle may be faulty.
+        return np.where(self._robot.used, end, np.minimum(end, longest))
+
+    def rise(self, muscle: int, length: float, command: float, tension: float) -> float:
+        """Return the larger of measured and demanded rise [N]."""
+        measured = tension - self._whole.bias[muscle]
+        return float(max(measured, self._stiffness[muscle] * (length - command)))
+
+    def winding_depth(self, muscle: int) -> float:  # noqa: ARG002
+        """Return DEPTH [m]."""
+        return DEPTH
+
+
+class PositionControl(Actuation):
+    """Modules that follow positions, and keep no tension by themselves."""
+
+    follows_tensions = False
+    largest_relief = SLACK
+
+    def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:  # noqa: ARG002
+        """Return `by_position`."""
+        return by_position
+
+    @property
+    def kept_tension(self) -> Array:
+        """0 N, (M,)."""
+        return np.zeros_like(self._bias)
+
+    def demanded(self, length: Array, command: Array) -> None:  # noqa: ARG002
+        """Return None."""
+        return
+
+    def tension_per_length(self, tension: Array) -> Array:
+        """Return the stiffness of the series elastic elements at T [N/m], (M,)."""
+        at_zero = self._robot.routes.length_at_zero
+        stiffness: Array = 1.0 / self._robot.series_elastic.compliance(at_zero, tension)
+        return stiffness
+
+    def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
+        """Return l + L_e(T) − L_e(T_wanted) [m], (M,)."""
+        elongation = self._robot.elongation
+        return length + elongation(tension) - elongation(wanted)
+
+    def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
+        """Return the lengths that move the measured tensions towards others (admittance)."""
+        measured = np.maximum(tension, 0.0)
+        goal = measured + ADMITTANCE * (wanted - measured)
+        return LENGTH, self.length_for(length, measured, goal)
+
+    def unchanging_length(self, length: Array, tension: Array) -> Array:  # noqa: ARG002
+        """Return l [m], (M,)."""
+        return length.copy()
+
+    def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
+        """Return the measured tensions [N], (M,), or T_bias where they are lower."""
+        return np.maximum(self.known_tension(tension), self._bias)
+
+    def is_pulling(self, length: Array, command: Array) -> Bools:  # noqa: ARG002
+        """Return True for every module, (M,)."""
+        return np.ones(np.shape(length), dtype=bool)
+
+    def tension_of_lag(self, lag: float, speed: Array) -> Array:  # noqa: ARG002
+        """Return 0 N, (M,): the drive turns by itself."""
+        return np.zeros_like(speed)
+
+    def depth(self, tension: Array, limit: Array) -> Array:
+        """Return SHARE (L_e(T_limit) − L_e(T)) [m], (M,), or all of it if that is negative."""
+        depth = self._robot.elongation(limit) - self._robot.elongation(tension)
+        depth = np.where(depth > 0.0, SHARE * depth, depth)
+        # Where the tension is not known, a command may not run further ahead of the module than
+        # what stretches it from T_bias to T_limit.
+        return np.where(np.isfinite(tension), depth, self.release)
+
+    def largest_depth(self, limit: Array) -> Array:  # noqa: ARG002
+        """Return `release` [m], (M,)."""
+        return self.release
+
+    def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
+        """Return 0 m: such a module winds in by its lead even if the arm is blocked."""
+        return 0.0
+
+    def released(
+        self, last: Array, start: Array, length: Array, tension: Array, longest: Array,
+        is_fresh: bool,
+    ) -> Array:  # fmt: skip
+        """Return the lengths [m] (M,) at which T is T_bias, or `release` beyond the start."""
+        robot, bias = self._robot, self._whole.bias
+        end = start + self.release
+        if is_fresh:
+            # The tension sensor of an isolated muscle may be faulty.
+            is_known = np.isfinite(tension) & robot.used
+            excess = robot.elongation(tension) - robot.elongation(bias)
+            measured = length + np.maximum(excess, 0.0)
+            # Where the tension is low enough, the module stays where it is commanded to be.
+            measured = np.where(tension > bias, np.maximum(measured, last), last)
+            end = np.where(is_known, measured, end)
+        return np.minimum(end, longest)
+
+    def rise(self, muscle: int, length: float, command: float, tension: float) -> float:  # noqa: ARG002
+        """Return the measured rise [N]."""
+        return float(tension - self._whole.bias[muscle])
+
+    def winding_depth(self, muscle: int) -> float:
+        """Return `release` [m], which stretches a tendon from T_bias to T_limit."""
+        return float(self.release[muscle])
+
+
+ACTUATIONS: dict[str, type[Actuation]] = {STIFFNESS: StiffnessControl, POSITION: PositionControl}
