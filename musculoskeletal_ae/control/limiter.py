@@ -20,10 +20,12 @@ wrong, the feedback r pays the muscle out further. A muscle whose measured tensi
 
 Modules that follow positions turn a command into tension by stretching the series elastic elements:
 
-    l_target ≥ l − SHARE (L_e(T_limit) − L_e(T)) + r       while T ≤ T_limit
-    l_target ≥ l + L_e(T) − L_e(T_limit) + r               above it
+    l_target ≥ l − SHARE (L_e(T_limit) − L_e(T′)) + r        while T ≤ T_limit, T′ = T + AHEAD dT/dt
+    l_target ≥ l + L_e(T) − L_e(T_limit) + r = l_exceeded    above it
+    l_target ≥ l_exceeded, which shortens at RECOVERY         afterwards
 
-Here T is measured, so that the limit holds in any posture and for any error of the network. These
+Here T is measured, so that the limit holds in any posture and for any error of the network. Tendon
+friction and the age of T would otherwise make a muscle at its limit oscillate (`recovered`). These
 modules receive length commands only: a desired tension becomes the length that corrects the
 fraction `ADMITTANCE` of the tension error.
 
@@ -59,6 +61,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
 #: largest difference between the lengths of a real muscle and of its model [m]
 LENGTH_MARGIN = 0.03
+LONGEST_INTERVAL = 0.05  # longest time between two messages for which a rate is computed [s]
 RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
 
@@ -76,6 +79,10 @@ class CommandLimiter:
         #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
         self._relief: Array = np.zeros(robot.muscle_count)  # relief r of each muscle [m]
+        #: time [s], T [N] and dT/dt [N/s], (M,), of the last message
+        self._tension: tuple[float, Array, Array] | None = None
+        #: lengths at which the tension limit was exceeded last, which recover slowly [m], (M,)
+        self._exceeded: Array = np.full(robot.muscle_count, -np.inf)
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
         longest = robot.routes.relative_lengths(postures).max(axis=0)
@@ -96,6 +103,7 @@ class CommandLimiter:
 
     def shift(self, offset: Array) -> None:
         """Convert the last commands after the length offsets grew by `offset` [m], (M,)."""
+        self._exceeded = self._exceeded - offset
         if self._last_length is not None:
             self._last_length = self._last_length[0] - offset, self._last_length[1]
         if self.command is not None and self.command.kind == LENGTH:
@@ -184,20 +192,36 @@ class CommandLimiter:
             self._last_length = self._last_length[0], self._last_length[1] + dt
         return self.command
 
+    def _tension_rate(self, time: float, tension: Array) -> Array:
+        """Return dT/dt [N/s] (M,) between the last two messages."""
+        rate = np.zeros_like(tension)
+        if self._tension is not None:
+            before, old, rate = self._tension
+            if 0.0 < time - before < LONGEST_INTERVAL:
+                rate = (tension - old) / (time - before)
+            elif time != before:
+                rate = np.zeros_like(tension)
+        self._tension = time, tension, rate
+        return rate
+
     def _shortest(
         self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
         """Return the shortest length [m] (M,) that demands no tension above the limit."""
         robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable
-        depth, most = actuation.depth(tension, limit), actuation.largest_depth(limit)
+        rate = self._tension_rate(sample.time, tension)
+        depth, most = actuation.depth(tension, rate, limit), actuation.largest_depth(limit)
         tension = np.where(np.isfinite(tension), tension, 0.0)
         per_length = actuation.tension_per_length(limit)
         self._relief = np.clip(
             self._relief + RELIEF * dt * (tension - limit) / per_length, 0.0, most
         )
         length = np.minimum(sample.length, self.longest)
-        shortest = length - depth + self._relief
+        recovered = actuation.recovered(self._exceeded, dt)
+        exceeded = np.maximum(recovered, length - depth)
+        self._exceeded = np.where(tension > limit, exceeded, recovered)
+        shortest = np.maximum(length - depth + self._relief, self._exceeded)
         # The rate limit is exceeded only if the measured tension is too high: a length sensor alone
         # may be wrong.
         too_tense = tension > robot.description.tension.limit

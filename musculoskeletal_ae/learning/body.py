@@ -327,9 +327,9 @@ class CalibratedBody:
             ],
             axis=1,
         )
-        by_losses = -elastic.compliance(absolute, end)[:, None] * by_losses
-        jacobian[:, layout.friction] = by_losses[:, 0]
-        jacobian[:, layout.drive] = by_losses[:, 1:]
+        compliance = elastic.compliance(absolute, end)
+        jacobian[:, layout.friction] = compliance * end * direction
+        jacobian[:, layout.drive] = -compliance[:, None] * by_losses[:, 1:]
         jacobian[:, layout.offset], jacobian[:, layout.creep] = 1.0, -np.asarray(age)
         jacobian[:, layout.rest] = smooth
         return length, jacobian

@@ -37,8 +37,12 @@ SLACK = 0.03
 #: share of the stretch that remains up to T_limit that a command to a module that follows positions
 #: may use; the rest covers errors of L_e and the age of T
 SHARE = 0.7
+#: time for which a rise of the tension is extrapolated [s]: the age of T, and the lag of the module
+AHEAD = 0.04
 #: share of a difference of tensions that a command to such a module removes
 ADMITTANCE = 0.5
+#: speed at which such a module may wind in again beyond a length at which it exceeded T_limit [m/s]
+RECOVERY = 0.01
 DEPTH = 0.015  # by which a suspect under stiffness control is wound in, at most [m]
 
 
@@ -165,13 +169,14 @@ class Actuation(ABC):
         """Largest length by which rest feedback relieves a muscle [m]."""
 
     @abstractmethod
-    def depth(self, tension: Array, limit: Array) -> Array:
+    def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
         """Return by how much a command may be shorter than the measured length [m], (M,).
 
         Negative where the muscle has to be paid out.
 
         Args:
             tension: T [N], (M,); NaN where it is not known.
+            rate: dT/dt [N/s], (M,).
             limit: T_limit [N], (M,).
         """
 
@@ -185,6 +190,15 @@ class Actuation(ABC):
 
         Args:
             lead: Lag of each module behind its command while it winds in [m], scalar or (M,).
+        """
+
+    @abstractmethod
+    def recovered(self, shortest: Array, dt: float) -> Array:
+        """Return the shortest lengths [m] (M,) that a limit still imposes, dt [s] later.
+
+        Args:
+            shortest: Lengths at which the tension limit was exceeded last [m], (M,).
+            dt: Time since the last call [s].
         """
 
     @property
@@ -279,7 +293,7 @@ class StiffnessControl(Actuation):
         tension: Array = self._stiffness * lag * speed
         return tension
 
-    def depth(self, tension: Array, limit: Array) -> Array:  # noqa: ARG002
+    def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
         """Return (T_limit − T_bias)/K_stiff [m], (M,)."""
         return self.largest_depth(limit)
 
@@ -291,6 +305,10 @@ class StiffnessControl(Actuation):
     def usable_lead(self, lead: Array | float) -> Array | float:
         """Return the lead: the motor takes K_stiff λ dl/dt of the demand to turn."""
         return lead
+
+    def recovered(self, shortest: Array, dt: float) -> Array:  # noqa: ARG002
+        """Return −∞: the modules regulate the tension by themselves."""
+        return np.full_like(shortest, -np.inf)
 
     def released(
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,  # noqa: ARG002
@@ -364,10 +382,15 @@ class PositionControl(Actuation):
         """Return 0 N, (M,): the drive turns by itself."""
         return np.zeros_like(speed)
 
-    def depth(self, tension: Array, limit: Array) -> Array:
-        """Return SHARE (L_e(T_limit) − L_e(T)) [m], (M,), or all of it if that is negative."""
-        depth = self._robot.elongation(limit) - self._robot.elongation(tension)
-        depth = np.where(depth > 0.0, SHARE * depth, depth)
+    def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
+        """Return SHARE (L_e(T_limit) − L_e(T + AHEAD dT/dt)) [m], (M,), but not less than 0.
+
+        If T exceeds the limit, return the negative L_e(T_limit) − L_e(T).
+        """
+        elongation = self._robot.elongation
+        depth = elongation(limit) - elongation(tension)
+        soon = elongation(limit) - elongation(tension + AHEAD * np.maximum(rate, 0.0))
+        depth = np.where(depth > 0.0, SHARE * np.maximum(soon, 0.0), depth)
         # Where the tension is not known, a command may not run further ahead of the module than
         # what stretches it from T_bias to T_limit.
         return np.where(np.isfinite(tension), depth, self.release)
@@ -379,6 +402,15 @@ class PositionControl(Actuation):
     def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
         """Return 0 m: such a module winds in by its lead even if the arm is blocked."""
         return 0.0
+
+    def recovered(self, shortest: Array, dt: float) -> Array:
+        """Return lengths that shorten at RECOVERY.
+
+        Paying out reverses the friction of the tendon, so the tension falls by far more than the
+        elastic elements explain. Wound in again at full speed, the tendon would exceed its limit
+        again before the next reading arrives.
+        """
+        return shortest - RECOVERY * dt
 
     def released(
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,

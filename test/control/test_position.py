@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Modules that follow positions: limits, stops and methods without tension control."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from control_bench import sample
@@ -18,6 +20,7 @@ from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import slid
 
 ROBOT = Robot(with_modules(Robot.load('arm26').description, actuation='position'))
 COUNT, BIAS = ROBOT.muscle_count, ROBOT.tension.bias[0]
@@ -54,6 +57,24 @@ def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_w
         assert (result <= np.maximum(LIMIT, 0.0) + 1e-3)[is_tense].all()
         wound_in = sent < before
         assert (result <= limit + 1.0)[wound_in & (before >= length)].all()
+
+
+def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hide_its_tension():
+    limiter, friction, stiffness = CommandLimiter(ROBOT, Settings()), 0.35, 0.25 * LIMIT / 0.001
+    length, sliding, readings, tensions = np.zeros(COUNT), np.ones(COUNT), [], []
+    for n in range(400):
+        end = np.maximum(0.1 * LIMIT - stiffness * length, 0.0)
+        tension = end * np.exp(friction * sliding)
+        tensions.append(tension / LIMIT)
+        readings.append(replace(sample(length, tension, ROBOT), time=n * DT))
+        now = readings[max(0, n - 3)]  # 30 ms old
+        goal = limiter.limit(Command(LENGTH, np.full(COUNT, -0.05)), now, LIMIT, DT).value
+        moved = np.clip(goal - length, -SPEED_DEFAULT * DT, SPEED_DEFAULT * DT)
+        sliding = slid(sliding, -np.sign(moved), moved)
+        length = length + moved
+    # Every reversal of friction halves or doubles the tension, so it would reach 2.2 each time.
+    assert np.max(tensions[100:]) < 1.3
+    assert (np.array(tensions[100:]) > 1.1).mean() < 0.06
 
 
 def test_a_desired_tension_becomes_a_length_command_towards_it():

@@ -10,11 +10,16 @@ has wound in `slack_length`. Changes of length that are due to the motion of the
 A module that follows positions maintains no tension, and a tendon may be slack because its command
 is long. The rule then looks for a tendon that is stretched, but has no tension:
 
-    T < slack_share · T_bias for DEAD_TIME, and l(θ, 0) − l > STRETCH · L_e(T_bias)
+    T < slack_share · T_bias for DEAD_TIME, and x and x − x₀ > STRETCH · L_e(T_bias)
+    x = l(θ, 0) − l,   x₀ = x − L_e(T) when the tendon was last taut
 
-θ is estimated from the tendons that are not slack. A rupture of a tendon without load is detected
-as soon as the tendon should carry load.
+θ is estimated from the tendons that are not slack. x contains the error of the network, which may
+be centimetres before it has learned the arm. Readings just before the tension was lost reveal this
+error, x₀. Both x and x − x₀ must be large. A rupture of a tendon without load is detected as soon
+as the tendon should carry load.
 """
+
+from collections import deque
 
 import numpy as np
 
@@ -33,6 +38,7 @@ STRETCH = 1.5
 UNCALIBRATED_STRETCH = 3.0
 #: STRETCH with motor currents, whose tensions are uncertain because of drive friction
 CURRENT_STRETCH = 2.0
+RECENT = 5  # number of messages that are kept; the oldest of them is from before a rupture
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
 
@@ -125,10 +131,29 @@ class StretchedTendon(SlackTendon):
     Such modules do not wind in slack by themselves, so `is_winding_in` stays False.
     """
 
+    def __init__(self, robot: Robot, settings: Detection) -> None:
+        super().__init__(robot, settings)
+        self._recent: deque[MuscleSample] = deque(maxlen=RECENT)
+        #: the last message in which each slack tendon was taut, by muscle
+        self._taut = dict[int, MuscleSample]()
+        self._is_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
+
+    def reset(self) -> None:
+        """Restart the measurement of times."""
+        super().reset()
+        self._recent.clear()
+        self._taut.clear()
+        self._is_slack[:] = False
+
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle that has been stretched without tension for DEAD_TIME."""
         sample, bias = observation.sample, self._robot.tension.bias
         is_slack = (sample.motor_tension < LIMITS.slack_share * bias) & self._robot.used
+        if self._recent:
+            for m in np.flatnonzero(is_slack & ~self._is_slack).tolist():
+                self._taut[m] = self._recent[0]
+        self._recent.append(sample)
+        self._is_slack = is_slack
         is_dead = is_slack & observation.lengths_known
         if np.count_nonzero(is_dead):
             is_dead &= self._is_stretched(sample, tuple(np.flatnonzero(is_slack).tolist()))
@@ -146,13 +171,24 @@ class StretchedTendon(SlackTendon):
             return np.zeros(robot.muscle_count, dtype=bool)  # the others do not determine θ
         if isolated not in self._reduced:
             self._reduced[isolated] = mae.without(isolated)
-        theta = self._reduced[isolated].estimate(sample.bone_tension, sample.length).theta
-        tension = sample.bone_tension.copy()
-        tension[list(isolated)] = 0.0
         is_calibrated = mae.anomaly is not None and mae.anomaly.calibrated
         share = STRETCH if is_calibrated else UNCALIBRATED_STRETCH
         if is_calibrated and robot.tension_source.is_current:
             share = CURRENT_STRETCH
-        stretch = mae.lengths(theta, tension) - sample.length
-        is_stretched: Bools = stretch > share * robot.elongation(robot.description.tension.bias)
+        enough = share * robot.elongation(robot.description.tension.bias)
+        stretch = self._stretch(sample, isolated)
+        is_stretched: Bools = stretch > enough
+        for m in np.flatnonzero(is_stretched & self._is_slack).tolist():
+            if (taut := self._taut.get(m)) is None:
+                continue
+            error = self._stretch(taut, isolated)[m] - robot.elongation(taut.bone_tension)[m]
+            is_stretched[m] = stretch[m] - error > enough[m]
         return is_stretched
+
+    def _stretch(self, sample: MuscleSample, isolated: tuple[int, ...]) -> Array:
+        """Return x [m], (M,); `isolated` muscles are not used to estimate θ."""
+        theta = self._reduced[isolated].estimate(sample.bone_tension, sample.length).theta
+        tension = sample.bone_tension.copy()
+        tension[list(isolated)] = 0.0
+        stretch: Array = self._mae.lengths(theta, tension) - sample.length
+        return stretch
