@@ -40,6 +40,8 @@ DOCUMENTS = README, FOLDER / 'results.md'
 MODULES = {
     'robot/robot.py': ['Robot'],
     'robot/description.py': ['RobotDescription', 'TensionRange', 'load_description'],
+    'robot/actuation.py': ['Actuation'],
+    'robot/tension_source.py': ['TensionSource'],
     'robot/series_elastic.py': ['SeriesElastic'],
     'robot/kinematics.py': ['Kinematics'],
     'robot/routes.py': ['Routes'],
@@ -56,7 +58,7 @@ MODULES = {
     'estimation/health.py': ['HealthMonitor'],
     'signals/body_state.py': ['BodyState', 'LengthOffsets'],
     'signals/muscle_stream.py': ['MuscleStream', 'MuscleSample', 'RejectionError'],
-    'signals/friction.py': ['FrictionDirection'],
+    'signals/friction.py': ['FrictionDirection', 'Transmission'],
     'control/controller.py': ['Controller'],
     'control/supervisor.py': ['Supervisor', 'Activity', 'StopState'],
     'control/stops.py': ['StopCause', 'Condition', 'Action', 'Clears'],
