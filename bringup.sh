@@ -336,6 +336,13 @@ chosen_value() { # NAME
     sed -n -e "s/^[^#]*\b$1: \+\([A-Za-z0-9.]\+\).*/\1/p" -e "s/^[a-z_]*:$1:=//p" | tail -n 1
 }
 
+# Sets $kept: what a node saves of an emulated arm is kept with the logs, because the next run may
+# emulate another arm. With hardware, the node continues from what it has saved.
+kept_in() { # NODE
+  kept=()
+  [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/$1")")
+}
+
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, the format of ROS parameters
 
 own_clock=false # whether the emulated arm is slower than real time
@@ -374,10 +381,7 @@ fi
 [ $combined = true ] || start_node estimator
 start_node sim
 if [ $learner = true ]; then
-  # Keep the learned state of an emulated arm with the logs, because the next run may emulate another
-  # arm. With hardware, the learner continues from its saved state.
-  kept=()
-  [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/learner")")
+  kept_in learner
   start_node learner "${kept[@]}" -p "joint_source:=$joint_source"
 fi
 [ -z "$record" ] || start record -o "$record" "${files[@]}" --ros-args "${under[@]}"
@@ -386,7 +390,8 @@ if [ -n "$bag" ]; then
   start replay "$bag" --clock "${files[@]}" --ros-args "${under[@]}"
 elif [ $controller = true ]; then
   [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
-  moving=(-p "explore:=$explore")
+  kept_in controller
+  moving=(-p "explore:=$explore" "${kept[@]}")
   # A pause of a busy desktop must not stop an emulated arm.
   [ $hardware = true ] || moving+=(-p max_age:=1.0)
   name=controller

@@ -199,9 +199,11 @@ class Attack:
 
     def process(self, name: str, log: str = '', remapping: Sequence[str] = ()) -> Process:
         """Start the process of a node."""
+        # A second node uses another directory, because it is refused in that of the first.
+        saved = f'state_directory:={self.folder / (log or "state")}'
         own = {
-            'controller': ['max_age:=1.0', 'explore:=true'],
-            'learner': [f'state_directory:={self.folder / (log or "state")}'],
+            'controller': ['max_age:=1.0', 'explore:=true', saved],
+            'learner': [saved],
             'hardware_emulator': ['marker_pose_rate:=10.0'],
         }
         parameters = ['robot:=arm26', f'rate:={float(self.rate)}', *own.get(name, [])]

@@ -11,6 +11,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
 SHOWN = 10.0  # [s] for which `refusal` reports the last refusal
+LONGEST_PERIOD = 1.5  # [s] between two reports; more means that this node itself has paused
 # A source time that lies further back than this comes from another clock, not from reordering.
 REORDERING = 1_000_000_000  # [ns]
 
@@ -134,6 +135,24 @@ class Reception:
         received = dict(self._received)
         self._received = Counter(dict.fromkeys(received, 0))
         return received
+
+
+class Pauses:
+    """Decides whether a pause of this node itself excuses the silence of a stream.
+
+    After a pause, messages wait unread. A report that comes late is therefore no proof of silence,
+    but the next one is: a node that always reports late would otherwise never name a silent stream.
+    """
+
+    def __init__(self) -> None:
+        self._reported_at, self._was_late = math.inf, False
+
+    def excuse(self, now: float) -> bool:
+        """Return whether to ignore silence in the report at `now`, on a steady clock [s]."""
+        is_late = now - self._reported_at > LONGEST_PERIOD
+        self._reported_at = now
+        was_late, self._was_late = self._was_late, is_late
+        return is_late and not was_late
 
 
 class Stamps:

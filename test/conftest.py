@@ -42,6 +42,12 @@ def alone(tmp_path_factory) -> Callable[[str], AbstractContextManager[Path]]:
     return partial(_alone, tmp_path_factory)
 
 
+@pytest.fixture(scope='session', autouse=True)
+def state_home(tmp_path_factory) -> None:
+    """Keep what nodes save out of the home directory."""
+    os.environ['XDG_STATE_HOME'] = str(tmp_path_factory.mktemp('state'))
+
+
 @pytest.fixture
 def both_cores(alone) -> Iterator[None]:
     """Run only one test at a time that occupies both cores, such as a whole real-time system."""

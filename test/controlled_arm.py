@@ -49,7 +49,7 @@ class ControlledArm:
             return self.graph.start(name, robot='arm26', **parameters)
         return self.graph.host(NODES[name], robot='arm26', **parameters)
 
-    def start_controller(self):
+    def start_controller(self, **parameters):
         return self.start(
             'controller',
             checkpoint=self.checkpoint,
@@ -57,6 +57,7 @@ class ControlledArm:
             second_duration=0.5,
             rate_limit=RATE_LIMIT,
             max_age=1.0,  # avoids stops because of a loaded machine
+            **parameters,
         )
 
     def kill(self, process):

@@ -4,7 +4,7 @@
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.reception import Pauses, Reception
 
 SECOND = 1_000_000_000
 
@@ -93,3 +93,17 @@ def test_a_message_that_is_used_later_counts_once_it_is_used():
     assert not reception.take_received().get('topic')
     reception.note_used('topic')
     assert reception.take_received() == {'topic': 1}
+
+
+def test_one_pause_of_a_node_excuses_one_report():
+    pauses = Pauses()
+    assert [pauses.excuse(now) for now in (0.0, 1.0, 2.0, 9.0, 10.0, 11.0)] == [
+        False, False, False, True, False, False
+    ]  # fmt: skip
+
+
+def test_a_node_that_always_reports_late_still_names_a_silent_stream():
+    """Once a stream was silent for 90 s on a busy machine, and the status line did not say so."""
+    pauses = Pauses()
+    excused = [pauses.excuse(2.0 * report) for report in range(45)]
+    assert excused == [False, True] + 43 * [False]

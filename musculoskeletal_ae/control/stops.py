@@ -72,6 +72,17 @@ class StopCause(Enum):
             (Step.RESET_CONTROLLER,),
         ),
     )
+    RESTARTED = (
+        'restarted',
+        Declaration(
+            'the previous controller of this arm was killed or has crashed while it commanded the '
+            'arm',
+            Action.RELEASE,
+            Clears.RESET,
+            'the previous controller did not end properly',
+            (Step.RESET_CONTROLLER,),
+        ),
+    )
     CONTROL_FAULT = (
         'control_fault',
         Declaration(

@@ -28,6 +28,7 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.methods import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
+from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import (
@@ -65,6 +66,9 @@ class Controller(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
         self.core = Core(self.robot, seed=self.parameter('seed'))
+        self.memory = StopMemory(self.state_directory())
+        if self.memory.found is not None:
+            self.core.stop(*self.memory.found)
         self.recording: StopRecording = StopRecording(
             self.resolve_topic_name, topics=topics_with(self.motors.settings)
         )
@@ -117,6 +121,7 @@ class Controller(Shell):
     def destroy_node(self) -> None:
         """Wait until a stop recording has been written, then destroy the node."""
         self.recording.close()
+        self.memory.close()
         super().destroy_node()
 
     def _configure(self, name: str, value: Any) -> None:
@@ -232,6 +237,7 @@ class Controller(Shell):
 
     def _stop(self, _: Trigger.Request) -> str:
         self.core.stop(StopCause.OPERATOR)
+        self._remember_stop()
         return 'stopped; call controller/reset to continue'
 
     def _reset(self, _: Trigger.Request) -> str:
@@ -261,6 +267,8 @@ class Controller(Shell):
         if self.action is not None:
             self.action.step(self._state)
         self._publish_mode()
+        if command is not None:
+            self._remember_stop()
         self._record_stop()
 
     def _publish_mode(self) -> None:
@@ -272,6 +280,11 @@ class Controller(Shell):
         if mode != self.published_mode:
             self.published_mode = mode
             self.mode.publish(String(data=mode))
+
+    def _remember_stop(self) -> None:
+        """Keep a latched stop for the case that this controller is killed."""
+        supervisor = self.core.supervisor
+        self.memory.note(supervisor.condition if supervisor.is_latched else None)
 
     def _record_stop(self) -> None:
         """Save the last seconds before a latched stop."""
@@ -287,6 +300,10 @@ class Controller(Shell):
         report = status.report(self.core, time.monotonic())
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
+        if problem := self.memory.problem:
+            report.values['stop that is not kept'] = problem
+            if report.level == 'ok':
+                report = report._replace(level='warn', message=f'{report.message}; {problem}')
         if left_out := self.recording.left_out:
             report.values['messages too large for a stop recording'] = str(left_out)
         stopped = [] if self.core.supervisor.is_running else [report.message]

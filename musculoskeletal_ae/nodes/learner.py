@@ -5,10 +5,8 @@ joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_dete
 isolated_muscles, muscle_length_zeros → mae_checkpoint.
 """
 
-import os
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from sensor_msgs.msg import Imu
@@ -49,7 +47,7 @@ class Learner(Shell):
             settings=Settings(**{name: value(name) for name in parameters_of(Settings)}),
             joint_source=value('joint_source'),
             trainer=partial(TrainerProcess, device=value('device')),
-            directory=self._directory(value('state_directory')),
+            directory=self.state_directory(),
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.sources.watch('mae_checkpoint')
@@ -79,13 +77,6 @@ class Learner(Shell):
         self.create_timer(POLL_PERIOD, self._poll, clock=STEADY)
 
     # -- parameters -----------------------------------------------------------------------------
-
-    def _directory(self, value: str) -> Path | None:
-        if value != 'auto':
-            return Path(value) if value else None
-        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'  # `StateStore` expands ~
-        place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
-        return place.joinpath(*self.get_namespace().strip('/').split('/'))
 
     def _afresh(self, value: bool) -> Mae | None:
         """Return the network from which to start again; None at the start of the node."""

@@ -43,6 +43,12 @@ SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX, **MOTORS}
 #: parameters of every node that uses a network
 NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
+STATE_DIRECTORY = Parameter(
+    'auto',
+    'where the learner saves samples and network, and the controller its stop (auto: below '
+    'XDG_STATE_HOME; empty: nowhere)',
+)
+
 ALL_NODES = '/**'  # name of the section for all nodes in a parameter file
 
 #: all parameters, by node and by name
@@ -55,6 +61,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'stop_recordings': Parameter(
             10, 'number of stop recordings to keep (0: none)', '', (0, 1000), settable=True
         ),
+        'state_directory': STATE_DIRECTORY,
         **parameters_of(ControlSettings),
     },
     'estimator': {
@@ -160,10 +167,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'fresh': Parameter(
             False, 'drop the saved state and start from `checkpoint`', settable=True
         ),
-        'state_directory': Parameter(
-            'auto',
-            'where samples and network are saved (auto: below XDG_STATE_HOME; empty: nowhere)',
-        ),
+        'state_directory': STATE_DIRECTORY,
         **parameters_of(LearningSettings),
         'update_steps': Parameter(STEPS, 'mini-batches of one update', '', (1, 100_000)),
         'device': Parameter(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import math
+import os
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from inspect import iscoroutinefunction
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,7 +62,7 @@ from musculoskeletal_ae.nodes.sources import (
     Twins,
 )
 from musculoskeletal_ae.parameters import Parameter
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.reception import Pauses, Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
@@ -92,9 +93,6 @@ MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes o
 #: needed topics that are published continually, whose silence is therefore an error
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
-#: Time between two reports above which this node itself was paused [s]. Its messages then wait
-#: unread, so it reports no silence.
-LONGEST_PERIOD = 1.5
 
 
 class Shell(Node):
@@ -162,7 +160,7 @@ class Shell(Node):
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = self._waiting = ''
-        self._reported_at = math.inf  # time of the last report [s]
+        self._pauses = Pauses()
         self.checkpoint_version: int | None = None  # version of the network in use
         self.needed: list[str] = []  # topics that the node needs to work
         backward = JumpThreshold(
@@ -293,6 +291,18 @@ class Shell(Node):
         value = self.get_parameter_or(name, RosParameter(name)).value
         # Return an empty list for None, as which rcl reads an empty list on the command line.
         return [] if value is None and isinstance(self._table[name].default, tuple) else value
+
+    def state_directory(self) -> Path | None:
+        """Return the directory that `state_directory` names; None if nothing is kept.
+
+        `auto` is a directory for each robot and namespace. A ~ is not expanded.
+        """
+        value = self.parameter('state_directory')
+        if value != 'auto':
+            return Path(value) if value else None
+        home = os.environ.get('XDG_STATE_HOME') or '~/.local/state'
+        place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
+        return place.joinpath(*self.get_namespace().strip('/').split('/'))
 
     def follow_parameter(
         self,
@@ -585,10 +595,8 @@ class Shell(Node):
 
     def _with_silence(self, report: Report) -> Report:
         """Return a report that also names a stream on which no usable message arrives."""
-        now = time.monotonic()
-        has_paused, self._reported_at = now - self._reported_at > LONGEST_PERIOD, now
-        silent = None if has_paused else next(filter(self._is_silent, self.needed), None)
-        if silent is None:
+        silent = next(filter(self._is_silent, self.needed), None)
+        if self._pauses.excuse(time.monotonic()) or silent is None:
             return report
         step = STREAMS[silent]
         text = f'no usable {silent} for {self._reception.silence(silent):.0f} s: {step.text}'

@@ -111,21 +111,38 @@ def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm.goes_to(HERE)
 
 
-def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_takes_over(moving):
+def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_waits_for_a_reset(moving):
     arm = moving('controller')
     arm.kill(arm.controller)
     arm.pays_out()
     arm.processes = ()
-    arm.controller = arm.start_controller()
-    arm.says('no target')
+    arm.controller = arm.start_controller(explore=True)
+    arm.says('restarted')
 
     def heard():  # repeat, because discovery may be late
         arm.target(THERE)
         return arm.controller.core.target_state.theta is not None
 
     arm.graph.wait(heard, 'the target')
+    arm.pays_out()
+    arm.says("'mode': 'stopped'")
+    arm.graph.wait(lambda: reset(arm).success, 'the reset')
     arm.goes_to(THERE)
     arm.says('holding')
+
+
+def test_an_operators_stop_outlives_a_killed_controller(moving):
+    arm = moving('controller')
+    assert arm.graph.call(Trigger, 'controller/stop').success
+    arm.kill(arm.controller)
+    arm.processes = ()
+    arm.controller = arm.start_controller(explore=True)
+    arm.says("'stop cause': 'operator_stop'")
+    arm.graph.end(arm.controller)  # without a reset
+    arm.controller = arm.start_controller(explore=True)
+    arm.says("'stop cause': 'operator_stop'")
+    arm.graph.wait(lambda: reset(arm).success, 'the reset')
+    arm.says('no target')
 
 
 def test_an_anomaly_stops_the_arm_until_estimator_and_controller_are_reset(moving):

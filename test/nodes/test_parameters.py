@@ -75,8 +75,7 @@ def test_every_number_has_a_range_in_which_its_default_is(node):
 
 
 @pytest.mark.parametrize('kind', [Controller, Estimator, HardwareEmulator, Learner, Sim])
-def test_every_parameter_that_is_settable_is_followed(graph, monkeypatch, tmp_path, kind):
-    monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
+def test_every_parameter_that_is_settable_is_followed(graph, kind):
     node = graph.host(kind, robot='arm26')
     settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
     assert settable - {'stop_recordings'} == set(node._setters)  # read at every stop instead

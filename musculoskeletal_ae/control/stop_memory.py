@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps a latched stop on disk, so that a controller that is started again is still stopped.
+
+    controller.stop    the stop with which the next controller begins
+    controller.lock    locked by the controller that uses the directory
+
+While a controller commands the arm, the file names the stop cause `restarted`. A latched stop
+replaces it by its own cause. A controller that ends properly while nothing stops it deletes the
+file. The file therefore remains after a stop, and after a controller that was killed or has
+crashed. The controller that finds it begins stopped, and moves only after `controller/reset`.
+"""
+
+import fcntl
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TextIO
+
+from musculoskeletal_ae.control.stops import Condition, StopCause
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.files import read_text
+
+FILE, LOCK = 'controller.stop', 'controller.lock'
+LARGEST = 10_000  # size limit of the file [bytes]
+RETRY_INTERVAL = 2.0  # time between attempts to write [s]
+BEFORE = 'before this controller was started'
+
+
+class StopMemory:
+    """The file that outlives a controller.
+
+    Attributes:
+        found: The stop that the previous controller has left behind, or None.
+        problem: Why the present stop cannot be kept, or ''.
+    """
+
+    def __init__(self, directory: Path | None) -> None:
+        """Read what the previous controller has left behind.
+
+        Args:
+            directory: Where the file is; created if it does not exist. None: nothing is kept.
+
+        Raises:
+            MusculoskeletalError: If the directory cannot be used, or another controller uses it.
+        """
+        self.found: Condition | None = None
+        self.problem = ''
+        self._written: StopCause | None = None  # content of the file
+        self._is_latched = False  # whether the file has to outlive this controller
+        self._next_attempt = 0.0
+        self._file: Path | None = None
+        self._lock: TextIO | None = None
+        if directory is None:
+            return
+        name = f'state_directory {str(directory)!r}'
+        try:
+            file = directory.expanduser() / FILE
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self._lock = file.with_name(LOCK).open('w', encoding='utf-8')
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            exists = file.exists()
+        except BlockingIOError as error:
+            self.close()
+            remedy = 'stop that controller, or set another directory for another arm'
+            raise MusculoskeletalError(f'{name} is in use by a controller; {remedy}') from error
+        except (OSError, ValueError, RuntimeError) as error:  # a NUL; an unknown home directory
+            self.close()
+            remedy = "set a writable directory, or '' to keep no stop"
+            raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error
+        self._file = file
+        if exists:
+            self._is_latched, self._written = True, _cause_in(file)
+            self.found = Condition(self._written, BEFORE)
+
+    def note(self, stop: Condition | None) -> None:
+        """Keep the present latched stop; None while the arm may move.
+
+        A write that fails is reported in `problem`, and repeated.
+        """
+        self._is_latched = stop is not None
+        cause = StopCause.RESTARTED if stop is None else stop.cause
+        if self._file is None or cause is self._written or time.monotonic() < self._next_attempt:
+            return
+        new = self._file.with_name(f'.{FILE}')
+        try:
+            # Without fsync, which could delay a command by 0.1 s. A kill loses nothing that was
+            # written. A power failure may leave an empty file, which counts as `restarted`.
+            new.write_text(f'{cause.identifier}\n{stop or cause.text}\n', encoding='utf-8')
+            new.replace(self._file)
+        except OSError as error:
+            self._next_attempt = time.monotonic() + RETRY_INTERVAL
+            self.problem = f'a restarted controller will not know this stop: {error}'
+        else:
+            self._written, self.problem = cause, ''
+
+    def close(self) -> None:
+        """Delete the file unless a stop is latched, and release the directory."""
+        if self._file is not None and not self._is_latched:
+            with suppress(OSError):
+                self._file.unlink(missing_ok=True)
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+        self._file = None
+
+
+def _cause_in(file: Path) -> StopCause:
+    """Return the stop cause in a file; `restarted` if the file states none."""
+    with suppress(MusculoskeletalError):
+        text = read_text(file, lambda _, problem: MusculoskeletalError(problem), LARGEST)
+        for cause in StopCause:
+            if text.partition('\n')[0] == cause.identifier:
+                return cause
+    return StopCause.RESTARTED
