@@ -144,11 +144,23 @@ urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
 
 # --- the package ---------------------------------------------------------------------------------
 
-# The build links to the sources, so changes take effect without another build.
+# The build links to the sources, so it is repeated only if a file that describes the package has
+# changed, or if the list of installed files has.
 build_package() {
+  local stamp=build/.built described
+  described=$(
+    {
+      printf '%s\n' "$ros" "$repository" "$(readlink -f "$python")"
+      cat setup.py setup.cfg package.xml requirements.txt
+      find bags config resource -type f | LC_ALL=C sort
+    } | sha256sum
+  )
+  if [ -e install/setup.bash ] && [ "$(cat $stamp 2>/dev/null)" = "$described" ]; then return; fi
+  rm -f $stamp
   step 'building the package with colcon' "$python" -m colcon --log-base log build \
     --symlink-install --base-paths . --packages-select musculoskeletal_ae \
     --event-handlers desktop_notification- || fail 'The package could not be built.'
+  printf '%s\n' "$described" >$stamp
 }
 
 # Compiles all numba functions, so that nodes need not compile when they start. Numba's cache does

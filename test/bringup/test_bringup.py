@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from graph import DEADLINE, Graph, Process
 from rcl_interfaces.srv import GetParameters
-from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8MultiArray
 from std_srvs.srv import Trigger
@@ -93,15 +92,22 @@ def statuses(output):
     return [match for line in output.splitlines() if (match := STATUS.match(line))]
 
 
-def test_a_new_robot_is_trained_once_brought_up_and_estimated(environment, tmp_path):
-    robot = write_robot(tmp_path / '.other')
+def test_a_new_robot_is_trained_once_and_estimated_and_another_reality_reported(
+    environment, tmp_path
+):
+    model = tmp_path / 'own.xml'
+    model.write_text(bodies.MJCF, encoding='utf-8')
+    robot = tmp_path / '.own'
+    import_robot(model, robot)
+    model.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
     # The paper's network is trained in a few seconds.
-    chosen = ['--robot', str(robot), '--preset', 'paper', '--seed', '3']
-    run = bringup(environment, *chosen)
-    assert 'training the MAE' in read_until(run, 'starting estimator')
+    chosen = ['--robot', str(robot), '--preset', 'paper']
+    run = bringup(environment, *chosen, '--reality', str(model))
+    reported = f"-- reality {model}: joint 'elbow' moves from -1.5 to 0.2 there"
+    assert 'training the MAE' in read_until(run, reported)
     run.end(signal.SIGINT)
     assert left_behind(run) == ''
-    run = bringup(environment, *chosen, '--duration', '5')
+    run = bringup(environment, *chosen, '--seed', '3', '--duration', '5')
     _, output = run.ended()
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
     lines = statuses(output)
@@ -217,19 +223,6 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
     assert left_behind(live) == left_behind(played) == ''
 
 
-def test_a_reality_that_is_another_robot_is_reported_on_the_terminal(environment, tmp_path):
-    file = tmp_path / 'own.xml'
-    file.write_text(bodies.MJCF, encoding='utf-8')
-    import_robot(file, tmp_path / 'own')
-    file.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
-    # The paper's network is trained in a few seconds.
-    options = ['--preset', 'paper', '--reality', str(file)]
-    run = bringup(environment, '--robot', str(tmp_path / 'own'), *options)
-    read_until(run, f"-- reality {file}: joint 'elbow' moves from -1.5 to 0.2 there")
-    run.end(signal.SIGINT)
-    assert left_behind(run) == ''
-
-
 @pytest.mark.parametrize(
     ('arguments', 'expected'),
     [
@@ -250,7 +243,8 @@ def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments
 
 
 def test_a_wrong_value_ends_bringup_with_the_error_of_the_node(environment):
-    run = bringup(environment, '--robot', 'arm26', '--reality', 'dream')
+    options = ['--no-controller', '--no-learner', '--reality', 'dream']
+    run = bringup(environment, '--robot', 'arm26', *options)
     _, output = run.ended()
     assert run.process.returncode == 1
     assert 'hardware_emulator ended with status' in output and "'dream'" in output
