@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common parts of the motion tests of both kinds of muscle modules."""
+"""Common parts of the motion tests of both kinds of muscle modules.
+
+A muscle that does not do what it was commanded to do is released at once, and the test ends. Each
+kind of test decides what that means (`MotionTest._run_away`).
+"""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -7,18 +11,29 @@ from collections.abc import Generator, Sequence
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.verdict import Verdict
 
 RELEASE = 0.6  # wait after a release [s]
 MEAN = 0.3  # time over which readings are averaged [s]
+SETTLE = 1.5  # time in which the arm comes to rest after a motion [s]
+HOLD = 0.5  # time for which a demand is held [s]
 RELEASE_SPEED = 0.03  # speed at which a target returns [m/s]
+ABOVE_BIAS = 40.0  # default of the highest tension, above T_bias [N]
+MOMENT = 0.1  # time for which a muscle may exceed a limit, for example because the arm falls [s]
+LATEST = 0.1  # longest time from a command to the first response [s]
+RESPONSE = 4.0, 0.0006  # changes of T [N] and l [m] above noise that count as a response
 
 Wait = Generator[None, None, None]  # each step takes one message
 
 
 class RunAwayError(Exception):
-    """A muscle exceeds its demand and must be released."""
+    """A muscle runs away and must be released."""
+
+    def __init__(self, muscle: int, fault: str, **values: object) -> None:
+        """Describe it for `Verdict.failed`."""
+        super().__init__(fault)
+        self.muscle, self.fault, self.values = muscle, fault, values
 
 
 class MotionTest(ABC):
@@ -33,6 +48,8 @@ class MotionTest(ABC):
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
         self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
+        #: last time at which each muscle was within its limits [s]
+        self._tame_at: Array = np.zeros(robot.muscle_count)
         self._run = self._sequence()
 
     def step(self, states: Array, now: float) -> Array | None:
@@ -44,17 +61,75 @@ class MotionTest(ABC):
         self.done = self.done or next(self._run, self) is self
         return None if self.done or np.isnan(self._target).any() else self._target.copy()
 
-    @abstractmethod
-    def _sequence(self) -> Wait:
-        """Run the whole test."""
+    # -- what the kinds of modules differ in ----------------------------------------------------
 
     @abstractmethod
+    def _hold(self) -> Wait:
+        """Check that the arm is held where it is."""
+
+    @abstractmethod
+    def _try(self, m: int) -> Wait:
+        """Check the responses of muscle m."""
+
+    @abstractmethod
+    def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
+        """Return the error of a muscle that runs away.
+
+        Args:
+            states: l [m], T [N] and temperature [°C] of the newest message, (3, M).
+            start: The same when the present wait began.
+        """
+
+    @abstractmethod
+    def _pay_out(self, m: int) -> None:
+        """Release muscle m, which has run away."""
+
+    # -- common parts ---------------------------------------------------------------------------
+
+    def _sequence(self) -> Wait:
+        """Run the whole test."""
+        try:
+            self.trying = 'hold'
+            yield from self._hold()
+            for m in self._muscles:
+                self.trying = self._robot.muscles[m]
+                yield from self._try(m)
+        except RunAwayError as error:
+            self.verdict.failed(error.fault, error.muscle, **error.values)
+            self._pay_out(error.muscle)
+            # Then commands end, after which modules go to their safe state.
+            end = self._now + RELEASE
+            while self._now < end:
+                yield
+
     def _wait(self, duration: float) -> Wait:
-        """Wait [s]; raise a RunAwayError if a muscle exceeds its demand or moves too far."""
+        """Wait [s].
+
+        Raises:
+            RunAwayError: If a muscle runs away meanwhile.
+        """
+        end, start = self._now + duration, self._recent[-1][1]
+        while self._now < end:
+            yield
+            if error := self._run_away(self._recent[-1][1], start):
+                raise error
+
+    def _lasting(self, is_beyond: Bools) -> int | None:
+        """Return a muscle that has been beyond its limits for longer than MOMENT, or None.
+
+        `is_beyond` (M,) is valid for the newest message.
+        """
+        self._tame_at[~is_beyond] = self._now
+        is_wild = self._now - self._tame_at > MOMENT
+        return int(is_wild.argmax()) if is_wild.any() else None
+
+    def _readings(self) -> Array:
+        """Return l [m], T [N] and temperature [°C] of the messages of the last MEAN, (N, 3, M)."""
+        return np.array([states for _, states in self._recent])
 
     def _noise(self) -> Array:
         """Return the standard deviation of T over MEAN [N] (M,)."""
-        return np.std([states[1] for _, states in self._recent], axis=0)
+        return np.std(self._readings()[:, 1], axis=0)
 
     def _go(self, m: int, goal: float) -> Wait:
         """Move a target to `goal` [m] at RELEASE_SPEED, and wait."""

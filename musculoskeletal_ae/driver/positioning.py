@@ -14,9 +14,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.driver.motion import RELEASE, MotionTest, RunAwayError, Wait
+from musculoskeletal_ae.driver.motion import (
+    ABOVE_BIAS,
+    HOLD,
+    LATEST,
+    RELEASE,
+    RESPONSE,
+    SETTLE,
+    MotionTest,
+    RunAwayError,
+    Wait,
+)
 from musculoskeletal_ae.driver.verdict import Verdict
-from musculoskeletal_ae.driver.winding import ABOVE_BIAS, HOLD, LATEST, MOMENT, RESPONSE, SETTLE
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
@@ -59,51 +68,35 @@ class Positioning(MotionTest):
                     f'{limit} N; choose a lower one'
                 )
             self._highest = np.full(self._robot.muscle_count, highest)
-        #: last time at which each muscle neither pulled too hard nor was far from its target [s]
-        self._tame_at: Array = np.zeros(self._robot.muscle_count)
 
     # -- commands -------------------------------------------------------------------------------
 
-    def _sequence(self) -> Wait:
-        try:
-            self.trying = 'hold'
-            yield from self._wait(RELEASE)
-            self._target[:] = self._mean()[0]
-            yield from self._wait(SETTLE)
-            held = self._mean()
-            for m in np.flatnonzero(np.abs(held[0] - self._target) > FOLLOWS).tolist():
-                off = 1e3 * (held[0] - self._target)[m]
-                self.verdict.failed('position hold', m, off=off)
-            for m in self._muscles:
-                self.trying = self._robot.muscles[m]
-                yield from self._try(m)
-        except RunAwayError as error:
-            muscle, detail = error.args
-            self.verdict.failed('position ran away', muscle, detail=detail)
-            self._target[muscle] += self._robot.actuation.release[muscle]
-            end = self._now + RELEASE
-            while self._now < end:
-                yield
+    def _hold(self) -> Wait:
+        yield from self._wait(RELEASE)
+        self._target[:] = self._mean()[0]
+        yield from self._wait(SETTLE)
+        held = self._mean()
+        for m in np.flatnonzero(np.abs(held[0] - self._target) > FOLLOWS).tolist():
+            off = 1e3 * (held[0] - self._target)[m]
+            self.verdict.failed('position hold', m, off=off)
 
-    def _wait(self, duration: float) -> Wait:
-        end = self._now + duration
-        while self._now < end:
-            yield
-            length, tension, _ = self._recent[-1][1]
-            most = self._highest + RUN_AWAY_TENSION
-            far = np.abs(length - self._target) > RUN_AWAY
-            self._tame_at[~((tension > most) | far)] = self._now
-            wild = self._now - self._tame_at > MOMENT
-            if wild.any():
-                m = int(wild.argmax())
-                text = f'T rose to {tension[m]:.0f} N'
-                if far[m]:
-                    text = f'l is {1e3 * (length - self._target)[m]:+.0f} mm off l_target'
-                raise RunAwayError(m, text)
+    def _run_away(self, states: Array, start: Array) -> RunAwayError | None:  # noqa: ARG002
+        length, tension, _ = states
+        far = np.abs(length - self._target) > RUN_AWAY
+        m = self._lasting((tension > self._highest + RUN_AWAY_TENSION) | far)
+        if m is None:
+            return None
+        detail = f'T rose to {tension[m]:.0f} N'
+        if far[m]:
+            detail = f'l is {1e3 * (length - self._target)[m]:+.0f} mm off l_target'
+        return RunAwayError(m, 'position ran away', detail=detail)
+
+    def _pay_out(self, m: int) -> None:
+        self._target[m] += self._robot.actuation.release[m]
 
     def _mean(self) -> Array:
         """Return mean l [m], T [N] and temperature [°C], (3, M)."""
-        mean: Array = np.mean([states for _, states in self._recent], axis=0)
+        mean: Array = self._readings().mean(axis=0)
         return mean
 
     # -- checks ---------------------------------------------------------------------------------
@@ -163,5 +156,4 @@ class Positioning(MotionTest):
 
     def _may_go_on(self, m: int) -> bool:
         """Return whether muscle m may be wound in further; an unknown tension does not end it."""
-        tension = float(np.mean([states[1, m] for _, states in self._recent]))
-        return not tension > self._highest[m]
+        return not float(self._readings()[:, 1, m].mean()) > self._highest[m]

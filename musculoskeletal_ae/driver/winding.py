@@ -21,8 +21,13 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.motion import (
+    ABOVE_BIAS,
+    HOLD,
+    LATEST,
     MEAN,
     RELEASE,
+    RESPONSE,
+    SETTLE,
     MotionTest,
     RunAwayError,
     Wait,
@@ -31,23 +36,17 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-ABOVE_BIAS = 40.0  # default of the highest demanded tension, above T_bias [N]
 #: responses to lower demands above T_bias cannot be distinguished from noise [N]
 LEAST_ABOVE_BIAS = 20.0
-SETTLE = 1.5  # time in which the arm comes to rest after a motion [s]
-HOLD = 0.5  # time for which a demand is held [s]
 SPEED = 0.01  # speed at which a target continues inwards while the arm gives way [m/s]
 FURTHEST = 0.025  # largest distance by which a muscle is wound in [m]
 SLACK = 0.01  # distance by which l_target is then set beyond l [m]
 RUN_AWAY_TENSION = 60.0  # excess over the demand at which a muscle is released [N]
 RUN_AWAY = 0.05  # shortening at which a muscle is released [m]
-MOMENT = 0.1  # time for which a falling arm may exceed RUN_AWAY_TENSION [s]
-LATEST = 0.1  # longest time from a command to the first response [s]
 #: tolerance of T [N], and relative to the demand; the larger one applies
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
 LENGTH_ERROR = 2.0e-4  # two standard deviations of noise and resolution of l [m]
 SLOPES = 0.7, 1.4  # legal range of the change of T, divided by that of the demand
-RESPONSE = 4.0, 0.0006  # changes of T [N] and l [m] above noise that count as a response
 CLIP = 20.0, 0.05  # demand beyond tension.max [N], and tolerance relative to tension.max
 #: distance from −l within which a muscle with the wrong sign of l gets tight [m]
 MIRROR_TOLERANCE = 0.008
@@ -90,7 +89,7 @@ class Winding(MotionTest):
         #: tolerance of T where T_bias or no tension is demanded [N] (M,)
         usual = np.minimum(TENSION_TOLERANCE, 0.5 * self._bias)
         self._resting = np.maximum(usual, LENGTH_ERROR * robot.stiffness)
-        self._run_away = np.minimum(RUN_AWAY_TENSION * self._scale, robot.tension.max)
+        self._run_away_tension = np.minimum(RUN_AWAY_TENSION * self._scale, robot.tension.max)
         self._highest: Array = np.minimum(self._bias + ABOVE_BIAS * self._scale, robot.tension.max)
         if highest is not None:
             self._highest = np.full(robot.muscle_count, highest)
@@ -109,55 +108,41 @@ class Winding(MotionTest):
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, '
                     f'not {limit} N'
                 )
-        #: last time that each muscle was below its demand plus RUN_AWAY_TENSION [s]
-        self._tame_at: Array = np.zeros(robot.muscle_count)
         self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
 
     # -- commands -------------------------------------------------------------------------------
 
-    def _sequence(self) -> Wait:
-        try:
-            self.trying = 'hold'
-            yield from self._wait(MEAN)
-            for pause in (SETTLE, HOLD):
-                self._target[:] = self._mean().length
-                yield from self._wait(pause)
-            held, self._swing = self._mean(), self._noise()
-            for m in np.flatnonzero(self._swing > self._tolerance).tolist():
-                self.verdict.failed('hums', m, swing=self._swing[m])
-            for m in np.flatnonzero(self._off(held)).tolist():
-                self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
-            for m in self._muscles:
-                self.trying = self._robot.muscles[m]
-                yield from self._try(m)
-        except RunAwayError as error:
-            muscle, detail, rose = error.args
-            what = 'rising' if rose > RESPONSE[1] else 'ran away'
-            self.verdict.failed(what, muscle, detail=detail, rose=1e3 * rose)
-            # Pay out, then stop sending commands, after which modules go to their safe state.
-            self._target += 2.0 * RUN_AWAY
-            end = self._now + RELEASE
-            while self._now < end:
-                yield
+    def _hold(self) -> Wait:
+        yield from self._wait(MEAN)
+        for pause in (SETTLE, HOLD):
+            self._target[:] = self._mean().length
+            yield from self._wait(pause)
+        held, self._swing = self._mean(), self._noise()
+        for m in np.flatnonzero(self._swing > self._tolerance).tolist():
+            self.verdict.failed('hums', m, swing=self._swing[m])
+        for m in np.flatnonzero(self._off(held)).tolist():
+            self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
 
-    def _wait(self, duration: float) -> Wait:
-        """Wait [s]; raise RunAwayError if a muscle exceeds its demand or shortens too far."""
-        end, start = self._now + duration, self._recent[-1][1] if self._recent else None
-        while self._now < end:
-            yield
-            length, tension, _ = self._recent[-1][1]
-            tensions = self._robot.tension
-            most = np.minimum(np.maximum(tensions.limit, self._highest), tensions.max)
-            asked = np.minimum(self._demanded(length), most)
-            self._tame_at[~(tension > asked + self._run_away)] = self._now
-            if (wild := self._now - self._tame_at > MOMENT).any():
-                m = int(wild.argmax())
-                detail = f'T rose to {tension[m]:.0f} N, but the demand was {asked[m]:.0f} N'
-                rose = 0.0 if start is None else float(length[m] - start[0][m])
-                raise RunAwayError(m, detail, rose)
-            if start is not None and (fell := start[0] - length).max() > RUN_AWAY:
-                detail = f'l fell by {1e3 * fell.max():.0f} mm'
-                raise RunAwayError(int(fell.argmax()), detail, 0.0)
+    def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
+        """Return the error of a muscle that exceeds its demand or shortens too far."""
+        length, tension, _ = states
+        tensions = self._robot.tension
+        most = np.minimum(np.maximum(tensions.limit, self._highest), tensions.max)
+        asked = np.minimum(self._demanded(length), most)
+        m = self._lasting(tension > asked + self._run_away_tension)
+        if m is not None:
+            detail = f'T rose to {tension[m]:.0f} N, but the demand was {asked[m]:.0f} N'
+            rose = float(length[m] - start[0][m])
+            fault = 'rising' if rose > RESPONSE[1] else 'ran away'
+            return RunAwayError(m, fault, detail=detail, rose=1e3 * rose)
+        fell = start[0] - length
+        if fell.max() > RUN_AWAY:
+            detail = f'l fell by {1e3 * fell.max():.0f} mm'
+            return RunAwayError(int(fell.argmax()), 'ran away', detail=detail)
+        return None
+
+    def _pay_out(self, m: int) -> None:  # noqa: ARG002 (all muscles: the arm may be falling)
+        self._target += 2.0 * RUN_AWAY
 
     def _demanded(self, length: Array) -> Array:
         """Return the tensions that the commands demand at l [m] (..., M), [N] (..., M)."""
@@ -166,7 +151,7 @@ class Winding(MotionTest):
         return demand
 
     def _mean(self) -> _Reading:
-        readings = np.array([states for _, states in self._recent])
+        readings = self._readings()
         # The demand is averaged, because it is a nonlinear function of the noisy l.
         demand = self._demanded(readings[:, 0])
         clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
