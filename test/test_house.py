@@ -43,6 +43,25 @@ def test_only_the_presets_import_the_paper() -> None:
             assert not taken, f'{file}: choose it through presets.registry instead'
 
 
+def test_outside_its_folder_the_paper_is_only_cited() -> None:
+    chosen = 'paper', 'presets', 'experiments'  # the experiments compare with it
+    offered = 'parameters.py', 'train.py', 'experiment.py'  # their options name it
+    for file in sources(PACKAGE):
+        if file.parent.name in chosen or file.name in offered:
+            continue
+        text = ' '.join(file.read_text(encoding='utf-8').split())
+        for match in re.finditer('paper', text, re.IGNORECASE):
+            around = text[match.start() : match.end() + 50]
+            assert '§' in around, f'{file}: cite the section, or choose by a preset: {around}'
+
+
+def test_one_file_imports_what_rclpy_does_not_publish() -> None:
+    taking = [
+        file.name for file in sources(PACKAGE) if any('rclpy.impl' in n for n in imported(file))
+    ]
+    assert taking == ['rclpy_names.py']
+
+
 def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
     for file in sources(PACKAGE):
         if file.parent.name not in ('nodes', 'tools') and file.name != 'executables.py':

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import Command, Pull
@@ -24,14 +25,36 @@ class Inputs(NamedTuple):
     dt: float  # time since the last command [s]
 
 
-class ActivityControl(Protocol):
-    """Commands the arm during one activity."""
+class ActivityControl(ABC):
+    """Commands the arm during one activity.
 
+    The controller asks after each step what follows from it; the defaults are those of an activity
+    that needs and changes nothing.
+    """
+
+    @abstractmethod
     def enter(self, inputs: Inputs, /) -> None:
         """Start the activity, or restart it after a pause, from the present tensions."""
 
+    @abstractmethod
     def step(self, inputs: Inputs, /) -> Command | None:
         """Return the desired command; None keeps the last one."""
 
+    @abstractmethod
     def leave(self) -> None:
         """End the activity, because another activity or a stop follows."""
+
+    @property
+    def needs_trajectory(self) -> bool:
+        """Whether it needs a new trajectory from the present posture to the target."""
+        return False
+
+    @property
+    def has_arrived(self) -> bool:
+        """Whether the motion that it was asked for has ended."""
+        return False
+
+    @property
+    def new_target(self) -> Array | None:
+        """Posture [rad] (D,) that replaces the target; None: the target is kept."""
+        return None

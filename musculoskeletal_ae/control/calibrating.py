@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
 from musculoskeletal_ae.control.ramps import Ramp
 from musculoskeletal_ae.control.settings import Settings
@@ -28,7 +28,7 @@ def gentle_limit(robot: Robot) -> Array:
     return robot.tension.bias + SHARE * (robot.tension.limit - robot.tension.bias)
 
 
-class Calibrating:
+class Calibrating(ActivityControl):
     """The activity of moving gently, in small slow steps relative to the present lengths.
 
         l_target = l + ①(θ_goal, T_goal) − ①(θ_est, T) + l_comp(T_goal)

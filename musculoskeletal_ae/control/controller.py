@@ -532,25 +532,30 @@ class Controller:
         self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
 
     def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        activities, state = self.activities, self.target_state
-        follower = activities.follower
-        if control is follower and follower.trajectory is None and state.theta is not None:
-            # After a stop or a change of method, move to the target from the present posture.
+        """Step an activity, and apply what follows from it for target and supervisor."""
+        if control.needs_trajectory:
+            self._approach_again()
+        command = self.activities.step(control, inputs)
+        if (theta := control.new_target) is not None:
+            inside = np.clip(theta, self.robot.lower, self.robot.upper)
+            self.target_state = Target(np.zeros_like(inside), inside)
+        if control.has_arrived:
+            self.supervisor.on_arrival()
+        return command
+
+    def _approach_again(self) -> None:
+        """Start another trajectory to the target from the present posture, if there may be one.
+
+        After a stop or a change of method, there is no trajectory. If the arm has fallen, the
+        number of attempts is limited.
+        """
+        state, follower = self.target_state, self.activities.follower
+        if follower.trajectory is None and state.theta is not None:
             self._approach(self.settings.first_duration)
-        elif control is follower and follower.has_fallen and state.approaches_left:
+        elif follower.has_fallen and state.approaches_left:
             state.approaches_left -= 1
             follower.leave()
             self._approach(self.settings.target_duration or self.settings.first_duration)
-        command = activities.step(control, inputs)
-        if control is activities.gravity_compensation:
-            # The next method holds the present posture.
-            inside = np.clip(inputs.theta, self.robot.lower, self.robot.upper)
-            self.target_state = Target(np.zeros_like(inside), inside)
-        if control is activities.exploring:
-            state.theta = activities.exploring.theta
-        if control is follower and not follower.is_moving:
-            self.supervisor.on_arrival()
-        return command
 
     def _inputs(self, dt: float) -> Inputs:
         # Without a stop cause, all inputs are available.

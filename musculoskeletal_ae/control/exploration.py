@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import Command
 from musculoskeletal_ae.control.ramps import Goal, LengthRamps
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
@@ -115,13 +115,13 @@ def holdable_postures(
     )
 
 
-class Exploring:
+class Exploring(ActivityControl):
     """The activity of exploring, which executes random steps with ramps of muscle lengths."""
 
     def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
         self.stream, self.ramps = exploration, ramps
         self._steps: Iterator[Step] | None = None
-        self.theta: Array | None = None  # present target [rad], (D,)
+        self._theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
         """Start with a new posture, or continue after a pause, from the present tensions."""
@@ -137,7 +137,7 @@ class Exploring:
         assert self._steps is not None
         if self.ramps.is_over_after(inputs.dt):
             step = next(self._steps)
-            self.theta = step.theta
+            self._theta = step.theta
             constant = step.tension if step.method == 'first' else None
             effort = np.zeros_like(step.theta)
             self.ramps.pursue([Goal(step.method, step.theta, effort, step.duration, constant)])
@@ -145,4 +145,9 @@ class Exploring:
 
     def leave(self) -> None:
         """End the exploration; the next one starts with another posture."""
-        self._steps = self.theta = None
+        self._steps = self._theta = None
+
+    @property
+    def new_target(self) -> Array | None:
+        """The posture to which the arm moves; it is held after the exploration."""
+        return self._theta

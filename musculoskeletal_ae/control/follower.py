@@ -35,7 +35,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
 from musculoskeletal_ae.control.feedback import RestFeedback, depends_on_limit
 from musculoskeletal_ae.control.methods import Solution, stiffness_command
@@ -109,7 +109,7 @@ class Stiffening:
         return self._near
 
 
-class Follower:
+class Follower(ActivityControl):
     """Follows trajectories, and holds where the last one ended.
 
     Attributes:
@@ -199,6 +199,16 @@ class Follower:
         if not is_at_rest or self._robot.used.all():
             return False
         return bool(np.abs(self.error / self._robot.kinematics.radian).max() > FALLEN)
+
+    @property
+    def needs_trajectory(self) -> bool:
+        """Whether it has no trajectory, as after a stop, or the arm has fallen on the way."""
+        return self.trajectory is None or self.has_fallen
+
+    @property
+    def has_arrived(self) -> bool:
+        """Whether the last trajectory has ended."""
+        return not self.is_moving
 
     @property
     def latest(self) -> Trajectory | None:

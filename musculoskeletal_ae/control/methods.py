@@ -26,6 +26,7 @@ from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
@@ -51,11 +52,6 @@ LEVELS = 8  # number of tensions between T_bias and limit at which the elongatio
 # to errors of the MAE.
 STEP = 0.05
 
-#: methods that need no measured tension, by preset
-WITHOUT_TENSION = {'default': ('geometric', 'first', 'proposed')}
-#: methods that need no measured tension with any other preset, whose `proposed` starts from it
-OTHERS_WITHOUT_TENSION = ('geometric', 'first')
-
 
 def check_method(robot: Robot, settings: Settings) -> None:
     """Check that the robot's modules can do what the method needs.
@@ -72,7 +68,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
         )
     if robot.tension_source.is_known:
         return
-    legal = WITHOUT_TENSION.get(settings.preset, OTHERS_WITHOUT_TENSION)
+    legal = preset_named(settings.preset).methods_without_tension
     if settings.method not in legal:
         raise MusculoskeletalError(
             f'method {settings.method!r} needs tensions, and tension_source of muscles.yaml is '

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.feedback import depends_on_limit
 from musculoskeletal_ae.control.methods import LengthMethod, Solution
@@ -169,7 +169,7 @@ def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
     return preset_named(settings.preset).length_methods()
 
 
-class RampedTarget:
+class RampedTarget(ActivityControl):
     """The activity of moving to a target and holding it by a length method."""
 
     def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import TENSION, Command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
@@ -22,7 +22,7 @@ WALL = 30.0  # stiffness of the wall near a joint limit [N·m/rad]
 WALL_AT = 0.05  # distance of the wall from the joint limit [rad]
 
 
-class TorqueControl:
+class TorqueControl(ActivityControl):
     """Joint torque by muscle tension: the method `tension`.
 
         τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
@@ -112,6 +112,7 @@ class GravityCompensation(TorqueControl):
     def __init__(self, robot: Robot, settings: Settings) -> None:
         super().__init__(robot, settings)
         self.held: Array | None = None  # θ_held [rad], (D,)
+        self._theta: Array | None = None  # the last posture [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
         """Hold the present posture, starting from the present tensions."""
@@ -120,7 +121,13 @@ class GravityCompensation(TorqueControl):
 
     def step(self, inputs: Inputs) -> Command | None:
         """Return the tension command."""
+        self._theta = inputs.theta
         return self._command_towards(inputs.theta, np.zeros_like(inputs.theta), inputs)
+
+    @property
+    def new_target(self) -> Array | None:
+        """The present posture, which the next method holds."""
+        return self._theta
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         low, high, radian = self._robot.lower, self._robot.upper, self._robot.kinematics.radian

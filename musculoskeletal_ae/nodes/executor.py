@@ -28,12 +28,12 @@ from rclpy.executors import (
     SingleThreadedExecutor,
     TimeoutException,
 )
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.timer import Timer
 from rclpy.waitable import NumberOfEntities
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.rclpy_names import WaitSet
 
 VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
 CHOICES = ('lean', 'events', 'single')
@@ -147,7 +147,7 @@ class LeanExecutor(SingleThreadedExecutor):
         for action in self._actions:
             self._handles.enter_context(action)
             count += action.get_num_entities()
-        new = self._wait_set = rclpy_implementation.WaitSet(
+        new = self._wait_set = WaitSet(
             count.num_subscriptions, count.num_guard_conditions, count.num_timers,
             count.num_clients, count.num_services, count.num_events, self.context.handle,
         )  # fmt: skip

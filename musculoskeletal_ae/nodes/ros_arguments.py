@@ -5,15 +5,16 @@ import os
 from itertools import pairwise
 
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from rclpy.impl.implementation_singleton import rclpy_implementation
+
+from musculoskeletal_ae.nodes.rclpy_names import RCLInvalidROSArgsError, UnknownROSArgsError
 
 NO_REASON = 'error not set'  # the message of rcl for an error without a reason
 #: exceptions of rclpy for a start-up value of the wrong type or out of range
 PARAMETER_ERRORS = (
     InvalidParameterTypeException,
     InvalidParameterValueException,
-    rclpy_implementation.UnknownROSArgsError,
-    rclpy_implementation.RCLInvalidROSArgsError,
+    UnknownROSArgsError,
+    RCLInvalidROSArgsError,
 )
 
 

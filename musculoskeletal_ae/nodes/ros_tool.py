@@ -12,7 +12,6 @@ from typing import Any
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -20,6 +19,7 @@ from rclpy.utilities import remove_ros_args
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.executor import make_executor
 from musculoskeletal_ae.nodes.parameters import OF_RCLPY
+from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -104,7 +104,7 @@ def run_tool(
             problem = f'{parameter!r} is not a parameter; put options of {name} before --ros-args'
             print(printable(f'{name}: error: {problem}'), file=sys.stderr)
             return 2
-    refused = (InvalidTopicNameException, rclpy_implementation.RCLError, *PARAMETER_ERRORS)
+    refused = (InvalidTopicNameException, RCLError, *PARAMETER_ERRORS)
     try:
         return exit_status(lambda: _interruptible(work, options, arguments), *refused)
     finally:

@@ -14,7 +14,6 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -23,6 +22,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.executor import make_executor
 from musculoskeletal_ae.nodes.parameters import COMBINED, check_names
 from musculoskeletal_ae.nodes.progress import ProgressWatch
+from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 from musculoskeletal_ae.nodes.shell import STEADY
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -53,7 +53,7 @@ def run(name: str) -> int:
     except MusculoskeletalError as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
-    except (*PARAMETER_ERRORS, rclpy_implementation.RCLError) as error:
+    except (*PARAMETER_ERRORS, RCLError) as error:
         print(f'error: {printable(reason(error))}', file=sys.stderr)
         return 1
     return 0

@@ -27,7 +27,6 @@ from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSPolicyKind, QoSProfile
@@ -51,6 +50,7 @@ from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, Chec
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.parameters import MOTORS, PARAMETERS, check_names
+from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import reason
 from musculoskeletal_ae.nodes.sources import (
     AUTHORS,
@@ -440,7 +440,7 @@ class Shell(Node):
     def _check_topic_name(self, name: str) -> None:
         try:
             self.resolve_topic_name(name or STATES)
-        except (InvalidTopicNameException, rclpy_implementation.RCLError) as error:
+        except (InvalidTopicNameException, RCLError) as error:
             raise MusculoskeletalError(f'{name!r}: {reason(error)}') from error
 
     def listen(

@@ -31,6 +31,7 @@ class DefaultPreset:
     least_samples = 2
     validates_updates = True
     simulates_on_devices = True
+    methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 
     def initial_steps(self, groups: Iterable[Group]) -> int:
         """Return a number of mini-batches that grows with the number of joints and muscles."""

@@ -36,6 +36,7 @@ class PaperPreset:
     least_samples = THRESHOLD + 1
     validates_updates = False
     simulates_on_devices = False
+    methods_without_tension: tuple[str, ...] = 'geometric', 'first'
 
     def __init__(self, hidden: tuple[int, ...] = HIDDEN) -> None:
         self._hidden = hidden

@@ -36,12 +36,14 @@ class Preset(Protocol):
         validates_updates: Whether the learner validates an update before it publishes it
             (`estimation/checkpoint_validation.py`).
         simulates_on_devices: Whether the simulator can run on a torch device.
+        methods_without_tension: Names of the control methods that start from no measured tension.
     """
 
     name: str
     least_samples: int
     validates_updates: bool
     simulates_on_devices: bool
+    methods_without_tension: tuple[str, ...]
 
     # -- network and initial training -----------------------------------------------------------
 

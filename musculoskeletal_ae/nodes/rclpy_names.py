@@ -1,0 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names of rclpy that it defines without a public module. Nothing else imports its implementation.
+
+`RCLError` is the base class of errors that rcl returns, for example for an invalid topic name.
+"""
+
+from rclpy.impl.implementation_singleton import rclpy_implementation
+
+RCLError = rclpy_implementation.RCLError
+RCLInvalidROSArgsError = rclpy_implementation.RCLInvalidROSArgsError
+UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
+WaitSet = rclpy_implementation.WaitSet
