@@ -27,6 +27,15 @@ settings.register_profile('no deadline', deadline=None)
 settings.load_profile('no deadline')
 
 
+def pytest_collection_modifyitems(items: list[Any]) -> None:
+    """Start the tests that occupy both cores first.
+
+    They run one after another in one process, mostly waiting, beside all other tests. If they came
+    last, the other processes would have nothing left to do meanwhile.
+    """
+    items.sort(key=lambda item: 'both_cores' not in item.fixturenames)
+
+
 @contextmanager
 def _alone(factory: pytest.TempPathFactory, what: str) -> Iterator[Path]:
     folder = factory.getbasetemp()

@@ -49,7 +49,7 @@ class Candidates:
     def follow(self) -> None:
         """Subscribe to candidates, and follow the parameter `checkpoint`."""
         node = self._node
-        node.needed.append(CANDIDATES)
+        node.needed.add(CANDIDATES)
         node.follow_parameter('checkpoint', self._use_file, node.load_checkpoint)
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
@@ -78,7 +78,7 @@ class Candidates:
         self.validator.check(mae, is_chosen=True)
         self._accept(mae)
         self.queue.give_up()
-        self._node.stop_waiting_for(CANDIDATES)
+        self._node.needed.remove(CANDIDATES)
 
     def _accept(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
         try:

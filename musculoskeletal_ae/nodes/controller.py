@@ -90,7 +90,7 @@ class Controller(Shell):
         self.follow_accepted_checkpoints(
             self.core.use, lambda reason: self.core.stop(StopCause.UNFIT_CHECKPOINT, reason)
         )
-        self.needed += ['muscle_states', 'estimated_joint_states']
+        self.needed.add('muscle_states', 'estimated_joint_states')
         self.follow_offsets(self._use_body)
         self.sources.watch(*AUTHORS)
         self.follow_muscle_messages(self._muscles)

@@ -63,7 +63,7 @@ class Estimator(Shell):
         self.published_isolated: tuple[int, ...] | None = None
         self.published_offsets: LengthOffsets | None = None
         self.detected.publish(Bool(data=self.published_anomaly))
-        self.needed.append('muscle_states')
+        self.needed.add('muscle_states')
         self.posture: tuple[float, ...] = ()  # value of the parameter zero_posture
         self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
         self.follow_parameter('zero_posture', self._on_posture)

@@ -60,12 +60,12 @@ class Learner(Shell):
         self.follow_parameter('checkpoint', self._start, self._network)
         self.follow_parameter('relearn_muscles', self._name, self.robot.muscle_indices)
         self.running = True
-        self.needed = ['muscle_states']
         if topic := JOINT_TOPICS.get(value('joint_source')):
-            self.needed.insert(0, topic)
+            self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.listen(Imu, 'imu', self._take_imu, SENSOR)
+        self.needed.add('muscle_states')
         self.follow_offsets(self._use_offsets)
         self.follow_muscle_messages(self._take_muscle_states)
         self.follow_anomaly(core.anomaly)

@@ -16,19 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -49,7 +42,9 @@ from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
-from musculoskeletal_ae.nodes.parameters import MOTORS, PARAMETERS, check_names
+from musculoskeletal_ae.nodes.needed_topics import NeededTopics
+from musculoskeletal_ae.nodes.node_parameters import NodeParameters, naming_parameter
+from musculoskeletal_ae.nodes.parameters import MOTORS, check_names
 from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import reason
 from musculoskeletal_ae.nodes.sources import (
@@ -57,12 +52,10 @@ from musculoskeletal_ae.nodes.sources import (
     LOOK_PERIOD,
     MOTOR_COMMAND,
     SEVERAL,
-    SILENT_TOPIC,
     Sources,
     Twins,
 )
-from musculoskeletal_ae.parameters import Parameter
-from musculoskeletal_ae.reception import Pauses, Reception
+from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
@@ -90,9 +83,6 @@ QOS_REMEDIES = {
     ('subscriber needs', QoSPolicyKind.DURABILITY): 'subscribe volatile',
 }
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
-#: needed topics that are published continually, whose silence is therefore an error
-STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
-SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
 
 
 class Shell(Node):
@@ -117,15 +107,7 @@ class Shell(Node):
             MusculoskeletalError: If a parameter or the robot cannot be used.
         """
         super().__init__(name, **options)
-        self._table = PARAMETERS[name]
-        self._setters: dict[str, Callable[[Any], object]] = {}
-        self._prepare: dict[str, Callable[[Any], object]] = {}
-        self._proposed: dict[str, Any] = {}  # values of a request that is being checked
-        for key, parameter in self._table.items():
-            default = parameter.default
-            default = list(default) if isinstance(default, tuple) else default
-            self.declare_parameter(key, default, _descriptor(parameter))
-            self.parameter(key)  # raises if the value is not legal
+        self.parameters = NodeParameters(self, name)
         check_names(getattr(self, '_parameter_overrides', {}))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # rate of the muscle modules [Hz]
@@ -134,7 +116,7 @@ class Shell(Node):
         #: topics of a ros2_control robot, by the names of the topics that they replace
         self._wires = {STATES: self.motors.state_topic, MOTOR_COMMAND: self.motors.command_topic}
         for name in ('motor_state_topic', 'motor_command_topic'):
-            with _naming_parameter(name):
+            with naming_parameter(name):
                 self._check_topic_name(self.parameter(name))
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
@@ -146,7 +128,6 @@ class Shell(Node):
         self.rejected = self._reception.rejected  # number of messages, by topic and reason
         #: offsets and isolated muscles that the estimator has published
         self.body = BodyState.healthy(self.robot.muscle_count)
-        self.add_on_set_parameters_callback(self._set_parameters)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
         self.twins = Twins(self._diagnostics.status_name, self._diagnostics.identity)
@@ -159,10 +140,9 @@ class Shell(Node):
         )
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report, clock=STEADY)
-        self._fault = self._waiting = ''
-        self._pauses = Pauses()
+        self._fault = ''
         self.checkpoint_version: int | None = None  # version of the network in use
-        self.needed: list[str] = []  # topics that the node needs to work
+        self.needed = NeededTopics(self, self._reception)
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )
@@ -278,19 +258,8 @@ class Shell(Node):
     # -- parameters -----------------------------------------------------------------------------
 
     def parameter(self, name: str) -> Any:
-        """Return the checked value of a parameter; a list becomes a tuple without empty names.
-
-        Raises:
-            MusculoskeletalError: If the value is not legal.
-        """
-        with _naming_parameter(name):
-            value = self._proposed.get(name, self._held(name))
-            return self._table[name].checked(value)
-
-    def _held(self, name: str) -> Any:
-        value = self.get_parameter_or(name, RosParameter(name)).value
-        # Return an empty list for None, as which rcl reads an empty list on the command line.
-        return [] if value is None and isinstance(self._table[name].default, tuple) else value
+        """Return a parameter's checked value; see `NodeParameters.value`."""
+        return self.parameters.value(name)
 
     def state_directory(self) -> Path | None:
         """Return the directory that `state_directory` names; None if nothing is kept.
@@ -310,59 +279,8 @@ class Shell(Node):
         setter: Callable[[Any], object],
         prepare: Callable[[Any], object] | None = None,
     ) -> None:
-        """Call `setter` with the value of a parameter now, and whenever the parameter is set.
-
-        Parameters of one request are set together or not at all. If one is refused, the setters of
-        the others are called again with the previous values. A setter whose effect cannot be undone
-        in this way needs `prepare`. Such setters are called after all others, in the order of
-        registration, and once if several parameters share a setter. Only the first of them may
-        raise an error.
-
-        Args:
-            name: Name of the parameter.
-            setter: Uses the value it is called with, or raises a MusculoskeletalError to refuse it.
-            prepare: Converts the value for `setter`, or returns None if there is nothing to do;
-                raises a MusculoskeletalError to refuse it.
-        """
-        self._setters[name] = setter
-        if prepare is not None:
-            self._prepare[name] = prepare
-        self._take({name: self._held(name)})
-
-    def _take(self, values: dict[str, Any]) -> None:
-        """Set parameters together; if one is refused, restore the others and raise."""
-        legal, last = dict[str, Any](), dict[Callable[[Any], object], tuple[str, Any]]()
-        for name in filter(values.__contains__, self._setters):
-            with _naming_parameter(name):
-                legal[name] = self._table[name].checked(values[name])
-                if prepare := self._prepare.get(name):
-                    prepared = prepare(legal.pop(name))
-                    if prepared is not None:
-                        last[self._setters[name]] = name, prepared
-        taken: list[str] = []
-        try:
-            for name, value in legal.items():
-                with _naming_parameter(name):
-                    self._setters[name](value)
-                taken.append(name)
-            for setter, (name, value) in last.items():
-                with _naming_parameter(name):
-                    setter(value)
-        except MusculoskeletalError:
-            self._proposed = {}
-            for name in reversed(taken):
-                self._setters[name](self.parameter(name))
-            raise
-
-    def _set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        self._proposed = {p.name: p.value for p in parameters}
-        try:
-            self._take(self._proposed)
-        except MusculoskeletalError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        finally:
-            self._proposed = {}
-        return SetParametersResult(successful=True)
+        """Call `setter` now and whenever the parameter is set; see `NodeParameters.follow`."""
+        self.parameters.follow(name, setter, prepare)
 
     # -- checkpoints ----------------------------------------------------------------------------
 
@@ -383,7 +301,7 @@ class Shell(Node):
             except (np.linalg.LinAlgError, FloatingPointError) as error:
                 raise CheckpointError(f'the network cannot be evaluated ({error})') from error
             self.checkpoint_version = mae.version
-            self.stop_waiting_for(ACCEPTED)
+            self.needed.remove(ACCEPTED)
 
         def handle(message: UInt8MultiArray) -> Iterator[None]:
             mae = checkpoint.from_bytes(bytes(message.data), self.robot)
@@ -402,7 +320,7 @@ class Shell(Node):
             put_to_use(mae)
 
         self.accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
-        self.needed.append(ACCEPTED)
+        self.needed.add(ACCEPTED)
         self.follow_parameter('checkpoint', use_file, self.load_checkpoint)
         self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
 
@@ -418,10 +336,6 @@ class Shell(Node):
     ) -> CheckpointQueue:
         """Return a queue that handles the checkpoints of a topic in small steps."""
         return CheckpointQueue(self, self._reception, topic, handle, unfit)
-
-    def stop_waiting_for(self, topic: str) -> None:
-        """Stop reporting this topic as missing."""
-        self.needed = [other for other in self.needed if other != topic]
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -593,38 +507,6 @@ class Shell(Node):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
-    def _with_silence(self, report: Report) -> Report:
-        """Return a report that also names a stream on which no usable message arrives."""
-        silent = next(filter(self._is_silent, self.needed), None)
-        if self._pauses.excuse(time.monotonic()) or silent is None:
-            return report
-        step = STREAMS[silent]
-        text = f'no usable {silent} for {self._reception.silence(silent):.0f} s: {step.text}'
-        steps = ', '.join(filter(None, [report.values.get(REMEDY_STEPS), step.identifier]))
-        values = {**report.values, SILENT_TOPIC: text, REMEDY_STEPS: steps}
-        return Report('error', f'{report.message}; {text}', values)
-
-    def _is_silent(self, topic: str) -> bool:
-        """Return whether no usable messages arrive on a stream that was used or is published."""
-        reception = self._reception
-        if topic not in STREAMS or reception.silence(topic) <= SILENCE:
-            return False
-        return reception.was_used(topic) or self.count_publishers(self.full_name(topic)) > 0
-
-    def _log_waiting(self, missing: list[str]) -> None:
-        """Log the needed topics without messages, and the reason, whenever they change."""
-        reasons = [
-            f'{self.full_name(topic)}, which has no publisher'
-            if self.count_publishers(self.full_name(topic)) == 0
-            else f'{self.full_name(topic)}, on which no usable message has arrived'
-            for topic in missing
-        ]
-        # Remove duplicates, because one topic may carry both joint angles and motors.
-        before, self._waiting = self._waiting, '; '.join(dict.fromkeys(reasons))
-        if self._waiting != before:
-            text = f'waiting for {self._waiting}' if reasons else 'receiving all needed topics'
-            self.get_logger().info(text)
-
     def _report(self) -> None:
         try:
             report = self.report()
@@ -641,9 +523,8 @@ class Shell(Node):
             steps = Step.STOP_SECOND_PUBLISHER.identifier
             values = {**report.values, SEVERAL: intruders, REMEDY_STEPS: steps}
             report = Report('error', text, values)
-        report = self._with_silence(report)
-        received = self._diagnostics.tell(report)
-        self._log_waiting([topic for topic in self.needed if topic not in received])
+        received = self._diagnostics.tell(self.needed.with_silence(report))
+        self.needed.log_missing(received)
 
 
 def _recorded(
@@ -657,27 +538,3 @@ def _recorded(
         return message
 
     return lambda data: callback(read(data))
-
-
-@contextmanager
-def _naming_parameter(name: str) -> Iterator[None]:
-    """Prefix the messages of errors in this context with the name of the parameter."""
-    try:
-        yield
-    except (MusculoskeletalError, OSError) as error:
-        raise MusculoskeletalError(f'parameter {name}: {error}') from error
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        description=parameter.description,
-        read_only=not parameter.settable,
-        dynamic_typing=parameter.is_number_list,  # rclpy reads `[]` as an array of bytes
-    )
-    if parameter.within is not None:
-        low, high = parameter.within
-        if isinstance(parameter.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-        else:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    return descriptor

@@ -42,7 +42,7 @@ class Sim(Arm):
         self.wrench = np.zeros(6)
         self.fixed = np.full(self.robot.joint_count, np.nan)
         takes_motor_commands = self.as_robot and self.motors.command_topic
-        self.needed.append(MOTOR_COMMAND if takes_motor_commands else 'muscle_length_command')
+        self.needed.add(MOTOR_COMMAND if takes_motor_commands else 'muscle_length_command')
         self.follow_accepted_checkpoints(self._use_checkpoint)
         if self.as_robot:
             self.follow_length_commands(self._command)

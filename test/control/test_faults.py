@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -26,14 +27,14 @@ class Loop:
 
     def __init__(self, mae):
         self.arm, self.estimator = EmulatedArm(ROBOT, 1), Estimator(ROBOT)
-        self.controller = Controller(ROBOT)
+        self.controller = Controller(ROBOT, Settings(first_duration=2.0))
         self.estimator.use(mae)
         self.controller.use(mae)
         self.now, self.commands, self.pulls = 0.0, [], []
         middle = 0.5 * (ROBOT.lower + ROBOT.upper)
         self.run(0.5)
         self.controller.target({n: (a, 0.0) for n, a in zip(ROBOT.joints, middle)})
-        self.run(8.0)
+        self.run(4.0)
         self.commands.clear()
         self.pulls.clear()
 
@@ -85,7 +86,7 @@ class Loop:
         self.controller.use_body(self.estimator.body)
         self.controller.anomaly(False)
         refused = self.controller.reset(self.now)
-        self.run(6.0)
+        self.run(3.0)
         return refused
 
 

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of one node: declared from `PARAMETERS`, checked, and followed by setters."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.parameters import Parameter
+
+
+class NodeParameters:
+    """Declares the parameters of a node, and passes their checked values to setters.
+
+    Parameters of one request are set together or not at all.
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        """Declare the parameters of the node `name` in `PARAMETERS`.
+
+        Raises:
+            MusculoskeletalError: If a value at the start is not legal.
+        """
+        self._node, self._table = node, PARAMETERS[name]
+        self._setters: dict[str, Callable[[Any], object]] = {}
+        self._prepare: dict[str, Callable[[Any], object]] = {}
+        self._proposed: dict[str, Any] = {}  # values of a request that is being checked
+        for key, parameter in self._table.items():
+            default = parameter.default
+            default = list(default) if isinstance(default, tuple) else default
+            node.declare_parameter(key, default, _descriptor(parameter))
+            self.value(key)  # raises if the value is not legal
+        node.add_on_set_parameters_callback(self._set)
+
+    @property
+    def followed(self) -> frozenset[str]:
+        """Names of the parameters that have a setter."""
+        return frozenset(self._setters)
+
+    def value(self, name: str) -> Any:
+        """Return the checked value of a parameter; a list becomes a tuple without empty names.
+
+        Raises:
+            MusculoskeletalError: If the value is not legal.
+        """
+        with naming_parameter(name):
+            value = self._proposed.get(name, self._held(name))
+            return self._table[name].checked(value)
+
+    def follow(
+        self,
+        name: str,
+        setter: Callable[[Any], object],
+        prepare: Callable[[Any], object] | None = None,
+    ) -> None:
+        """Call `setter` with the value of a parameter now, and whenever the parameter is set.
+
+        If a parameter of a request is refused, the setters of the others are called again with the
+        previous values. A setter whose effect cannot be undone in this way needs `prepare`. Such
+        setters are called after all others, in the order of registration, and once if several
+        parameters share a setter. Only the first of them may raise an error.
+
+        Args:
+            name: Name of the parameter.
+            setter: Uses the value it is called with, or raises a MusculoskeletalError to refuse it.
+            prepare: Converts the value for `setter`, or returns None if there is nothing to do;
+                raises a MusculoskeletalError to refuse it.
+        """
+        self._setters[name] = setter
+        if prepare is not None:
+            self._prepare[name] = prepare
+        self._take({name: self._held(name)})
+
+    def _held(self, name: str) -> Any:
+        value = self._node.get_parameter_or(name, RosParameter(name)).value
+        # Return an empty list for None, as which rcl reads an empty list on the command line.
+        return [] if value is None and isinstance(self._table[name].default, tuple) else value
+
+    def _take(self, values: dict[str, Any]) -> None:
+        """Set parameters together; if one is refused, restore the others and raise."""
+        legal, last = dict[str, Any](), dict[Callable[[Any], object], tuple[str, Any]]()
+        for name in filter(values.__contains__, self._setters):
+            with naming_parameter(name):
+                legal[name] = self._table[name].checked(values[name])
+                if prepare := self._prepare.get(name):
+                    prepared = prepare(legal.pop(name))
+                    if prepared is not None:
+                        last[self._setters[name]] = name, prepared
+        taken: list[str] = []
+        try:
+            for name, value in legal.items():
+                with naming_parameter(name):
+                    self._setters[name](value)
+                taken.append(name)
+            for setter, (name, value) in last.items():
+                with naming_parameter(name):
+                    setter(value)
+        except MusculoskeletalError:
+            self._proposed = {}
+            for name in reversed(taken):
+                self._setters[name](self.value(name))
+            raise
+
+    def _set(self, parameters: list[RosParameter]) -> SetParametersResult:
+        self._proposed = {p.name: p.value for p in parameters}
+        try:
+            self._take(self._proposed)
+        except MusculoskeletalError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        finally:
+            self._proposed = {}
+        return SetParametersResult(successful=True)
+
+
+@contextmanager
+def naming_parameter(name: str) -> Iterator[None]:
+    """Prefix the messages of errors in this context with the name of the parameter."""
+    try:
+        yield
+    except (MusculoskeletalError, OSError) as error:
+        raise MusculoskeletalError(f'parameter {name}: {error}') from error
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=parameter.description,
+        read_only=not parameter.settable,
+        dynamic_typing=parameter.is_number_list,  # rclpy reads `[]` as an array of bytes
+    )
+    if parameter.within is not None:
+        low, high = parameter.within
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    return descriptor
