@@ -13,7 +13,7 @@ second time fails.
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
@@ -49,64 +49,154 @@ def run(
             parts.
     """
     os.environ.update(SINGLE | dict(os.environ))
-    weights = {name: experiment.weight for name, experiment in EXPERIMENTS.items()}
-    total = len(PRESETS) + len(study.seeds) * sum(weights[name] for name in {LEARNING, *names})
-    # Start the longest experiments first, so that none of them runs alone at the end.
-    others = sorted(set(names) - {LEARNING}, key=weights.__getitem__, reverse=True)
-    measured: dict[str, dict[int, Measured | str]] = {name: {} for name in names}
-    pool = _pool(jobs)
-    waiting: list[Part] = [(preset, -1) for preset in PRESETS]
-    # Parts that were running when a worker was killed. They run again, one at a time.
-    suspects: list[Part] = []
-    done, running, pool_broken = 0.0, dict[Future[Any], Part](), False
+    schedule, workers = _Schedule(study, names), _Workers(study, jobs)
+    try:
+        while schedule.waiting or workers.is_busy:
+            workers.start_from(schedule.waiting)
+            for part, future in workers.ended():
+                if error := future.exception():
+                    schedule.on_failure(part, error)
+                else:
+                    schedule.on_result(part, future.result())
+            report(schedule.completed, ', '.join(sorted({name for name, _ in workers.parts})))
+    except BaseException:
+        workers.abort()
+        raise
+    workers.close()
+    return {name: {seed: rows[seed] for seed in study.seeds} for name, rows in schedule.results()}
 
-    def begin(name: str, seed: int) -> None:
-        train = _train, online_learning.train_initial, study, name
+
+class _Schedule:
+    """The parts that may begin, and the results of those that have ended.
+
+    Attributes:
+        waiting: Parts that may begin, in this order.
+    """
+
+    def __init__(self, study: Study, names: Sequence[str]) -> None:
+        self._study, self._names = study, names
+        experiments = {name: experiment.weight for name, experiment in EXPERIMENTS.items()}
+        self._weights = dict.fromkeys(PRESETS, 1.0) | experiments
+        of_individual = sum(experiments[name] for name in {LEARNING, *names})
+        self._total = len(PRESETS) + len(study.seeds) * of_individual
+        self._done = 0.0
+        # Start the longest experiments first, so that none of them runs alone at the end.
+        others = set(names) - {LEARNING}
+        self._others = sorted(others, key=experiments.__getitem__, reverse=True)
+        self._untrained = set(PRESETS)
+        self._measured: dict[str, dict[int, Measured | str]] = {name: {} for name in names}
+        self.waiting: list[Part] = [(preset, -1) for preset in PRESETS]
+
+    @property
+    def completed(self) -> float:
+        """Completed share of the work."""
+        return self._done / self._total
+
+    def results(self) -> Iterable[tuple[str, dict[int, Measured | str]]]:
+        """Return the results, or error messages, of each experiment by seed."""
+        return self._measured.items()
+
+    def on_result(self, part: Part, result: Any) -> None:
+        """Keep the result of a part, and let the parts that need it begin."""
+        name, seed = part
+        self._done += self._weights[name]
+        if name in self._measured:
+            self._measured[name][seed] = result
+        if name == LEARNING:
+            self.waiting += [(other, seed) for other in self._others]
+        elif name in PRESETS:
+            self._untrained.remove(name)
+            if not self._untrained:
+                self.waiting += [(LEARNING, each) for each in self._study.seeds]
+
+    def on_failure(self, part: Part, error: BaseException) -> None:
+        """Note the error as the result of a part and of all parts that need it."""
+        name, seed = part
+        self._done += self._weights[name]
+        lost = self._names if name in (LEARNING, *PRESETS) else (name,)
+        seeds = self._study.seeds if name in PRESETS else (seed,)
+        for each in lost:
+            message = f'{type(error).__name__} in {name}: {error}'
+            self._measured[each] |= dict.fromkeys(seeds, message)
+
+
+class _Workers:
+    """Processes that run parts; a killed process is replaced, and its parts run again."""
+
+    def __init__(self, study: Study, jobs: int) -> None:
+        self._study, self._jobs = study, jobs
+        self._pool = _pool(jobs)
+        self._is_broken = False
+        self._running = dict[Future[Any], Part]()
+        #: parts that were running when a process was killed; they run again, one at a time
+        self._suspects: list[Part] = []
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a part runs, or has to run again."""
+        return bool(self._running or self._suspects)
+
+    @property
+    def parts(self) -> Iterable[Part]:
+        """The parts that run."""
+        return self._running.values()
+
+    def start_from(self, waiting: list[Part]) -> None:
+        """Start as many parts as may run now, and remove them from `waiting`."""
+        if self._is_broken and not self._running:
+            self._pool.shutdown()
+            self._pool, self._is_broken = _pool(self._jobs), False
+        if self._suspects and not self._running:
+            self._begin(self._suspects[0])
+        while waiting and not (self._suspects or self._is_broken) and self._is_free:
+            self._begin(waiting.pop(0))
+
+    @property
+    def _is_free(self) -> bool:
+        return len(self._running) < self._jobs
+
+    def _begin(self, part: Part) -> None:
+        name, seed = part
+        task: tuple[Any, ...] = _measure, name, self._study, seed
+        if name in PRESETS:
+            task = _train, online_learning.train_initial, self._study, name
         try:
-            future = pool.submit(*(train if name in PRESETS else (_measure, name, study, seed)))
+            future = self._pool.submit(*task)
         except BrokenProcessPool as error:  # the pool broke after the last check
             future = Future()
             future.set_exception(error)
-        running[future] = name, seed
+        self._running[future] = part
 
-    try:
-        while waiting or suspects or running:
-            if pool_broken and not running:
-                pool.shutdown()
-                pool, pool_broken = _pool(jobs), False
-            if suspects and not running:
-                begin(*suspects[0])
-            while waiting and not suspects and not pool_broken and len(running) < jobs:
-                begin(*waiting.pop(0))
-            ended, _ = wait(running, POLL, FIRST_COMPLETED)
-            for future in ended:
-                (name, seed), error = running.pop(future), future.exception()
-                pool_broken |= isinstance(error, BrokenProcessPool)
-                if (name, seed) in suspects:
-                    suspects.remove((name, seed))
-                elif isinstance(error, BrokenProcessPool):
-                    suspects.append((name, seed))
-                    continue
-                done += weights.get(name, 1.0)  # initial training: 1
-                if error:
-                    for lost in names if name in (LEARNING, *PRESETS) else (name,):
-                        for each in study.seeds if name in PRESETS else (seed,):
-                            measured[lost][each] = f'{type(error).__name__} in {name}: {error}'
-                    continue
-                if name in measured:
-                    measured[name][seed] = future.result()
-                if name == LEARNING:
-                    waiting += [(other, seed) for other in others]
-                elif name in PRESETS and not (waiting or suspects or running or measured[names[0]]):
-                    waiting += [(LEARNING, each) for each in study.seeds]  # both presets trained
-            report(done / total, ', '.join(sorted({name for name, _ in running.values()})))
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
+    def ended(self) -> list[tuple[Part, Future[Any]]]:
+        """Wait for a moment; return the parts that have ended.
+
+        Parts that ran for the first time when a process was killed are not among them.
+        """
+        ended = list[tuple[Part, Future[Any]]]()
+        for future in wait(self._running, POLL, FIRST_COMPLETED).done:
+            part, was_killed = self._running.pop(future), _was_killed(future)
+            self._is_broken |= was_killed
+            if part in self._suspects:
+                self._suspects.remove(part)
+            elif was_killed:
+                self._suspects.append(part)
+                continue
+            ended.append((part, future))
+        return ended
+
+    def abort(self) -> None:
+        """End all processes at once."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
         for child in multiprocessing.active_children():
             child.terminate()
-        raise
-    pool.shutdown()
-    return {name: {seed: measured[name][seed] for seed in study.seeds} for name in names}
+
+    def close(self) -> None:
+        """End the processes, which have nothing left to do."""
+        self._pool.shutdown()
+
+
+def _was_killed(future: Future[Any]) -> bool:
+    return isinstance(future.exception(), BrokenProcessPool)
 
 
 def _pool(jobs: int) -> ProcessPoolExecutor:
