@@ -73,73 +73,126 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     """Return the postures of a path from `start` to θ [rad], (K, D); the last one is θ."""
     if robot.used.all():
         return theta[None]
-    # Import here, because an arm without isolated muscles does not need scipy.
-    from scipy.sparse.csgraph import dijkstra
+    cost = PathCost(robot, mae)
+    direct = cost.of_edge(start, theta)
+    if direct <= np.linalg.norm((theta - start) / robot.kinematics.radian):
+        return theta[None]
+    path = Roadmap(robot, cost, start, theta, direct).cheapest_path()
+    return _shortened(path, cost)[1:]
 
-    limits, joints = robot.tension, np.eye(robot.joint_count)
-    radian = robot.kinematics.radian
-    at_stop = AT_STOP * radian
-    most = limits.bias + USED * (limits.limit - limits.bias)
 
-    def missing(postures: Array) -> Array:
-        tensions = np.broadcast_to(limits.bias, (len(postures), robot.muscle_count))
+class PathCost:
+    """The cost of straight paths, by the torque that muscles and joint stops do not provide."""
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        self._robot, self._mae = robot, mae
+        self._radian = robot.kinematics.radian
+        limits = robot.tension
+        self._most = limits.bias + USED * (limits.limit - limits.bias)
+
+    def missing(self, postures: Array) -> Array:
+        """Return m of postures [rad] (N, D): the largest missing torque [N·m], (N,)."""
+        robot, low, high = self._robot, self._robot.tension.bias, self._most
+        tensions = np.broadcast_to(low, (len(postures), robot.muscle_count))
+        jacobians = self._radian * self._mae.muscle_jacobian(postures, tensions)
         torques = []
-        for at, jacobian in zip(postures, radian * mae.muscle_jacobian(postures, tensions)):
+        for theta, jacobian in zip(postures, jacobians):
             # Model a stop as a muscle that pulls the joint away from it.
-            low, high = at < robot.lower + at_stop, at > robot.upper - at_stop
-            stops = np.vstack([-joints[low], joints[high]])
+            stops = self._stops(theta)
             none = np.zeros(len(stops))
-            ends = np.concatenate([limits.bias, none]), np.concatenate([most, none + STOP])
-            torque = radian * robot.kinematics.holding_torque(at)
+            ends = np.concatenate([low, none]), np.concatenate([high, none + STOP])
+            torque = self._radian * robot.kinematics.holding_torque(theta)
             exertion = least_tension(np.vstack([jacobian, stops]), torque, *ends)
             torques.append(exertion.missing_torque)
         m = np.abs(torques).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
 
-    def cost(one: Array, other: Array) -> float:
-        length = float(np.linalg.norm((other - one) / radian))
+    def _stops(self, theta: Array) -> Array:
+        """Return G of the stops at which joints rest, (stops, D)."""
+        robot, joints = self._robot, np.eye(self._robot.joint_count)
+        at_stop = AT_STOP * self._radian
+        is_low, is_high = theta < robot.lower + at_stop, theta > robot.upper - at_stop
+        return np.vstack([-joints[is_low], joints[is_high]])
+
+    def of_edge(self, one: Array, other: Array) -> float:
+        """Return the cost of the straight path between two postures [rad], (D,) each."""
+        length = float(np.linalg.norm((other - one) / self._radian))
         shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
-        m = missing(one + shares * (other - one))
+        m = self.missing(one + shares * (other - one))
         return length * (1.0 + PRICE * float(m.mean()))
 
-    direct = cost(start, theta)
-    if direct <= np.linalg.norm((theta - start) / radian):
-        return theta[None]
+    def of_ends(self, postures: Array) -> Array:
+        """Return the approximate cost between all postures [rad] (N, D), from the ends, (N, N)."""
+        apart = np.linalg.norm((postures[:, None] - postures) / self._radian, axis=2)
+        m = self.missing(postures)
+        near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
+        cost = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
+        return np.where(near | near.T, cost, 0.0)  # 0: no edge
+
+
+class Roadmap:
+    """Random postures between a start (number 0) and a goal (number 1), and the edges' costs."""
+
+    def __init__(
+        self, robot: Robot, cost: PathCost, start: Array, theta: Array, direct: float
+    ) -> None:
+        """Draw the postures; `direct` is the cost of the straight path to the goal θ."""
+        self._cost = cost
+        self._postures = np.vstack([start, theta, _random_postures(robot, start)])
+        self._price = cost.of_ends(self._postures)
+        self._evaluated = set[tuple[int, int]]()
+        self._set_price(0, 1, direct)
+
+    def cheapest_path(self) -> Array:
+        """Return the postures of the cheapest path [rad], (K, D)."""
+        path = [0, 1]
+        for _ in range(LOOKS):
+            path = self._apparently_cheapest()
+            new_edges = [edge for edge in pairwise(path) if edge not in self._evaluated]
+            if not new_edges:
+                break
+            for i, j in new_edges:
+                self._set_price(i, j, self._cost.of_edge(self._postures[i], self._postures[j]))
+        return self._postures[path]
+
+    def _apparently_cheapest(self) -> list[int]:
+        """Return the numbers of the postures of the cheapest path at the present costs."""
+        # Import here, because an arm without isolated muscles does not need scipy.
+        from scipy.sparse.csgraph import dijkstra
+
+        before = dijkstra(self._price, indices=[0], return_predecessors=True)[1][0]
+        path = [1]
+        while path[-1] != 0:
+            path.append(int(before[path[-1]]))
+        return path[::-1]
+
+    def _set_price(self, i: int, j: int, price: float) -> None:
+        self._price[i, j] = self._price[j, i] = price
+        self._evaluated |= {(i, j), (j, i)}
+
+
+def _random_postures(robot: Robot, start: Array) -> Array:
+    """Return random postures [rad] (POSTURES, D).
+
+    In a part of them, joints that rest at a stop at the start stay there.
+    """
     rng = np.random.default_rng(0)
+    at_stop = AT_STOP * robot.kinematics.radian
     postures = robot.random_postures(POSTURES, rng)
-    # Keep joints that rest at a stop there in a part of the roadmap.
     for joint in range(robot.joint_count):
         for stop in (robot.lower[joint], robot.upper[joint]):
             if abs(start[joint] - stop) < at_stop[joint]:
                 postures[rng.random(POSTURES) < 0.3, joint] = stop
-    postures = np.vstack([start, theta, postures])
-    apart = np.linalg.norm((postures[:, None] - postures) / radian, axis=2)
-    m = missing(postures)
-    price = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
-    near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
-    price = np.where(near | near.T, price, 0.0)
-    price[0, 1] = price[1, 0] = direct
-    evaluated = {(0, 1), (1, 0)}
-    path = [0, 1]
-    for _ in range(LOOKS):
-        before = dijkstra(price, indices=[0], return_predecessors=True)[1][0]
-        path = [1]
-        while path[-1] != 0:
-            path.append(int(before[path[-1]]))
-        path.reverse()
-        new_edges = [edge for edge in pairwise(path) if edge not in evaluated]
-        if not new_edges:
-            break
-        for i, j in new_edges:
-            price[i, j] = price[j, i] = cost(postures[i], postures[j])
-            evaluated |= {(i, j), (j, i)}
-    points = postures[path]
-    # Remove postures that do not make the path cheaper.
+    return postures
+
+
+def _shortened(path: Array, cost: PathCost) -> Array:
+    """Return a path [rad] (K, D) without the postures that do not make it cheaper."""
     k = 1
-    while k < len(points) - 1:
-        around = cost(points[k - 1], points[k]) + cost(points[k], points[k + 1])
-        if cost(points[k - 1], points[k + 1]) <= around:
-            points, k = np.delete(points, k, axis=0), max(k - 1, 1)
+    while k < len(path) - 1:
+        around = cost.of_edge(path[k - 1], path[k]) + cost.of_edge(path[k], path[k + 1])
+        if cost.of_edge(path[k - 1], path[k + 1]) <= around:
+            path, k = np.delete(path, k, axis=0), max(k - 1, 1)
         else:
             k += 1
-    return points[1:]
+    return path
