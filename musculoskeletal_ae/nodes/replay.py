@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -20,23 +19,21 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.bags.playback import (
-    LEAD_TIME,
     TAUGHT_TOPIC,
     Timeline,
     lap,
-    taught_motion,
     window,
 )
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
-from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
+from musculoskeletal_ae.nodes.taught_motion import ACKNOWLEDGE_TIME, send_taught_motion
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -49,15 +46,8 @@ LONGEST_SLEEP = 0.002  # longest wait that uses time.sleep instead of answering 
 #: time from the discovery of a subscriber until it can receive messages [s]
 SETTLE_TIME = 0.3
 LAP_GAP = 10_000_000  # time between the last message of a lap and the first of the next [ns]
-TRAJECTORY = 'joint_trajectory'
-#: value of a rate on /diagnostics if no message was used since the previous report
-NO_RATE = '0.0 Hz'
-FIRST_REPORT_TIME = 2.0 * PERIOD  # longest wait for a first report of the subscribers [s]
-REPORT_TIME = 5.0 * PERIOD  # longest wait for two reports after sending a trajectory [s]
-SENDINGS = 3  # number of attempts to send a trajectory
 WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
 SEND_WAIT = 10.0  # default of this wait for a trajectory, which needs a subscriber [s]
-ACKNOWLEDGE_TIME = 2.0  # longest wait until reliable readers have acknowledged the messages [s]
 CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
 #: shortest wall time between two messages on /clock that nodes can handle [s]
 SHORTEST_CLOCK_PERIOD = 0.001
@@ -212,127 +202,12 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
     time.sleep(SETTLE_TIME if longest else 0.0)
 
 
-class _Answers:
-    """Reports on /diagnostics of the nodes that subscribe to a topic."""
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node, self._topic = node, topic
-        self._refused_before = 0
-        self.reports: list[dict[str, str]] = []
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE)
-
-    @property
-    def listeners(self) -> set[str]:
-        """Status names of the nodes that subscribe to the topic."""
-        infos = self._node.get_subscriptions_info_by_topic(self._topic)
-        return {f'{info.node_namespace.rstrip("/")}/{info.node_name}: state' for info in infos}
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name in self.listeners:
-                self.reports.append({value.key: value.value for value in status.values})
-
-    def begin(self) -> None:
-        """Forget the reports so far; refusals that they count concern earlier messages."""
-        self._refused_before = self._refused
-        self.reports.clear()
-
-    @property
-    def _refused(self) -> int:
-        counted = f'rejected {TRAJECTORY}: '
-        last = self.reports[-1] if self.reports else {}
-        return sum(int(n) for key, n in last.items() if key.startswith(counted) and n.isdecimal())
-
-    @property
-    def is_taken(self) -> bool:
-        """Whether a node has reported using a message since `begin`."""
-        key = f'{TRAJECTORY} rate'
-        return any(values.get(key, NO_RATE) != NO_RATE for values in self.reports)
-
-    @property
-    def refusal(self) -> str:
-        """Why a node has refused a message since `begin`; '' if none has reported a refusal."""
-        if not self.reports or self._refused <= self._refused_before:
-            return ''
-        last = self.reports[-1].get('last rejected', '')
-        return last if last.startswith(TRAJECTORY) else 'see its /diagnostics for the reason'
-
-
-def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wait: float) -> None:
-    """Publish a trajectory to the connected nodes, and wait until one has used it.
-
-    Raises:
-        MusculoskeletalError: If there is no subscriber, or the trajectory was lost or refused.
-    """
-    publisher = node.create_publisher(JointTrajectory, topic, RELIABLE)
-    answers = _Answers(node, publisher.topic_name)
-    # Wait for both, because discovery may list a subscriber before or after it is connected.
-    spinner.spin_until(lambda: publisher.get_subscription_count() and answers.listeners, wait)
-    if not publisher.get_subscription_count():
-        listeners = ', '.join(sorted(answers.listeners))
-        raise MusculoskeletalError(
-            f'no connection to {listeners} within {wait:g} s: try again, or with a longer --wait'
-            if listeners
-            else f'{topic} has no subscriber: start the controller first'
-        )
-    spinner.spin_until(lambda: answers.reports, FIRST_REPORT_TIME)
-    has_reported = bool(answers.reports)
-    for _ in range(SENDINGS):
-        answers.begin()
-        publisher.publish(message)
-        is_acknowledged = publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
-        # Wait for two reports: the first may have been on its way when the trajectory arrived.
-        spinner.spin_until(
-            lambda: answers.is_taken or answers.refusal or len(answers.reports) > 1,
-            REPORT_TIME if has_reported else 0.0,
-        )
-        if answers.refusal:
-            raise MusculoskeletalError(
-                f'the controller did not take the trajectory: {answers.refusal}'
-            )
-        if answers.is_taken:
-            return
-        if is_acknowledged and not answers.reports:
-            print(f'{topic}: received; no node has reported whether it uses it', file=sys.stderr)
-            return
-    raise MusculoskeletalError(
-        f'{topic} was sent {SENDINGS} times, and no node has used it; try again when this machine '
-        'is less busy'
-    )
-
-
-def _teach(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish a hand-guided motion as one trajectory, and return the exit status 0.
-
-    Raises:
-        MusculoskeletalError: If the bag has no such motion, or the controller refuses it.
-    """
-    names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
-    if len(names) > 1:  # with --keep-names, the bag's arms stay separate
-        problem = f'has the motion of several arms: {", ".join(names)}'
-        raise BagError(bag.path, problem, 'choose one with --from-namespace')
-    ((recorded, name),) = names.items()
-    motion = taught_motion(bag, recorded, *window(bag, options.start, options.duration))
-    message = JointTrajectory(joint_names=motion.joints)
-    for seconds, theta, velocity in zip(*motion[1:]):
-        point = JointTrajectoryPoint(positions=theta.tolist(), velocities=velocity.tolist())
-        point.time_from_start = Duration(seconds=float(seconds)).to_msg()
-        message.points.append(point)
-    start_ros(arguments)
-    node = Node('replay')
-    topic, spinner = name.removesuffix(TAUGHT_TOPIC) + TRAJECTORY, Spinner(node)
-    _send(node, spinner, message, topic, options.wait)
-    length = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
-    print(f'{topic}: {length}; the first {LEAD_TIME:g} s lead to the beginning of the motion')
-    return 0
-
-
 def _replay(options: Namespace, arguments: list[str]) -> int:
     bag = Bag.open(options.bag)
     for reason in bag.unfinished:
         print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
     if options.as_trajectory:
-        return _teach(bag, options, arguments)
+        return send_taught_motion(bag, options, arguments)
     motors = motor_settings(options.params_file)
     names = select(bag, options.topics, options.from_namespace, options.keep_names, motors)
     if options.loop and not options.clock:
@@ -385,6 +260,14 @@ def parse(arguments: list[str]) -> Namespace:
     wait = f'longest wait for subscribers [s] (default: {WAIT:g}, --as-trajectory: {SEND_WAIT:g})'
     add('--wait', type=not_negative, metavar='S', help=wait)
     options = parser.parse_args(arguments)
+    _check_combination(parser, options)
+    if options.wait is None:
+        options.wait = SEND_WAIT if options.as_trajectory else WAIT
+    return options
+
+
+def _check_combination(parser: Parser, options: Namespace) -> None:
+    """Refuse options that have no effect together."""
     if options.rate != 1 and not options.clock:
         parser.error(
             '--rate other than 1 needs --clock, and nodes with use_sim_time: '
@@ -398,8 +281,6 @@ def parse(arguments: list[str]) -> Namespace:
         }
         if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace', 'params_file'}):
             parser.error(f'--check plays nothing: remove --{ignored[0].replace("_", "-")}')
-    if options.wait is None:
-        options.wait = SEND_WAIT if options.as_trajectory else WAIT
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: remove --loop, --clock and --paused')
     if options.as_trajectory and options.topics != [DEFAULT]:
@@ -407,7 +288,6 @@ def parse(arguments: list[str]) -> Namespace:
         parser.error(
             f'--as-trajectory sends the motion of {TAUGHT_TOPIC}: remove --topics {listed}'
         )
-    return options
 
 
 def _work(options: Namespace, arguments: list[str]) -> int:
