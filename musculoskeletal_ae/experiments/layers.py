@@ -47,34 +47,43 @@ HIDDEN = {
     'fewer units: 50, 20': (50, 20),
     'fewer units: 20, 10': (20, 10),
 }
-TRAININGS = 1  # random seeds
+TRAININGS = 3  # number of trainings of each layout, which differ in the random seed
+QUICK_LAYOUTS, QUICK_TRAININGS = 1, 2
 QUICK_STEPS = 600  # number of steps of a shortened initial training
+ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is reported
 
 
 def measure(study: Study, seed: int) -> Measured:
     """Return the results of the first individual; nothing for the others."""
     if seed != study.seeds[0]:
         return Measured({}, {})
-    layouts = [name for name in HIDDEN if not study.quick or name in list(HIDDEN)[:2]]
-    trainings = range(TRAININGS)
-    every = {
-        name: [
-            study.remember(
-                f'layers_{seed}_{"_".join(map(str, HIDDEN[name]))}_{training}',
-                partial(_learn, study, seed, HIDDEN[name], training),
-            )
-            for training in trainings
-        ]
+    layouts = list(HIDDEN)[:QUICK_LAYOUTS] if study.quick else list(HIDDEN)
+    trainings = QUICK_TRAININGS if study.quick else TRAININGS
+    trained = {
+        name: [_trained(study, seed, HIDDEN[name], training) for training in range(trainings)]
         for name in layouts
     }
-    layers = dict[str, Any]()
-    for name, repeated in every.items():
-        after = [row.pop('after_rad') for row in repeated]
-        layers[name] = {key: float(np.mean([row[key] for row in repeated])) for key in repeated[0]}
-        known = [error for error in after if error is not None]
-        values = (float(np.mean(known)), min(known), max(known)) if known else (None,) * 3
-        layers[name] |= dict(zip(('after_rad', 'after_min_rad', 'after_max_rad'), values))
-    return Measured({'layers': layers, 'trainings': len(trainings)}, {'layers': layers})
+    layers = {name: _summary(rows) for name, rows in trained.items()}
+    return Measured({'layers': layers, 'trainings': trainings}, {'layers': trained})
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    """Return the mean of each number over trainings, and the range of the two errors."""
+    summary = dict[str, float | None]()
+    for key in rows[0]:
+        known = [row[key] for row in rows if row[key] is not None]
+        summary[key] = float(np.mean(known)) if known else None
+        if key in ERRORS:
+            summary[key.replace('_rad', '_min_rad')] = min(known, default=None)
+            summary[key.replace('_rad', '_max_rad')] = max(known, default=None)
+    return summary
+
+
+def _trained(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> dict[str, Any]:
+    """Return the numbers of one training; a kept part of an interrupted run is used again."""
+    part = f'layers_{seed}_{"_".join(map(str, hidden))}_{training}'
+    numbers: dict[str, Any] = study.remember(part, partial(_learn, study, seed, hidden, training))
+    return numbers
 
 
 def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> dict[str, Any]:
@@ -100,23 +109,22 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
 def layers(_: Study, rows: Rows) -> Plot:
     """Draw the error of each layout before and after online learning."""
     seed, row = first_individual(rows)
-    results = row.traces['layers']
+    trained = row.traces['layers']
     groups = {
         f'{when} learning': (
             colour,
-            np.array([[each[f'{when}_rad'] for each in results.values()]], dtype=float),
+            np.array([[row[f'{when}_rad'] for row in rows] for rows in trained.values()], float).T,
         )
         for when, colour in plots.WHEN.items()
     }
-    figure, (panel,) = plots.new_figure(9.0, 0.62 * len(results) + 1.3)
+    figure, (panel,) = plots.new_figure(9.0, 0.62 * len(trained) + 1.3)
     title = f'individual {seed}, preset {PAPER_PRESET} with other hidden layers of the encoder'
-    plots.bars(panel, list(results), groups, 'mean error [rad], held-out motion', title)
+    plots.bars(panel, list(trained), groups, 'mean error [rad], held-out motion', title)
     count = row.numbers['trainings']
-    repeated = 'one training each' if count == 1 else f'means over {count} trainings'
     return figure, (
         'Error of the estimate on the held-out motion with other hidden layers of the encoder, '
-        f'{repeated}.'
+        f'mean of {count} trainings, and a dot for each.'
     )
 
 
-EXPERIMENT = Experiment(__doc__, measure, (layers,), 8.0)
+EXPERIMENT = Experiment(__doc__, measure, (layers,), 24.0)
