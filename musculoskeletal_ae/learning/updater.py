@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of all online learning methods: an updater turns samples into a network.
 
-An updater keeps its network and optimiser between updates. `update.py` implements the method of
-preset `default`, and `paper/online_learning.py` the method of preset `paper`.
+An updater keeps its network and optimiser between updates. Each preset chooses its own updater
+(`Preset.make_updater`).
 """
 
 from __future__ import annotations

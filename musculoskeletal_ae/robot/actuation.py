@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What muscle modules make of their commands: `actuation` of muscles.yaml.
 
-    StiffnessControl   T = T_bias + max(0, K_stiff (l − l_target))          (paper, eq. 5)
+    StiffnessControl   T = T_bias + max(0, K_stiff (l − l_target))   (paper, §III-E, eq. 5)
     PositionControl    l → l_target; T results from the stretch of the series elastic elements
 
 Control, safe stop and detectors get from `Robot.actuation` what differs between them. Neither asks
