@@ -57,7 +57,7 @@ class Healthy(NamedTuple):
     rests: int  # number of distinct rests in the healthy time
     #: half of the recent messages with all joint angles, from motion and rest, for training
     learned: Observations | None = None
-    judging: Observations | None = None  # the other half of these messages, for validation
+    judging: Observations | None = None  # the other half of the recent messages, for validation
 
 
 class Reservoir:

@@ -22,7 +22,7 @@ class TrainingData(NamedTuple):
     """N samples in scaled units, shape (N, D+2M) each."""
 
     entered: Array  # network input, with noisy lengths
-    true: Array  # target output
+    true: Array  # target of the network's output
 
 
 #: share of the friction that remains unknown although the direction of sliding is estimated

@@ -118,8 +118,8 @@ LONGEST_PAUSE = 60.0  # largest value of this pause [s]
 # A process counts as hung if it has not answered within PATIENCE, plus PATIENCE_PER_STEP for each
 # training step. The first answer may take longer, because imports can take minutes on a slow disk.
 PATIENCE_AT_FIRST = 300.0  # time for the first answer, instead of PATIENCE [s]
-PATIENCE = 60.0  # [s]
-PATIENCE_PER_STEP = 0.1  # [s]
+PATIENCE = 60.0  # longest wait for an answer without training steps [s]
+PATIENCE_PER_STEP = 0.1  # additional wait for each training step [s]
 LONGEST_ENDING = 2.0  # longest wait for a killed process to end [s]
 
 

@@ -43,7 +43,7 @@ class Updater(ABC):
         return None
 
     def update(self, job: Job) -> Update:
-        """Run one update. Its duration is bounded, because the number of samples is."""
+        """Run one update. Its duration is bounded, because the number of samples is bounded."""
         start, newest = time.perf_counter(), job.observed[-NEWEST:]
         mae = self._mae.without(job.isolated)
         estimate = observed_theta(mae, newest)

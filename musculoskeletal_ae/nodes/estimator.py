@@ -146,7 +146,7 @@ class Estimator(Shell):
                 'the parameter isolate_muscles names no muscle; set it first'
             )
         wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
-        self.core.reset()  # before isolating, because it restores a suspect
+        self.core.reset()  # called before isolating, because a reset restores a suspect
         answer = self._isolate(wanted)
         self._reset(request)
         return answer

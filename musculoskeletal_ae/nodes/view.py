@@ -273,7 +273,7 @@ class View(Node):
         """Reset anomaly and stop, unless a muscle of the emulated arm is still ruptured."""
         isolated = set(self.robot.names(self._isolated()).split(', '))
         if remaining := [name for name in self.ruptured if name not in isolated]:
-            problem = f'{", ".join(remaining)} would stop the arm again, being ruptured'
+            problem = f'ruptured muscles ({", ".join(remaining)}) would stop the arm again'
             self.page.notify(f'{problem}; press "Mend" first', False)
             return
 

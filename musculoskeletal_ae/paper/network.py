@@ -25,8 +25,8 @@ def new_network(
     """Return a network of D joints and M muscles with random weights.
 
     Args:
-        joints: D.
-        muscles: M.
+        joints: Number of joints D.
+        muscles: Number of muscles M.
         seed: Random seed of the weights.
         hidden: Numbers of units in the encoder's hidden layers; the decoder has the reverse order.
     """

@@ -213,8 +213,8 @@ class MuscleFile(Strict, frozen=True):
         if self.tension_source != 'sensor' and not is_position:
             raise ValueError(
                 f'tension_source {self.tension_source!r} needs actuation: position, and actuation '
-                "is 'stiffness', by which a module regulates tension; publish the tension by which "
-                'it regulates (tension_source: sensor), or set actuation: position'
+                "is 'stiffness'; publish the tension that the modules regulate "
+                '(tension_source: sensor), or set actuation: position'
             )
         self._check_drives()
         foreign = ('stiffness',) if is_position else ('speed', 'release')

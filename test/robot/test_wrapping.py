@@ -50,7 +50,7 @@ def robot(request, tmp_path_factory):
     ('start', 'end', 'expected'),
     [
         ([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], 1.0),  # misses the ball
-        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # just touches it
+        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # just touches the ball
         # straight at the centre: two tangents and an arc
         ([1, 0, 0], [-1, 0, 0], 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))),
     ],
