@@ -55,8 +55,8 @@ SPEED_DEFAULT = 0.1  # speed of a module that follows positions [m/s]
 NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (
     'the tension is unknown, so these are not available: contact estimation, tension control, the '
-    'torque balance, tension and heat limits, and the detection of slack and ruptured tendons by '
-    'tension'
+    'torque balance, the tension limit, the heat limit, and the detection of slack and ruptured '
+    'tendons by tension'
 )
 BY_CURRENT = (
     'tensions are motor currents; their scale, offset and drive friction are learned, and tension '
