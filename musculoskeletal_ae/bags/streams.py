@@ -5,7 +5,7 @@ import heapq
 import math
 from array import array
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, NamedTuple
@@ -110,6 +110,63 @@ class _Stream:
         self.values.append(self.read(content, came))
         self.times.append(came)
 
+    def series(self) -> Series:
+        """Return all values."""
+        return Series(np.array(self.times), np.array(self.values).reshape(-1, *self.shape))
+
+
+class _ArmStreams:
+    """The streams of one arm, and the conversion of its messages.
+
+    Attributes:
+        by_topic: All streams, by the name of the topic in the interface.
+        had_offsets: Whether the length offsets were known, for each message of muscle_states.
+    """
+
+    def __init__(self, robot: Robot, motors: MotorSettings, ignore: Callable[[str], None]) -> None:
+        """Start empty; `ignore` receives the unused parts of messages of joint_states."""
+        self._robot, self._ignore = robot, ignore
+        self._interface = MotorInterface(motors, robot.muscles)
+        self._muscle_stream = MuscleStream(robot)
+        self.had_offsets: list[bool] = []
+        muscles = robot.muscle_count
+        self._isolated = _Stream((muscles,), self._isolated_mask)
+        self._offsets = _Stream((2, muscles), lambda message, _: read_array(message, 2, muscles))
+        self.by_topic = {
+            'joint_states': _Stream((robot.joint_count,), self._posture),
+            'muscle_states': _Stream((3, muscles), self._muscle_states),
+            'muscle_length_command': _Stream((muscles,), self._command),
+            'muscle_tension_command': _Stream((muscles,), self._command),
+            'isolated_muscles': self._isolated,
+            'muscle_length_zeros': self._offsets,
+        }
+
+    def _posture(self, message: Any, _: float) -> Array:
+        joints = self._robot.joints
+        theta = read_posture(message, joints, some=True)
+        for name in joints_not_finite(message, joints):
+            self._ignore(f'position of {name} is not finite')
+        return theta
+
+    def _muscle_states(self, message: Any, came: float) -> Array:
+        stream = self._muscle_stream
+        stream.use_body(_body_at(came, stream.body, self._isolated, self._offsets))
+        sample = stream.take(self._interface.reading(message), came)
+        self.had_offsets.append(stream.body.offsets.known)
+        return np.array([sample.length, sample.tension_read, sample.temperature])
+
+    def _command(self, message: Any, _: float) -> Array:
+        return read_array(message, 1, self._robot.muscle_count)
+
+    def _isolated_mask(self, message: Any, _: float) -> Array:
+        indices = self._robot.muscle_indices(read_names(message))
+        return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
+
+
+#: topics of the body state; they are read first, because the recorder may have received them after
+#: the readings
+BODY_TOPICS = 'isolated_muscles', 'muscle_length_zeros'
+
 
 def read_streams(
     bag: Bag, robot: Robot, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
@@ -131,91 +188,94 @@ def read_streams(
     Raises:
         BagError: If no message of a topic fits the robot, or the bag is damaged.
     """
-    muscles, joints = robot.muscle_count, robot.joints
-    interface = MotorInterface(motors, robot.muscles)
-
-    def isolated_mask(message: Any, _: float) -> Array:
-        indices = robot.muscle_indices(read_names(message))
-        return np.isin(np.arange(muscles), indices).astype(float)
-
-    muscle_stream, has_offsets = MuscleStream(robot), list[bool]()
-
-    def muscle_states(message: Any, came: float) -> Array:
-        muscle_stream.use_body(_body_at(came, muscle_stream.body, isolated, offsets))
-        sample = muscle_stream.take(interface.reading(message), came)
-        has_offsets.append(muscle_stream.body.offsets.known)
-        return np.array([sample.length, sample.tension_read, sample.temperature])
-
-    def posture(message: Any, _: float) -> Array:
-        theta = read_posture(message, joints, some=True)
-        for name in joints_not_finite(message, joints):
-            reception.ignore(labels['joint_states'], f'position of {name} is not finite')
-        return theta
-
-    def rows(count: int) -> Callable[[Any, float], Array]:
-        return lambda message, _: read_array(message, count, muscles)
-
-    isolated, offsets = _Stream((muscles,), isolated_mask), _Stream((2, muscles), rows(2))
-    streams = {
-        'joint_states': _Stream((len(joints),), posture),
-        'muscle_states': _Stream((3, muscles), muscle_states),
-        'muscle_length_command': _Stream((muscles,), rows(1)),
-        'muscle_tension_command': _Stream((muscles,), rows(1)),
-        'isolated_muscles': isolated,
-        'muscle_length_zeros': offsets,
-    }
     recorded = interface_topics(bag, namespace, motors)
-    used = {name: stream for name, stream in streams.items() if name in recorded}
-    # A topic may carry the angles of joints and of motors. Its messages are then counted twice.
-    topics = defaultdict[str, dict[str, _Stream]](dict)
-    labels = dict[str, str]()
-    for name, stream in used.items():
-        is_shared = list(recorded.values()).count(recorded[name]) > 1
-        labels[name] = f'{recorded[name]} as {name}' if is_shared else recorded[name]
-        topics[recorded[name]][labels[name]] = stream
-    start, warnings = bag.start, list[str]()
-    late = _bunched(bag, list(topics))
+    labels = _labels(recorded)
+    warnings = list[str]()
     reception = Reception(warnings.append)
+    arm = _ArmStreams(robot, motors, lambda part: reception.ignore(labels['joint_states'], part))
+    used = {labels[name]: stream for name, stream in arm.by_topic.items() if name in recorded}
+    takers = defaultdict[str, dict[str, Callable[[Any], None]]](dict)
+    for name, stream in arm.by_topic.items():
+        if name in recorded:
+            takers[recorded[name]][labels[name]] = stream.take
+    clock_offsets = _bunched(bag, list(takers))
+    early = [recorded[name] for name in BODY_TOPICS if name in recorded]
+    _deliver(bag, takers, early, clock_offsets, reception)
+    # Messages of motors carry no angles of joints if these have no sensors.
+    optional = f'{recorded.get("joint_states")} as joint_states'
+    _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
+    notes = [
+        f'{topic}: the recorder wrote messages late and in bunches; their publish times are used'
+        for topic in clock_offsets
+    ]
+    joints, states, lengths, tensions, isolated, _ = (
+        stream.series() for stream in arm.by_topic.values()
+    )
+    is_known = np.array(arm.had_offsets, dtype=bool)
+    if not is_known.all():
+        reason = f'{labels["muscle_states"]}: length offsets unknown'
+        reception.rejected[reason] += int((~is_known).sum())
+        states = Series(states.time[is_known], states.values[is_known])
+    series = joints, states, lengths, tensions, isolated
+    return Streams(*series, reception.rejected, reception.ignored, tuple(notes))
+
+
+def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
+    """Return the names under which messages are counted, by topic of the interface.
+
+    A recorded topic may carry the angles of joints and of motors. Its messages are counted twice.
+    """
+    count = Counter(recorded.values())
+    return {
+        name: f'{topic} as {name}' if count[topic] > 1 else topic
+        for name, topic in recorded.items()
+    }
+
+
+def _deliver(
+    bag: Bag,
+    takers: Mapping[str, Mapping[str, Callable[[Any], None]]],
+    early: Sequence[str],
+    clock_offsets: Mapping[str, int],
+    reception: Reception,
+) -> None:
+    """Pass all messages to the takers of their topic, as pairs of time [s] and content.
+
+    Args:
+        bag: The recording.
+        takers: Receivers of the messages by recorded topic and label.
+        early: Topics that are read before the others.
+        clock_offsets: Topics whose publish times are used, and the offsets of the clocks [ns].
+        reception: Rejects and counts messages.
+    """
     receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
-    # The body state is read first, because the recorder may have received it after the readings.
-    early = [recorded[name] for name in ('isolated_muscles', 'muscle_length_zeros') if name in used]
-    for message in chain(bag.messages(early), bag.messages(topics.keys() - early)):
+    for message in chain(bag.messages(early), bag.messages(takers.keys() - early)):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic may have different clocks.
         sender = message.topic, *getattr(decoded, 'name', ())
         if sender not in receive:
             receive[sender] = [
-                reception.of(label, stream.take, lambda: 1)
-                for label, stream in topics[message.topic].items()
+                reception.of(label, take, lambda: 1)
+                for label, take in takers[message.topic].items()
             ]
-        sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         came = message.log_time
-        if message.topic in late:
-            came = message.publish_time + late[message.topic]
+        if message.topic in clock_offsets:
+            came = message.publish_time + clock_offsets[message.topic]
+        sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         for take in receive[sender]:
-            take(((came - start) / 1e9, decoded), sent)
-    for name, stream in used.items():
-        label = labels[name]
+            take(((came - bag.start) / 1e9, decoded), sent)
+
+
+def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:
+    """Raise a BagError if messages of a topic were rejected and none was used.
+
+    `used` are the streams by their labels, `warnings` the first rejection for each reason.
+    """
+    for label, stream in used.items():
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]
-        is_optional = label == f'{recorded[name]} as joint_states'  # motors, but no joint sensors
-        if reasons and not stream.values and not is_optional:
+        if reasons and not stream.values:
             problem = f'no message of {label} fits the robot ({reasons[-1]})'
             raise BagError(bag.path, problem, 'choose the robot that was recorded')
-    joint_states, states, lengths, tensions, isolated_series, _ = (
-        Series(np.array(stream.times), np.array(stream.values).reshape(-1, *stream.shape))
-        for stream in streams.values()
-    )
-    use = np.array(has_offsets, dtype=bool)
-    if not use.all():
-        reason = f'{labels["muscle_states"]}: length offsets unknown'
-        reception.rejected[reason] += int((~use).sum())
-        states = Series(states.time[use], states.values[use])
-    series = joint_states, states, lengths, tensions, isolated_series
-    notes = [
-        f'{topic}: the recorder wrote messages late and in bunches; their publish times are used'
-        for topic in late
-    ]
-    return Streams(*series, reception.rejected, reception.ignored, tuple(notes))
 
 
 def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
