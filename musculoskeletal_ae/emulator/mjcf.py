@@ -497,8 +497,10 @@ def _with_motors(spec: Any, robot: Robot) -> Any:
     spec.option.disableactuator = 0
     plain = mujoco.MjSpec().add_actuator()
     motor = {name: getattr(plain, name) for name in OF_MOTORS}
+    # MuJoCo does not find by name what was renamed after compilation.
+    tendons = {tendon.name: tendon for tendon in spec.tendons}
     for muscle in robot.muscles:
-        spec.tendon(muscle).actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        tendons[muscle].actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         motor |= {'name': muscle, 'target': muscle}
         spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_TENDON, **motor)
     return spec

@@ -332,6 +332,48 @@ def test_a_ball_joint_becomes_the_three_hinges_that_it_is_imported_as(tmp_path):
     np.testing.assert_allclose(lengths, robot.routes.absolute_lengths(theta), atol=1e-9)
 
 
+#: bodies and joints without names, in a file of their own
+PART = """<mujoco><site name="o" pos=".05 0 1"/><site name="o2" pos="-.05 0 1"/>
+  <body pos="0 0 1"><joint axis="0 1 0" range="-60 60"/><geom size=".02" fromto="0 0 0 0 0 -.2"
+    type="capsule"/><site name="i" pos=".03 0 -.1"/><site name="i2" pos="-.03 0 -.1"/>
+    <body pos="0 0 -.2"><joint axis="0 1 0" range="-60 60"/><geom size=".02"/></body></body>
+</mujoco>"""
+WHOLE = """<mujoco><worldbody><include file="part.xml"/></worldbody>
+  <tendon><spatial {first}><site site="o"/><site site="i"/></spatial>
+    <spatial {second}><site site="o2"/><site site="i2"/></spatial></tendon>
+  <actuator>{actuators}</actuator></mujoco>"""
+PULLS = '<motor tendon="a" ctrllimited="true" ctrlrange="-90 0"/>' * 2
+PULLS += '<motor tendon="b" ctrllimited="true" ctrlrange="-70 0"/>'
+
+
+@pytest.mark.parametrize(
+    ('names', 'actuators', 'muscles', 'limit'),
+    [
+        (('', ''), '', ('tendon_0', 'tendon_1'), None),
+        (('name="a"', 'name="b"'), PULLS, ('a', 'b'), [180.0, 70.0]),
+    ],
+    ids=['tendons without names', 'two actuators on a tendon'],
+)
+def test_a_model_without_names_in_several_files_is_imported_and_played(
+    tmp_path, names, actuators, muscles, limit
+):
+    (tmp_path / 'part.xml').write_text(PART, encoding='utf-8')
+    file = tmp_path / 'whole.xml'
+    parts = dict(zip(('first', 'second'), names), actuators=actuators)
+    file.write_text(WHOLE.format(**parts), encoding='utf-8')
+    robot = import_robot(file, tmp_path / 'robot').robot
+    assert robot.joints == ('joint_0', 'joint_1')
+    assert robot.muscles == muscles
+    if limit is not None:
+        np.testing.assert_allclose(robot.tension.limit, limit)
+    arm = make_arm(robot, 0, str(file))
+    assert arm.warnings == ()
+    arm.step(0.1)
+    theta = robot.random_postures(3, np.random.default_rng(0))
+    lengths = arm.individual.absolute_lengths(theta)
+    np.testing.assert_allclose(lengths, robot.routes.absolute_lengths(theta), atol=1e-9)
+
+
 def test_an_unknown_reality_is_refused_with_the_legal_ones(robot):
     with pytest.raises(MusculoskeletalError, match='kin, foreign or an MJCF file'):
         make_arm(robot, 0, 'dream')
