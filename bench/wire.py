@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.processes import cpu, end_processes
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, number, numbers, whole
@@ -240,7 +241,11 @@ class Wire(NamedTuple):
 
 
 def measure(system: System, rate: float, seconds: float) -> Wire:
-    """Measure a system of nodes after its start."""
+    """Measure a system of nodes after its start.
+
+    Raises:
+        MusculoskeletalError: If the nodes exchange no messages.
+    """
     deadline = time.monotonic() + 60.0
     while not system.stamps['muscle_length_command'] and time.monotonic() < deadline:
         time.sleep(0.5)
@@ -257,6 +262,9 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
     states, commands = (
         np.array(system.stamps[name]) for name in ('muscle_states', 'muscle_length_command')
     )
+    if not (len(states) and len(commands)):
+        problem = f'{len(states)} states and {len(commands)} commands arrived in {passed:.0f} s'
+        raise MusculoskeletalError(f'{problem}: the nodes do not run, or the machine is too busy')
     after = np.searchsorted(commands, states)
     known = after < len(commands)
     latency = (commands[after[known]] - states[known]) * 1e-6  # [ms]
