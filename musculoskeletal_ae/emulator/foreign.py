@@ -62,9 +62,21 @@ class ForeignBody:
         mujoco.mj_fwdPosition(self._model, data)
         return data
 
+    def _routed(self, theta: Array) -> Any:
+        """Return data with lengths and moment arms of the tendons at θ [rad] (D,).
+
+        Without contacts, which would take most of the time in some files.
+        """
+        data = self._data
+        data.qpos[self.tree] = self._robot.kinematics.tree.angles(theta)
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_comPos(self._model, data)
+        mujoco.mj_tendon(self._model, data)
+        return data
+
     def absolute_lengths(self, theta: Array) -> Array:
         """Return the lengths of the routes [m] (N, M) for θ (N, D)."""
-        data = (self.set_posture(self._data, row) for row in theta)
+        data = (self._routed(row) for row in theta)
         return np.stack([each.ten_length[self.tendon_ids] for each in data])
 
     def muscle_jacobian(self, theta: Array) -> Array:
@@ -73,7 +85,7 @@ class ForeignBody:
         jacobian = np.empty((len(theta), model.ntendon, model.nv))
         rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
         for dense, angles in zip(jacobian, theta, strict=True):
-            mujoco.mju_sparse2dense(dense, self.set_posture(self._data, angles).ten_J, *rows)
+            mujoco.mju_sparse2dense(dense, self._routed(angles).ten_J, *rows)
         return self._robot.kinematics.tree.of_theta(
             jacobian[:, self.tendon_ids][:, :, self.tree], theta
         )
