@@ -64,7 +64,8 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
 def test_muscle_stiffness_control_without_a_tension_is_refused(tmp_path):
     with pytest.raises(RobotDescriptionError, match='needs actuation: position'):
         Robot.load(write_robot(tmp_path, tension_source='none'))
-    with pytest.raises(RobotDescriptionError, match=r"expected one of none, sensor, got 'weight'"):
+    legal = 'expected one of current, none, sensor'
+    with pytest.raises(RobotDescriptionError, match=f"{legal}, got 'weight'"):
         Robot.load(write_robot(tmp_path, tension_source='weight', actuation='position'))
     robot = Robot.load(write_robot(tmp_path, tension_source='none', actuation='position'))
     assert any('contact estimation' in line for line in robot.description.joint_notes)
@@ -92,7 +93,7 @@ def test_the_arm_reaches_a_target_by_lengths_alone_and_reports_missing_tensions(
     assert np.abs(loop.arm.theta - THETA).max() < 0.15
     assert loop.core.limiter.command.kind == LENGTH
     values = status.report(loop.core, loop._now).values
-    assert 'tension limit' in values['tension'] and 'contact' in values['tension']
+    assert 'heat limits' in values['tension'] and 'contact' in values['tension']
 
 
 def test_no_command_runs_further_ahead_of_a_module_than_its_release(loop):
