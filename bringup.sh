@@ -127,7 +127,10 @@ while [ $# -gt 0 ]; do
     --seed) seed=$2 && shift ;;
     --reality) reality=$2 && shift ;;
     --joint-source) joint_source=$2 && shift ;;
-    --params-file) parameter_files+=("$2") && shift ;;
+    --params-file)
+      [ -f "$2" ] || refuse "--params-file '$2' is no file"
+      parameter_files+=("$2") && shift
+      ;;
     -p)
       [[ $2 =~ ^($nodes):[^:]+:=. ]] ||
         refuse "-p '$2' must be NODE:NAME:=VALUE, where NODE is one of ${nodes//|/, }"
@@ -199,6 +202,7 @@ if [ $hardware = false ] && [ $network = false ]; then
   unset ROS_STATIC_PEERS
 fi
 use_udp
+[ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.parameters "${parameters[@]}" || exit
 
 # A namespace contains one arm. The lock is held until the last process has ended, which takes a
 # moment after Ctrl-C.

@@ -6,6 +6,7 @@ reception is used. A busy computer may delay or lose messages, or block the driv
 also records when this process itself was blocked.
 """
 
+import os
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from musculoskeletal_ae.driver.verdict import Verdict
 RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
 LONGEST_GAP = 0.2  # longest gap between two messages [s]; the controller's `max_age`
 OWN_PAUSE = 0.05  # shorter pauses of this process are ignored [s]
+OVERLOAD = 1.5  # load average per core above which this computer may slow the driver down
 LEAST_LOST = 0.05  # a larger fraction of lost messages is reported
 
 
@@ -73,8 +75,10 @@ class Pace:
             )
         elif gap > LONGEST_GAP:
             verdict.failed('gap', gap=gap)
+            _note_load(verdict)
         elif abs(rate / self._rate - 1.0) > RATE_TOLERANCE:
             verdict.failed('rate', rate=rate, wanted=self._rate)
+            _note_load(verdict)
         else:
             verdict.passed('rate')
 
@@ -87,3 +91,13 @@ class Pace:
         begin, end = ends[longest], ends[longest + 1]
         own = sum(max(0.0, min(end, b) - max(begin, a)) for a, b in self._pauses)
         return bool(own > 0.5 * (end - begin))
+
+
+def _note_load(verdict: Verdict) -> None:
+    """Note that other programs may have slowed the driver down, if this computer is overloaded."""
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load > OVERLOAD * cores:
+        verdict.notes.append(
+            f'this computer is overloaded: {load:.0f} processes wait for its {cores} cores. If the '
+            'driver runs here, end other programs and check its rate again'
+        )

@@ -37,6 +37,7 @@ class Fault(NamedTuple):
     muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver
     observation: str
     change: str  # what to change in the driver
+    name: str  # its name in FAULTS
 
 
 class Verdict:
@@ -70,7 +71,7 @@ class Verdict:
         muscles = muscles or tuple(range(self.robot.muscle_count))
         self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))
-        self.faults.append(Fault(texts.check, muscles, observation, change))
+        self.faults.append(Fault(texts.check, muscles, observation, change, what))
 
     def add(self, other: 'Verdict') -> None:
         """Add the results of another verdict on the same driver."""
@@ -79,6 +80,15 @@ class Verdict:
         self._state[(self._state == OPEN) & (other._state == OK)] = OK
         self.faults += other.faults
         self.notes += other.notes
+
+    @property
+    def allows_motion(self) -> bool:
+        """Whether the motion test is safe: no fault but wrong length zeros or another rate.
+
+        At another rate, all motions are only slower or coarser. A driver that publishes with long
+        gaps has another fault.
+        """
+        return all(fault.check == 'zero' or fault.name == 'rate' for fault in self.faults)
 
     @property
     def wrong(self) -> set[str]:

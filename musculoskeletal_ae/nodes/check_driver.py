@@ -210,11 +210,11 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         _say('fix the driver before moving the arm; still listening')
     if options.move:
         driver.alone()
-        if verdict.wrong - {'zero'}:
-            _say('motion test skipped: fix the faults above first')
-        else:
+        if verdict.allows_motion:
             driver.wind(verdict)
             _say(verdict)
+        else:
+            _say('motion test skipped: fix the faults above first')
     passed, failed = 'the driver keeps its contract', 'driver check FAILED: fix the faults above'
     _say(failed if verdict.faults else passed)
     return 1 if verdict.faults else 0

@@ -10,8 +10,9 @@ This module imports nothing slow, so that `--help` answers quickly.
 """
 
 import json
+import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from itertools import chain
@@ -325,5 +326,19 @@ def _description(parameter: Parameter) -> str:
     return f'{parameter.meaning}; {parameter.legal_values}'.removesuffix('; ')
 
 
+def main(assignments: Sequence[str]) -> int:
+    """Check the names in NODE:NAME:=VALUE, as bringup.sh does, or print `config/nodes.yaml`."""
+    for assignment in assignments:
+        node, name = assignment.partition(':=')[0].split(':', 1)
+        try:
+            check_names([name], node)
+        except MusculoskeletalError as error:
+            print(f'-p {assignment!r}: {error}', file=sys.stderr)
+            return 2
+    if not assignments:
+        print(yaml_text(), end='')
+    return 0
+
+
 if __name__ == '__main__':
-    print(yaml_text(), end='')
+    sys.exit(main(sys.argv[1:]))

@@ -57,6 +57,7 @@ SHORT_ARM = 0.015
 TOLERATED_SHARE = 0.05  # share of postures in which a sign or a direction may be missing
 LEAST_DETOUR = 1e-6  # length added by wrapping below which the value is a rounding error [m]
 LONGEST_ARM = 1.0  # moment arm above which the points are assumed to be in millimetres [m]
+MILLIMETRES = 5.0  # typical moment arm above which all points must be in millimetres [m]
 #: ranges above which joint limits are assumed to be in degrees (revolute, [rad]) or in millimetres
 #: (prismatic, [m])
 WIDEST_RANGES = 4.0 * np.pi, 10.0
@@ -150,6 +151,8 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
     theta = robot.random_postures(postures, np.random.default_rng(seed))
     result = judge(Setting.of(robot, theta))
     arms = result.moment_arms
+    if wrong_unit := tuple(_millimetres(arms)):
+        return replace(result, faults=wrong_unit, warnings=())
     suspicious = (
         *_other_units(robot, arms),
         *_small_joints(robot, arms),
@@ -365,6 +368,13 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             names = {'muscle': robot.muscles[m], 'joint': robot.joints[joint]}
             terms = arm_terms(robot, joint)
             yield _finding('flipping_muscle', **names, against=100 * against, terms=terms)
+
+
+def _millimetres(moment_arms: Array) -> Iterator[Finding]:
+    """Yield a fault if most points are in millimetres, from which all other faults would follow."""
+    typical = float(np.median(np.abs(moment_arms).max(axis=(0, 2))))
+    if typical > MILLIMETRES:
+        yield _finding('other_units, points', arm=typical)
 
 
 def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:

@@ -231,6 +231,8 @@ def test_a_run_is_recorded_and_the_recording_run(environment, tmp_path):
         (['--read-only'], 'requires --view'),
         (['--explore', '--no-controller'], 'exclude each other'),
         (['-p', 'arm:rate:=50.0'], 'hardware_emulator'),
+        (['-p', 'estimator:on_anomly:=stop'], 'nearest: on_anomaly'),
+        (['--params-file', 'no_such_file.yaml'], 'no_such_file.yaml'),
         (['--fly'], '--help'),
         (['--robot'], 'requires an argument'),
     ],

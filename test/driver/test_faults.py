@@ -252,6 +252,7 @@ def test_slow_repeated_and_frozen_messages_are_found():
     slow.period = 0.05
     verdict = slow.listen()
     assert verdict.wrong == {'rate'} and 'came at 20 Hz' in str(verdict)
+    assert verdict.allows_motion
     repeating, rows = Driver(ROBOT), []
     repeating.publish = lambda now: rows.append(now) or rows[len(rows) // 2]
     assert 'repeat the one before' in str(repeating.listen())
@@ -311,6 +312,7 @@ def test_a_gap_in_which_this_computer_was_blocked_is_recognised(is_busy):
         messages.listening.pause(1.05, 1.55)
     verdict = messages.listening.verdict(3.6)
     assert verdict.wrong == (set() if is_busy else {'rate'}), str(verdict)
+    assert verdict.allows_motion == is_busy
     assert ('this computer is busy' if is_busy else 'no message was received for 0.61 s') in str(
         verdict
     )

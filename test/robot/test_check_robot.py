@@ -55,10 +55,12 @@ def in_millimetres(document):
             point['xyz'] = [1e3 * v for v in point['xyz']]
 
 
-def test_routes_in_millimetres_are_suspected(tmp_path, capsys):
-    _, out, _ = verdict(capsys, change(write_robot(tmp_path / 'arm'), in_millimetres))
-    assert "muscle 'bender' has a moment arm of" in out
-    assert 'in metres, not millimetres' in out
+def test_routes_in_millimetres_are_the_only_fault(tmp_path, capsys):
+    """All other findings would follow from the wrong unit, and their remedies would mislead."""
+    directory = change(write_robot(tmp_path / 'arm'), in_millimetres)
+    status, out, _ = verdict(capsys, directory)
+    assert status == 1 and 'in metres, not millimetres' in out
+    assert kinds(directory) == {'other_units'}
 
 
 @pytest.mark.parametrize(
