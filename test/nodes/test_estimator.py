@@ -285,3 +285,18 @@ def test_silence_of_the_driver_is_an_error_also_for_a_node_that_has_just_started
 
     estimator.wait(is_heard, 'the end of the error')
     estimator.wait(lambda: reported('error'), 'the error after the last message')
+
+
+def test_messages_that_keep_coming_too_slowly_are_a_warning(graph, trained_file, healthy):
+    node = graph.host(Estimator, robot='arm26', checkpoint=trained_file, rate=1000.0)
+    muscles = graph.publisher(Float64MultiArray, 'muscle_states')
+    reports = graph.listen(DiagnosticArray, '/diagnostics')
+
+    def is_reported():
+        muscles.publish(healthy)
+        graph.spin(0.02)
+        texts = [status.message for report in reports for status in report.status]
+        return any('Hz instead of 1000 Hz' in text for text in texts)
+
+    graph.wait(is_reported, 'the warning')
+    assert node.report().level == 'ok'
