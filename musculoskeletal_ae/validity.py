@@ -232,22 +232,11 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
         raise MessageError('oversized', problem)
     if not points:
         return None
-    if not names:
-        raise MessageError('empty', 'points, but no joint_names')
-    if unknown := [name for name in names if name not in joints]:
-        raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
-    if len(set(names)) < len(names):
-        raise MessageError('duplicate joint', repr(max(names, key=names.count)))
-    columns: dict[str, Array | None] = {}
-    for what in ('positions', 'velocities', 'accelerations', 'effort'):
-        rows = [getattr(point, what) for point in points]
-        lengths = {len(row) for row in rows}
-        legal = {len(names)} if what == 'positions' else {0, len(names)}
-        if len(lengths) > 1 or not lengths <= legal:
-            problem = f'{what} of {sorted(lengths)} values at the points, for {len(names)} joints'
-            raise MessageError('wrong length', problem)
-        columns[what] = None if 0 in lengths else np.array([list(row) for row in rows], dtype=float)
-    position, velocity, acceleration, effort = columns.values()
+    _check_names(names, joints)
+    position, velocity, acceleration, effort = (
+        _column(points, what, len(names))
+        for what in ('positions', 'velocities', 'accelerations', 'effort')
+    )
     assert position is not None
     if effort is not None:
         raise MessageError('effort', 'a trajectory has positions, velocities, accelerations only')
@@ -257,16 +246,36 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
     time = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     if not (np.diff(time, prepend=-1e-9) > 0.0).all() or time[0] < 0.0:
         raise MessageError('times do not increase', str(time[:20].tolist()))
-    for what, part in (
-        ('position', position), ('velocity', velocity), ('acceleration', acceleration)
-    ):  # fmt: skip
-        if part is not None and not np.isfinite(part).all():
-            point, joint = np.argwhere(~np.isfinite(part))[0]
+    columns = {'position': position, 'velocity': velocity, 'acceleration': acceleration}
+    for what, column in columns.items():
+        if column is not None and not np.isfinite(column).all():
+            point, joint = np.argwhere(~np.isfinite(column))[0]
             raise MessageError('not finite', f'{what} of {names[joint]} at point {point + 1}')
     if velocity is not None and np.abs(velocity[-1]).max() > LAST_VELOCITY:
         raise MessageError('moves at its end', f'last velocities {velocity[-1].tolist()}')
     places = np.array([list(joints).index(name) for name in names])
     return Points(places, time, position, velocity, acceleration)
+
+
+def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:
+    """Check that a trajectory names joints of the robot, each once."""
+    if not names:
+        raise MessageError('empty', 'points, but no joint_names')
+    if unknown := [name for name in names if name not in joints]:
+        raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
+    if len(set(names)) < len(names):
+        raise MessageError('duplicate joint', repr(max(names, key=names.count)))
+
+
+def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:
+    """Return one quantity of all points (K, joint_count); None if no point has it."""
+    rows = [getattr(point, what) for point in points]
+    lengths = {len(row) for row in rows}
+    legal = {joint_count} if what == 'positions' else {0, joint_count}
+    if len(lengths) > 1 or not lengths <= legal:
+        problem = f'{what} of {sorted(lengths)} values at the points, for {joint_count} joints'
+        raise MessageError('wrong length', problem)
+    return None if 0 in lengths else np.array([list(row) for row in rows], dtype=float)
 
 
 def read_twist(message: Any, frame: str) -> Array:
