@@ -269,7 +269,7 @@ wait_for() {
 
 # shellcheck disable=SC2329  # called by the trap
 stop() {
-  local pid deadline=$((SECONDS + 5))
+  local pid patience start=$SECONDS
   local -a pids
   trap '' INT TERM HUP PIPE
   # Do not use name_of: a signal may arrive between the start of a process and its entry there.
@@ -277,9 +277,14 @@ stop() {
   [ ${#pids[@]} -gt 0 ] || return
   say stopping
   kill -TERM "${pids[@]}" 2>/dev/null
-  while kill -0 "${pids[@]}" 2>/dev/null && [ "$SECONDS" -lt "$deadline" ]; do sleep 0.1; done
-  for pid in "${pids[@]}"; do
-    ! kill -KILL "$pid" 2>/dev/null || say "${name_of[$pid]-process $pid} did not stop within 5 s: killed"
+  # Only a recording would lose something, so its process may take longer.
+  for patience in 5 30; do
+    while kill -0 "${pids[@]}" 2>/dev/null && ((SECONDS - start < patience)); do sleep 0.1; done
+    for pid in "${pids[@]}"; do
+      [ "${name_of[$pid]-}" != record ] || [ $patience = 30 ] || continue
+      ! kill -KILL "$pid" 2>/dev/null ||
+        say "${name_of[$pid]-process $pid} did not stop within $patience s: killed"
+    done
   done
   wait
 }
