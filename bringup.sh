@@ -192,6 +192,12 @@ if [ $is_installed = true ]; then
     fail 'Source the workspace in which musculoskeletal_ae is installed, and its virtual environment.'
   log_folder=${ROS_LOG_DIR:-${ROS_HOME:-$HOME/.ros}/log}
   mkdir -p "$log_folder" || exit 1
+  setup_log=$log_folder/setup.log
+  if [ -w "$package" ]; then # otherwise each node compiles into the cache of its user
+    mkdir -p "$package/__pycache__"
+    (flock 9 && compile_package "$package" "$package/__pycache__/.compiled") \
+      9>"$package/__pycache__/.lock" || exit 1
+  fi
 else
   environment_setup
 fi

@@ -64,9 +64,9 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        # `ros2 run musculoskeletal_ae bringup.sh`; the other file has functions that it uses.
+        # `ros2 run musculoskeletal_ae bringup.sh`; the other files belong to it.
         (f'lib/{NAME}', ['bringup.sh']),
-        (f'share/{NAME}/.ci', ['.ci/environment.sh']),
+        (f'share/{NAME}/.ci', ['.ci/environment.sh', '.ci/compile.py']),
         *bag_files(),
         *config_files(),
     ],

@@ -165,15 +165,15 @@ build_package() {
 
 # Compiles all numba functions, so that nodes need not compile when they start. Numba's cache does
 # not notice changes of functions from other files, so any change recompiles everything.
-compile_package() {
-  local stamp=build/.compiled
-  if [ -e $stamp ] && [ -z "$(find musculoskeletal_ae -name '*.py' -newer $stamp \
+compile_package() { # PACKAGE STAMP
+  local package=$1 stamp=$2
+  if [ -e "$stamp" ] && [ -z "$(find "$package" -name '*.py' -newer "$stamp" \
     -exec grep -l njit {} +)" ]; then return; fi
-  find musculoskeletal_ae -name '*.nb[ci]' -delete
+  find "$package" -name '*.nb[ci]' -delete
   step 'compiling with numba (half a minute, the first time)' \
-    env PYTHONPATH="$repository${PYTHONPATH:+:$PYTHONPATH}" "$python" .ci/compile.py ||
+    env PYTHONPATH="${package%/*}${PYTHONPATH:+:$PYTHONPATH}" "$python" "$repository/.ci/compile.py" ||
     fail 'The package could not be compiled.'
-  touch $stamp
+  touch "$stamp"
 }
 
 # --- all of it -----------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ environment_setup() { # [test]
     venv_is_complete || make_venv
     install_requirements "${requirements[@]}"
     build_package
-    compile_package
+    compile_package "$repository/musculoskeletal_ae" build/.compiled
   ) 9>"$repository/log/setup.lock" || exit 1
   trap - INT
 
