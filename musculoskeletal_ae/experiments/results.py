@@ -291,9 +291,9 @@ def readme_table(results: Results) -> str:
         return '\n\nNothing measured yet: `experiment all --readme doc/results.md`.\n\n'
     about = next(iter(results.values()))['about']
     text = (
-        f'\n\n{about["robot"]}, emulated {individuals(about["seeds"])}, '
-        f'{about["minutes"]:g} minutes of exploration. {NOTHING} means that the paper gives no '
-        'number, or that there is nothing to compare. The reference of an estimate is least '
+        f'\n\n{about["robot"]}, means over emulated individuals, {about["minutes"]:g} minutes of '
+        f'exploration. {NOTHING} means that the paper gives no number, or that there is nothing to '
+        'compare. The reference of an estimate is least '
         'squares with the true routes and elastic constants. The reference of control is the '
         'least ‖T‖ with which the true body can hold the posture in which the arm came to rest. '
         'The reference of the simulator is a simulation of the true body without friction.\n\n'
@@ -301,7 +301,8 @@ def readme_table(results: Results) -> str:
         '|---|---|---|---|---|---|'
     )
     for name in filter(ROWS.get, results):
-        text += f'\n| **`experiment {name}`** | | | | | |'
+        whom = individuals(results[name]['about']['seeds'])
+        text += f'\n| **`experiment {name}`**, {whom} | | | | | |'
         for each in table({name: results[name]}):
             text += f'\n| {each.quantity} | {each.published} | {each.paper} | **{each.default}** | '
             text += f'{each.bound} | {", ".join(filter(None, each[-2:]))} |'
