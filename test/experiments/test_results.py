@@ -112,7 +112,7 @@ def learns(_study, _seed):
     ('learning', 'measuring', 'told'),
     [
         (learns, fails, 'InfeasibleError in body_change: no tension at all'),
-        (learns, not_finite, 'MusculoskeletalError in body_change: a result of an experiment is'),
+        (learns, not_finite, 'MusculoskeletalError in body_change: the result error_rad is nan'),
         (fails, learns, 'InfeasibleError in online_learning: no tension at all'),
     ],
 )
