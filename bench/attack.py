@@ -245,10 +245,14 @@ def evaluate(attack: 'Attack') -> list[Row]:
         Row('no command changes faster than allowed', count, fast),
         Row('tension above 1.1 × limit lasts 0.5 s at most', len(true), tense),
         Row('a stopped arm is not wound in', len(stops), wound),
-        Row('no status OK while wrong for 2 s', tried['status'], take('status OK while wrong', [])),
+        Row(
+            'no status is OK for 2 s while something is wrong',
+            tried['status'],
+            take('status OK while wrong', []),
+        ),
         Row('the advised steps recover the arm', tried['attacks'], take('the advice helps', [])),
-        Row('samples survive', tried['kills'], take('samples survive', [])),
-        Row('memory stays', len(attack.processes), fat),
+        Row('no sample is lost', tried['kills'], take('samples survive', [])),
+        Row('memory does not grow', len(attack.processes), fat),
         Row(
             'the arm moves again afterwards',
             tried['attacks'] + tried['events'],

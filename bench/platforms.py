@@ -158,7 +158,9 @@ def _sourced(site: Site) -> None:
         ).stdout.strip()
     )  # fmt: skip
     if base == Path('/usr'):
-        raise MusculoskeletalError('a copy of Python is needed, and /usr cannot be copied: pyenv')
+        raise MusculoskeletalError(
+            'Python 3.12 is in /usr, which cannot be copied; install it with pyenv'
+        )
     packages = 'lib/python3.12/site-packages'
     system_python = system / 'bin' / 'python3.12'
     site.run(

@@ -203,7 +203,10 @@ def soft_neck(files: Files) -> Recording:
 
 def soft_arm(files: Files) -> Recording:
     """Read the control runs of the soft arm: motors [rad], currents [mA], IMU, 50 per second."""
-    spool, distance = 0.0093, 0.0382  # radius of the spool, and distance of the tendons [m]
+    spool, distance = (
+        0.0093,
+        0.0382,
+    )  # radius of the spool, and distance of the tendons from the axis [m]
     runs = []
     for name in files.names(r'graphs/Control/.*/Masa_f?\d+/.*\.csv'):
         rows = [line.split(',') for line in files.text(name).split('\n')]

@@ -71,5 +71,8 @@ def main(argv: list[str]) -> int:
                 failures += 1
                 print(f'{name}, {number.name} after {moment:.2f} s: status {status}\n{output}')
     print('\n'.join(f'{end} × {count}' for end, count in sorted(ends.items())))
-    print(f'{early} before the package; longest end {longest:.1f} s; {failures} failures')
+    print(
+        f'{early} signals came before the package was loaded; the slowest process took '
+        f'{longest:.1f} s to end; {failures} failures'
+    )
     return 1 if failures else 0

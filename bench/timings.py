@@ -254,7 +254,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
 
     network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
     there = [
-        Row(f'the same, each of {n} on {device}', step(arms(n, device=device)), None, n)
+        Row(f'simulation step, each of {n} arms on {device}', step(arms(n, device=device)), None, n)
         for n in (MANY, 16 * MANY)
         if device is not None
     ]

@@ -84,7 +84,7 @@ def _value_at(value: Any, steps: list[dict[str, str | None]]) -> Any:
 
 
 def _legal_words(kind: Any, steps: list[dict[str, str | None]]) -> list[str]:
-    """Return the legal keys or words at a place of a format."""
+    """Return the legal keys or words at the place in a type to which the path `steps` leads."""
     types = [inspect.type_info(kind)]
     for step in [*steps, None]:
         # Replace a union such as `X | None` by its members.

@@ -29,8 +29,8 @@ LONGEST_WAIT = 20.0  # [s]
 TENSION_UNIT = 100.0  # [N] per unknown, so that all are of one size
 FLEXED, FLEXION = 'elbow_pitch', np.radians(-90.0)
 FORCED, FORCED_TO = 'shoulder_pitch', np.radians(30.0)
-#: motion of a joint of the body above which its direction and size are compared
-NOTICEABLE = 0.05  # [rad]
+#: motion of a joint of the nominal body above which it is compared with that of the simulator [rad]
+NOTICEABLE = 0.05
 
 
 def random_commands(robot: Robot, count: int, seed: int) -> Array:

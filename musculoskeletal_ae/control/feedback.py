@@ -51,7 +51,7 @@ class RestFeedback:
     friction no longer retains tension in it. A tendon that was paid out is not paid out further,
     because friction already supports the arm there.
 
-    Modules that follow positions do not hold T_bias. For them K_stiff is the stiffness of the
+    Position-controlled modules do not hold T_bias. For them K_stiff is the stiffness of the
     series elastic element, T may be below T_bias, and R is larger: a slack tendon is wound in.
 
     Attributes:

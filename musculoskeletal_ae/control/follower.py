@@ -16,7 +16,7 @@ dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/d
 drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This is
 T_low. λ is measured while the arm moves (`winches`).
 
-Modules that follow positions resist no motion beyond their lag λ; l_comp and K_stiff λ dl/dt are 0.
+Position-controlled modules resist no motion beyond their lag λ; l_comp and K_stiff λ dl/dt are 0.
 
 A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
 (`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the

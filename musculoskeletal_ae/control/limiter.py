@@ -10,15 +10,16 @@ limits its commanded length:
     dr/dt = RELIEF (T − T_limit)/K_stiff,   0 ≤ r ≤ −l_comp(T_limit)
 
 No module is commanded to exert more than T_limit, whatever a plan, a feedback, a wrong network or
-contact demands. While a muscle is measured to wind in, its module lags by λ dl/dt (`winches`). The
-motor then takes K_stiff λ dl/dt of the demand to turn, and the tendon does not bear this part. The
-lead ends with the motion, or as soon as the measured tension is above the limit.
+contact demands. While a muscle winds in (dl/dt < 0), its motor lags behind the command (`winches`).
+A part λ K_stiff |dl/dt| of the demanded tension then only turns the motor, and does not reach the
+tendon. Therefore the command may lead the length by λ |dl/dt|. This lead ends when the muscle stops
+winding in, or as soon as the measured tension is above the limit.
 
 If the measured tension exceeds the limit nevertheless, for example because K_stiff or a sensor is
 wrong, the feedback r pays the muscle out further. A muscle whose measured tension is above
 `tension.limit` is paid out faster than the rate limit. No muscle is wound in faster.
 
-Modules that follow positions turn a command into tension by stretching the series elastic elements:
+Position-controlled modules turn a command into tension by stretching the series elastic elements:
 
     l_target ≥ l − SHARE (L_e(T_limit) − L_e(T′)) + r        while T ≤ T_limit, T′ = T + AHEAD dT/dt
     l_target ≥ l + L_e(T) − L_e(T_limit) + r = l_exceeded    above it

@@ -270,7 +270,10 @@ def stiffness_command(
 def _approach(
     model: StiffnessModel, programme: TensionProgramme, tension: Array, desired: Array
 ) -> Array:
-    """Return tensions near the desired stiffness, by Gauss–Newton on the constrained entries."""
+    """Return tensions whose joint stiffness is close to `desired`, by Gauss–Newton iterations.
+
+    Only joints with `desired` > 0 count.
+    """
     chosen, start = desired > 0.0, tension
     for _ in range(ITERATIONS if chosen.any() else 0):
         slope = model.slope(tension)[chosen]

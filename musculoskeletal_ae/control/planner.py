@@ -132,9 +132,10 @@ class Planner:
         held, problem = reach.nearest_held(robot, mae, start, theta)
         if not problem:
             return theta, ''
-        isolated = robot.names(robot.isolated)
+        isolated, verb = robot.names(robot.isolated), 'are' if len(robot.isolated) > 1 else 'is'
         problem = (
-            f'{problem} without {isolated}; nearest holdable posture: {robot.posture_text(held)}'
+            f'{problem}, because {isolated} {verb} isolated; nearest holdable posture: '
+            f'{robot.posture_text(held)}'
         )
         if not nearest:
             raise MessageError('not holdable', problem)

@@ -92,7 +92,10 @@ class Trajectory:
 
     @classmethod
     def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
-        """Return the trajectory through points that started `passed` [s] ago.
+        """Return the trajectory from `start` through the points that are still ahead.
+
+        `passed` is the time [s] since the times of the points began to count. Earlier points are
+        dropped.
 
         A single point at time 0 is reached as fast as possible.
 

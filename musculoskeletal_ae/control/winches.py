@@ -20,7 +20,7 @@ class Winches:
 
         l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
 
-    Modules that follow positions have K_stiff = ∞, and the equation always holds for them. The fit
+    Position-controlled modules have K_stiff = ∞, and the equation always holds for them. The fit
     is by least squares over all muscles whose speed exceeds WINDING.
     """
 

@@ -241,7 +241,7 @@ class Listening:
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
         """Check T and temperature in `states` (3, M) of modules without commands."""
         bias = self._robot.tension.bias
-        # Of modules that follow positions, T is what the posture gives.
+        # Of position-controlled modules, T is what the posture gives.
         bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
         for unit, newtons in TENSION_UNITS.items():
             if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():
@@ -253,7 +253,7 @@ class Listening:
         if np.nanmax(states[2], initial=-math.inf) > HOTTEST_AT_REST:
             hottest = np.nanmax(states[2])
             verdict.notes.append(
-                f'a module at rest has {hottest:.0f} °C: check that the unit is °C, not °F'
+                f'a module at rest reports {hottest:.0f} °C: check that the unit is °C, not °F'
             )
 
     def _judge_lengths_and_joints(
@@ -324,7 +324,7 @@ class Listening:
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)
-        # A hand moves the joints, but modules that follow positions hold their lengths.
+        # A hand moves the joints, but position-controlled modules hold their lengths.
         least = robot.actuation.choose(MOVED, math.inf)
         moved: Bools = np.ptp(model, axis=0) > least
 

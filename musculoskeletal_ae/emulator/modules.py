@@ -7,7 +7,7 @@
     heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
 
 In MSC and motor control, l and T are the readings of the module's own sensors. `muscles.yaml` says
-whether the modules follow MSC or positions (`actuation`). A module that follows positions holds its
+whether the modules follow MSC or positions (`actuation`). A position-controlled module holds its
 length while it gets no commands, and gives way to more than T_max.
 """
 
@@ -34,7 +34,7 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # These values are chosen; those of Musashi are not public.
 RELEASE_RATE = 100.0  # [N/s] at which a module in the safe state approaches T_bias
 MOTOR_GAIN = 0.004  # [m/s/N]
-POSITION_LAG = 0.02  # [s] time constant of a module that follows positions
+POSITION_LAG = 0.02  # [s] time constant of a position-controlled module
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
 AMBIENT = 25.0  # [°C]
@@ -72,7 +72,7 @@ class Modules(NamedTuple):
     length_low: Array  # limits of l that the motor can wind to [m]
     length_high: Array
     stiffness: Array  # K of muscle stiffness control [N/m]
-    follows_position: Array  # 1 for modules that follow positions
+    follows_position: Array  # 1 for position-controlled modules
     speed: Array  # largest speed [m/s]
     tension_bias: Array  # [N]
     tension_max: Array

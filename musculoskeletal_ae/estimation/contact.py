@@ -69,7 +69,7 @@ class LowPass:
         self._rate: Array = np.zeros(0)
 
     def reset(self) -> None:
-        """Restart the filter at rest at the next input."""
+        """Reset the filter. It starts from the value of the next input, with derivatives of 0."""
         self._value = None
 
     def step(self, value: Array, dt: float) -> tuple[Array, Array, Array]:

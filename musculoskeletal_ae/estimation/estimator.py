@@ -96,7 +96,7 @@ class Estimator:
             start of a length calibration until its first estimate.
         measured: θ from joint sensors [rad], (D,), at the last message with an estimate; None
             unless all joint sensors reported a value.
-        stepped_at: Time of the last message that was estimated, on the steady clock [s].
+        stepped_at: Time of the last message with an estimate, on the steady clock [s].
     """
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:

@@ -39,7 +39,10 @@ class HealthyTorque:
         self._square, self._time = np.zeros_like(self._radian), 0.0
 
     def use(self, mae: Mae) -> Mae:
-        """Use another network; return it with σ if it has a calibrated body model."""
+        """Use another network, and return it.
+
+        If it has a calibrated body model, the returned copy contains the measured σ.
+        """
         if (known := mae.touch) is None:
             self._mae = mae
         else:

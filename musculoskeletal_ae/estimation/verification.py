@@ -7,7 +7,7 @@ muscle stiffness control demands, and with the length l' estimated from the othe
 
     T_ref = T_bias + K (l − l_target)
 
-Modules that follow positions do not regulate tension. Their T_ref is the tension of the series
+Position-controlled modules do not regulate tension. Their T_ref is the tension of the series
 elastic element if the suspect is stretched further than before the verification:
 
     L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T)
@@ -135,7 +135,7 @@ class ModuleLaw:
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return the stretch x [m]; used by modules that follow positions only."""
+        """Return the stretch x [m]; used by position-controlled modules only."""
         return row.likely - row.length
 
     def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
@@ -144,7 +144,7 @@ class ModuleLaw:
 
 
 class PositionLaw(ModuleLaw):
-    """T_ref of one module that follows positions, by the stretch of its series elastic element."""
+    """T_ref of one position-controlled module, by the stretch of its series elastic element."""
 
     def __init__(self, bias: float, elongation: Callable[[float], float]) -> None:
         """Describe a module with T_bias [N] and the function L_e(T) [m] of T [N]."""

@@ -48,9 +48,10 @@ def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> flo
 
 
 def without_elongation(robot: Robot, tension: Array, length: Array) -> Array:
-    """Return the length without the model's elongation, l + L_e(l_abs, T) [m].
+    """Return the length if the series elastic element were not stretched, l + L_e(l_abs, T) [m].
 
-    L_e needs the absolute length, for which a first evaluation of L_e corrects the measured length.
+    The stretch shortens the measured l, so L_e is added. L_e is evaluated twice: at the measured
+    length, and at the length that the first result corrects.
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)

@@ -146,7 +146,7 @@ def record(
     Every command is that of `first`. `second` needs the current tension, which a fixed list cannot
     contain; the least tension that holds the posture on the geometric model replaces it. While a
     muscle is switched off, all modules follow tensions: 0 N for this muscle, and the tensions of
-    MSC for the others. A module that follows positions is paid out instead.
+    MSC for the others. A position-controlled module is paid out instead.
 
     Args:
         arm: The arm.

@@ -313,11 +313,12 @@ class _Reader:
             if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
                 driven[int(m.actuator_trnid[a][0])].append(self._strength(a))
             else:
-                source.note('dropped', f'actuator {self.names["actuator"][a]}: on no tendon')
+                name = self.names['actuator'][a]
+                source.note('dropped', f'actuator {name}: it does not act on a tendon')
         for t in range(m.ntendon):
             name, first = self.names['tendon'][t], m.tendon_adr[t]
             if m.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT:
-                source.note('dropped', f'tendon {name}: a fixed one, which has no route')
+                source.note('dropped', f'tendon {name}: it is fixed, so that it has no route')
             elif driven and t not in driven:
                 source.note('dropped', f'tendon {name}: no actuator pulls it')
             else:

@@ -43,8 +43,9 @@ def estimate_covariance(
     two parts. One comes from the error of the joint-sensor offset, which validation messages do not
     show because they contain the same offset. If there are at least MANY_MESSAGES validation
     messages, the other part is scaled by the ratio between their actual errors and errors drawn at
-    their postures. Most of these postures are near the samples. With fewer messages, the covariance
-    is multiplied by UNVALIDATED_FACTOR.
+    the postures of these messages. Most of these postures are near the samples, so that errors
+    there are smaller than at random postures. With fewer messages, the covariance is multiplied by
+    UNVALIDATED_FACTOR.
 
     Args:
         mae: The network.

@@ -176,7 +176,7 @@ class SampleStore:
         return [each for each in stored if each.number in numbers]
 
     def put_back(self, stored: Iterable[StoredSample]) -> None:
-        """Insert samples that were taken out at their original positions."""
+        """Reinsert samples that `take_out` removed, at their original positions."""
         for each in stored:
             place = bisect(self.numbers, each.number)
             self.samples.insert(place, each.sample)

@@ -144,7 +144,7 @@ class Controller(Shell):
             kind: publisher.get_subscription_count()
             for kind, publisher in self.publishers_of.items()
         }
-        # Modules that follow positions need no tension commands, because the limiter turns tensions
+        # Position-controlled modules need no tension commands, because the limiter turns tensions
         # into lengths.
         by_tension = value in BY_TENSION and self.robot.actuation.follows_tensions
         if by_tension and followed[LENGTH] and not followed[TENSION]:

@@ -211,7 +211,9 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     motors = motor_settings(options.params_file)
     names = select(bag, options.topics, options.from_namespace, options.keep_names, motors)
     if options.loop and not options.clock:
-        problem = 'without --clock and use_sim_time nodes do not notice that time jumps back'
+        problem = (
+            'nodes do not notice that time jumps back; add --clock, and set use_sim_time in them'
+        )
         print(f'warning: --loop: {problem}', file=sys.stderr)
     with STOP.reacting(Reaction.REMEMBER):
         start_ros(arguments)

@@ -102,7 +102,7 @@ def torque_term(weight: float, jacobian: Array, tension_rows: Array, torque: Arr
 
 
 def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_STEP) -> Array:
-    """Return G(θ, T) [m/rad] (..., M, D), the difference of ① between θ and θ + Δθ."""
+    """Return G(θ, T) [m/rad] (..., M, D), the forward difference quotient of l = ①(θ, T)."""
     joints = theta.shape[-1]
     offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])
     postures = theta[..., None, :] + offsets  # (..., D+1, D)

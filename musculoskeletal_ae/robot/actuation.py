@@ -31,10 +31,10 @@ DESIRED_SHARE = 0.3  # tension of a well-tensed arm, as a share of T_limit
 #: largest relief of needless tension by modules under stiffness control [m]; covers length errors
 #: and the tension that friction retains in a tendon
 RELIEF = 0.01
-#: the same of modules that follow positions [m]; covers errors of a network that has not learned
+#: the same of position-controlled modules [m]; covers errors of a network that has not learned
 #: the arm yet, which such modules turn into slack or into tension
 SLACK = 0.03
-#: share of the stretch that remains up to T_limit that a command to a module that follows positions
+#: share of the stretch that remains up to T_limit that a command to a position-controlled module
 #: may use; the rest covers errors of L_e and the age of T
 SHARE = 0.7
 #: time for which a rise of the tension is extrapolated [s]: the age of T, and the lag of the module
@@ -331,7 +331,7 @@ class StiffnessControl(Actuation):
 
 
 class PositionControl(Actuation):
-    """Modules that follow positions, and keep no tension by themselves."""
+    """Position-controlled modules, and keep no tension by themselves."""
 
     follows_tensions = False
     largest_relief = SLACK

@@ -183,7 +183,7 @@ def judge(setting: Setting) -> RobotCheck:
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
-    # Modules that follow positions also hold a muscle at T_bias, so that it counts as taut.
+    # Position-controlled modules also hold a muscle at T_bias, so that it counts as taut.
     is_taut = tension[held] > robot.actuation.kept_tension + SLACK_MARGIN
     taut = np.where(is_taut, k, 0.0)
     full, sided = (

@@ -50,7 +50,7 @@ LEAST_EIGENVALUE = -1e-9
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
 STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
-SPEED_DEFAULT = 0.1  # speed of a module that follows positions [m/s]
+SPEED_DEFAULT = 0.1  # speed of a position-controlled module [m/s]
 #: scale of a motor current in `with_modules` [N/A]: 0.03 N·m/A, a gear of 20 and a spool of 10 mm
 NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (
@@ -133,12 +133,12 @@ class RobotDescription:
     muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
     routes: tuple[Route, ...]  # one route for each muscle
     series_elastic: SeriesElastic
-    #: K_stiff of muscle stiffness control [N/m], (M,); infinite for modules that follow positions
+    #: K_stiff of muscle stiffness control [N/m], (M,); infinite for position-controlled modules
     stiffness: Array
     tension: TensionRange
     actuation: str  # STIFFNESS or POSITION of `robot.actuation`
     tension_source: TensionSource
-    speed: Array  # speed of modules that follow positions [m/s], (M,); infinite for others
+    speed: Array  # speed of position-controlled modules [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,)
     release: Array
     end_effectors: tuple[str, ...]  # names of links; `end_effector` is the first of them

@@ -20,7 +20,7 @@ LEAST_COMPLIANCE = 1e-7  # smallest plausible ∂L_e/∂T of an elastic element 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:
     """Return k [N/m] of MSC (K_stiff [N/m]) and elastic element (∂L_e/∂T [m/N]) in series.
 
-    K_stiff of a module that follows positions is infinite.
+    K_stiff of a position-controlled module is infinite.
     """
     return 1.0 / (1.0 / module + np.maximum(compliance, LEAST_COMPLIANCE))
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
 
-#: the module has a tension sensor; it measures its motor current; it measures neither
+#: what a module measures: its tension (with a sensor), its motor current, or neither
 SENSOR, CURRENT, NONE = 'sensor', 'current', 'none'
 
 

@@ -3,7 +3,7 @@
 
     l = f_decode,l(①(θ, T_end)),  T_end = T e^{−μ s}            learned body and tendon friction
     T = T_bias + max(0, K_stiff (l − l_target)),  T ≤ T_max     muscle stiffness control (MSC)
-    l = l_target,  0 ≤ T ≤ T_max                                modules that follow positions
+    l = l_target,  0 ≤ T ≤ T_max                                position-controlled modules
     B θ̇ = −(g(θ) + K θ − b − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
 The paper descends on a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and
@@ -40,7 +40,7 @@ from musculoskeletal_ae.simulation.load import Load, Tree, hold
 #: l_target of muscles without a command [m]; MSC then holds T_bias, and modules that follow
 #: positions hold their length
 PAID_OUT = np.inf
-#: K_stiff of modules that follow positions [N/m]; 400 N move such a module by a millimetre
+#: K_stiff of position-controlled modules [N/m]; 400 N move such a module by a millimetre
 RIGID = 4e5
 #: B divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on the emulated arm;
 #: values from 8 to 20 do equally well.
@@ -71,7 +71,7 @@ class Body(NamedTuple):
     """Constants of muscles (M,) and joints (D,) for the compiled code."""
 
     stiffness: Array  # K_stiff [N/m]
-    bias: Array  # T at l = l_target [N]: T_bias, or 0 for modules that follow positions
+    bias: Array  # T at l = l_target [N]: T_bias, or 0 for position-controlled modules
     most: Array  # T_max [N]
     span: Array  # distance of l_target below l at which T reaches T_max [m]
     loose: Array  # distance of l_target above l beyond which T no longer changes [m]
@@ -419,7 +419,7 @@ class QuasiStatics:
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
         """Return the arms h [s] later; `SimulatedBody.step` describes the arguments."""
-        # Without a command, modules that follow positions hold theirs.
+        # Without a command, position-controlled modules hold their last position.
         held = self._robot.actuation.choose(command, state.followed)
         command = np.where(np.isfinite(command), command, held)
         passed = np.exp(-self.body.friction * state.slid)

@@ -129,7 +129,9 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench.theta = THERE
     bench.step()
     name = ROBOT.muscles[LOST]
-    with pytest.raises(MessageError, match=f'lack .* N·m at .* without {name}; nearest'):
+    with pytest.raises(
+        MessageError, match=f'lack .* N·m at .*, because {name} is isolated; nearest'
+    ):
         bench.target(NOT_THERE)
     assert bench.core.target_state.theta is None
     bench.configure(unreachable='nearest')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Modules that follow positions: limits, stops and methods without tension control."""
+"""Position-controlled modules: limits, stops and methods without tension control."""
 
 from dataclasses import replace
 

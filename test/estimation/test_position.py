@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of modules that follow positions: a rupture is detected, slack is not reported."""
+"""Faults of position-controlled modules: a rupture is detected, slack is not reported."""
 
 import numpy as np
 import pytest

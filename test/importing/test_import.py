@@ -47,8 +47,8 @@ def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
     assert len(result.robot.routes.wrapping) == 4
     assert result.robot.description.couplings['curl'].ratio == pytest.approx(0.5)
     assert result.robot.tension.limit[0] == pytest.approx(180.0)
-    assert 'dropped: tendon none: a fixed one, which has no route' in result.notes
-    assert 'dropped: actuator not: on no tendon' in result.notes
+    assert 'dropped: tendon none: it is fixed, so that it has no route' in result.notes
+    assert 'dropped: actuator not: it does not act on a tendon' in result.notes
 
 
 CURVE = '0.1 0.5 0.1 -0.05 0.02'

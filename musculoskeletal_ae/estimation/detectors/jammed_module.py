@@ -3,7 +3,7 @@
 
     |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
 
-A module that follows positions has no T_ref. It is jammed if it does not move although its length
+A position-controlled module has no T_ref. It is jammed if it does not move although its length
 differs from l_target and it does not pull with its largest tension:
 
     |l − l_target| > BEHIND, T < T_max and |Δl| < STANDS for JAM_TIME
@@ -75,7 +75,7 @@ class JammedModule(Detector):
 
 
 class JammedPosition(JammedModule):
-    """Does the same for modules that follow positions."""
+    """Does the same for position-controlled modules."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
         """Return which modules have not reached their command, (M,); None without a command."""

@@ -7,7 +7,7 @@ The rule needs no statistics, because a healthy module maintains at least T_bias
 time to wind in slack. The detector waits while the winch moves at `slack_speed` or faster, until it
 has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count.
 
-A module that follows positions maintains no tension, and a tendon may be slack because its command
+A position-controlled module maintains no tension, and a tendon may be slack because its command
 is long. The rule then looks for a tendon that is stretched, but has no tension:
 
     T < slack_share · T_bias for DEAD_TIME, and x and x − x₀ > STRETCH · L_e(T_bias)
@@ -126,7 +126,7 @@ class SlackTendon(Detector):
 
 
 class StretchedTendon(SlackTendon):
-    """Measures how long each tendon of modules that follow positions has been stretched, but slack.
+    """Measures how long each tendon of position-controlled modules has been stretched, but slack.
 
     Such modules do not wind in slack by themselves, so `is_winding_in` stays False.
     """
