@@ -312,7 +312,7 @@ train_once() {
   )
   checkpoint=$cache/$(basename "$(realpath "$robot_directory")")-$preset-$hash.safetensors
   if [ -s "$checkpoint" ]; then
-    say "checkpoint from an earlier run: $checkpoint"
+    say "initial network from an earlier run (without what was learned since): $checkpoint"
     return
   fi
   [ -t 1 ] || export TQDM_MININTERVAL=5 # fewer lines of a progress bar in a file

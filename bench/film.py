@@ -6,7 +6,7 @@
 It runs `./bringup.sh --view` with `on_anomaly: isolate` and takes screenshots of the page:
 
 1. The arm explores and learns; the estimate converges to the measured arm.
-2. A click on the button "Cut" ruptures the muscle that is selected on the page.
+2. A click on the button "Rupture" ruptures the muscle that is selected on the page.
 3. The estimator isolates the muscle, and the arm moves on.
 
 All data in the film come over ROS topics from the nodes of a real run. Needs Chromium and about
@@ -78,7 +78,7 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
         browser.close_notifications()
         take(options.learning, EVERY)
         kept = {'view.png': len(frames) - 1}
-        browser.click(*browser.centre('Cut'))
+        browser.click(*browser.centre('Rupture'))
         if not take(PATIENCE, EVERY_LATER, until=lambda text: 'ANOMALY' in text):
             raise AssertionError(f'no anomaly was detected within {PATIENCE:g} s')
         kept['view_rupture.png'] = len(frames) - 1

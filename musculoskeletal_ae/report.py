@@ -2,9 +2,12 @@
 """Status reports for /diagnostics and for people, and numbers as readable text."""
 
 import math
+import os
 from typing import Literal, NamedTuple
 
 MOST_DIGITS = 17  # significant digits that identify a double
+#: key in /diagnostics of what a component waits for, and its value during an anomaly
+WAITS_FOR, ANOMALY = 'waits for', 'anomaly'
 Level = Literal['ok', 'warn', 'error']
 
 
@@ -14,6 +17,16 @@ class Report(NamedTuple):
     level: Level
     message: str
     values: dict[str, str]
+
+
+def load_text() -> str:
+    """Return the load of this computer in the last minute, such as "5 on 2 cores"."""
+    return f'{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores'
+
+
+def is_overloaded() -> bool:
+    """Return whether at least twice as many processes want to run as there are cores."""
+    return os.getloadavg()[0] >= 2.0 * (os.cpu_count() or 1)
 
 
 def whole(value: float, unit: str = '') -> str:

@@ -148,6 +148,9 @@ class Exploring(ActivityControl):
         self._steps = self._theta = None
 
     @property
-    def new_target(self) -> Array | None:
-        """The posture to which the arm moves; it is held after the exploration."""
+    def theta(self) -> Array | None:
+        """The posture to which the arm moves [rad], (D,); None before the first one.
+
+        It is no target of a user. Joints that a later target does not name keep their angles.
+        """
         return self._theta

@@ -30,8 +30,14 @@ class Step(Enum):
         'check the named sensor, or call estimator/zero if lengths are off',
     )
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
-    CHECK_DRIVER = 'check_driver', 'check that the driver is running'
-    CHECK_ESTIMATOR = 'check_estimator', 'check that the estimator is running'
+    CHECK_DRIVER = (
+        'check_driver',
+        'check that the driver is running and the computer not overloaded',
+    )
+    CHECK_ESTIMATOR = (
+        'check_estimator',
+        'check that the estimator is running and the computer not overloaded',
+    )
     STOP_SECOND_PUBLISHER = (
         'stop_second_publisher',
         'stop the node that does not belong to this arm',

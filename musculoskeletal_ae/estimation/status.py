@@ -76,6 +76,8 @@ def _suspects(core: Estimator) -> dict[str, str]:
     if core.body.isolated:
         values['isolated muscles'] = core.robot.names(core.body.isolated)
     values['finding'] = 'none' if suspects.finding is None else suspects.finding.kind.value
+    if suspects.finding is not None:
+        values['evidence'] = suspects.finding.evidence
     values['verification'] = 'none' if suspects.verification is None else 'running'
     if suspects.last_verdict is not None:
         values['last verified'] = suspects.last_verification

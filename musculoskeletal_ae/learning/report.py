@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
 from musculoskeletal_ae.learning.trainer import Update
-from musculoskeletal_ae.report import Level, Report
+from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, Report
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ LONGEST_IDLE = 5.0  # time without a usable message after which the status is a 
 def learner_report(learner: Learner) -> Report:
     """Return the status of a learner."""
     level: Level = 'warn'
+    waits_for = {}
     if trouble := learner.trouble:
         level, message = 'error', trouble
     elif learner.checkpoint is None:
@@ -31,11 +32,12 @@ def learner_report(learner: Learner) -> Report:
         message = 'checking new length offsets against muscle_states'
     elif learner.collector.is_anomaly:
         message = 'stopped by an anomaly; call estimator/reset to resume'
+        waits_for = {WAITS_FOR: ANOMALY}
     elif (idle_time := learner.idle_time) > LONGEST_IDLE:
         message = f'no usable data for {idle_time:.0f} s: {learner.collector.obstacle}'
     else:
         level, message = 'ok', 'learning'
-    return Report(level, message, {**_values(learner), 'state': message})
+    return Report(level, message, {**_values(learner), 'state': message, **waits_for})
 
 
 def _values(learner: Learner) -> dict[str, str]:

@@ -22,6 +22,8 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.report import Report
 
+SETTLING = 4.0  # [s] after the first estimate, during which troubles of the start are not shown
+
 
 class BringupStatus(Shell):
     """Prints the estimation error, A, and the numbers of samples and checkpoints."""
@@ -74,14 +76,19 @@ class BringupStatus(Shell):
                 )
             return
         self.started = self.started or now
+        # At first, reports of the nodes are still those of the time before the first messages.
+        if now - self.started >= SETTLING or not self.situation.trouble():
+            self._print_line(now - self.started)
+        if 0.0 < self.duration <= now - self.started:
+            raise ExternalShutdownException
+
+    def _print_line(self, running_time: float) -> None:
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
         unit = self.robot.kinematics.distance_unit
         situation = self.situation
         known = figures(self.theta is not None, means[0], means[1], unit)
         self.errors, self.anomalies = [], []
-        line = f'{now - self.started:6.0f} s  {known}'
+        line = f'{running_time:6.0f} s  {known}'
         line += f'  samples {situation.samples or 0}  checkpoints {situation.checkpoints or 0}'
         more = situation.trouble() or situation.hint()
         print(printable(f'{line}  {more}'.rstrip()), flush=True)
-        if 0.0 < self.duration <= now - self.started:
-            raise ExternalShutdownException

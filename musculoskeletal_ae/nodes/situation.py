@@ -8,6 +8,7 @@ reporting. Decisions compare identifiers only, such as the controller's values `
 
 import contextlib
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from musculoskeletal_ae.control.remedy import REPAIR, Step
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
-from musculoskeletal_ae.report import Level
+from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level
 
 LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
 #: time without a report after which a node counts as silent [s]; nodes report once a second
@@ -89,6 +90,7 @@ class Situation:
     Attributes:
         detected: Whether the estimator has detected an anomaly.
         suspect: Name of the muscle that the estimator suspects most, or ''.
+        evidence: Why the estimator has detected an anomaly, or ''.
         distance: Distance d of the anomaly detector; NaN if unknown.
         limit: Value of d above which a message is an anomaly; NaN if unknown.
         samples: Number of samples learned, or '' without a learner.
@@ -101,7 +103,8 @@ class Situation:
         self._clock = clock
         self._here = namespace.rstrip('/')
         self.detected = False
-        self.samples = self.checkpoints = self.suspect = self.doing = ''
+        self.samples = self.checkpoints = self.doing = ''
+        self.suspect = self.evidence = ''
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._has_explored = False  # whether the arm explored before the last stop
@@ -147,6 +150,7 @@ class Situation:
     def _take_estimator(self, values: dict[str, str]) -> None:
         self.detected = values.get('finding', 'none') != 'none'
         self.suspect = values.get('suspect muscle', '')
+        self.evidence = values.get('evidence', '')
         self.distance = self.limit = math.nan
         with contextlib.suppress(ValueError):
             self.distance = float(values.get('d', 'nan'))
@@ -208,6 +212,8 @@ class Situation:
             control = self._values('controller')
             is_stopped = control.get('stop cause') == StopCause.SECOND_PUBLISHER.identifier
             return is_stopped and node.values[SEVERAL] in control.get('stop', '')
+        if node.values.get(WAITS_FOR) == ANOMALY:
+            return self.detected
         if name == f'{self._here}/controller':
             return node.values.get('mode') in (STOPPED, VERIFYING)
         if name == f'{self._here}/estimator':
@@ -219,18 +225,21 @@ class Situation:
         """Return the parts of the status line about an anomaly and a stop."""
         control = self._values('controller')
         mode, cause = control.get('mode'), control.get('stop cause')
-        is_verifying = mode == VERIFYING
-        is_stopped_by_anomaly = (
-            mode in (STOPPED, VERIFYING) and cause == StopCause.ANOMALY.identifier
+        # The estimator may report a verification before the controller does.
+        is_verifying = (
+            mode == VERIFYING or self._values('estimator').get('verification') == 'running'
         )
+        is_stopped = mode in (STOPPED, VERIFYING)
+        is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
+        evidence = f': {self.evidence}' if self.evidence else ''
         troubles = []
         if self.detected and is_verifying:
-            troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified'))
+            troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified{evidence}'))
         elif self.detected and is_stopped_by_anomaly:
-            troubles.append(Trouble(f'ANOMALY: {self.suspect}'))
+            troubles.append(Trouble(f'ANOMALY: {self.suspect}{evidence}'))
         elif self.detected:
-            troubles.append(_with_remedy(f'ANOMALY: {self.suspect}', *REPAIR))
-        if mode == STOPPED or (is_verifying and not is_stopped_by_anomaly):
+            troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *REPAIR))
+        if is_stopped and not (is_verifying and is_stopped_by_anomaly):
             text, steps = (
                 control.get('remedy', ''),
                 remedy.parse(control.get(remedy.REMEDY_STEPS, '')),
@@ -259,9 +268,17 @@ class Situation:
         }
 
     def _silent(self) -> list[str]:
+        silent = self.silent_nodes()
+        if len(silent) > 1:  # one cause is more likely than several nodes that end together
+            load = f'{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores'
+            names = ', '.join(silent)
+            return [
+                f'{names}: no report for {max(silent.values()):.0f} s: is the computer overloaded '
+                f'(load {load})? Otherwise see their logs, then restart them'
+            ]
         return [
             f'{name}: no report for {silence:.0f} s; see its log, then restart it'
-            for name, silence in self.silent_nodes().items()
+            for name, silence in silent.items()
         ]
 
     def _body(self) -> list[Trouble]:

@@ -35,7 +35,7 @@ from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
+from musculoskeletal_ae.nodes.situation import EXPLORING, LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -141,6 +141,7 @@ class View(Node):
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
             ('isolated', String, 'isolated_muscles', LATCHED, read_names),
+            ('mode', String, 'controller_mode', LATCHED, lambda m: m.data),
             ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
         ]  # fmt: skip
 
@@ -274,7 +275,7 @@ class View(Node):
         isolated = set(self.robot.names(self._isolated()).split(', '))
         if remaining := [name for name in self.ruptured if name not in isolated]:
             problem = f'ruptured muscles ({", ".join(remaining)}) would stop the arm again'
-            self.page.notify(f'{problem}; press "Mend" first', False)
+            self.page.notify(f'{problem}; press "Repair" first', False)
             return
 
         def go_on(answer: Any) -> None:
@@ -299,7 +300,7 @@ class View(Node):
         running = {node for node, name in SIGNS.items() if self.clients_of[name].service_is_ready()}
         if any(push.get_subscription_count() for push in self.pushes):
             running.add('pushed')
-        self.page.offer(running)
+        self.page.offer(running, self._newest('mode', math.inf) in EXPLORING)
         self._ask(GET, self._on_emulator_state, quiet=True, names=['ruptured_muscles', 'payload'])
 
     def _on_emulator_state(self, answer: Any) -> None:
@@ -348,9 +349,9 @@ class View(Node):
                 wrench.wrench.force = Vector3(**dict(zip('xyz', value.tolist())))
                 for publisher in self.pushes:
                     publisher.publish(wrench)
-            case 'cut' | 'mend':
+            case 'rupture' | 'repair':
                 others = [name for name in self.ruptured if name != value]
-                self.ruptured = [*others, value] if what == 'cut' else others
+                self.ruptured = [*others, value] if what == 'rupture' else others
                 self._do('ruptured_muscles', self.ruptured or [''])
             case 'ruptured_muscles' | 'payload' | 'position':
                 parameter = Parameter(what, value=value).to_parameter_msg()
@@ -358,8 +359,12 @@ class View(Node):
                 self._ask(service, parameters=[parameter])
             case 'reset':
                 self._reset()
+            case 'controller/explore':
+                self._ask(what, data=True)
+            case 'end exploring':
+                self._ask('controller/explore', data=False)
             case _:
-                self._ask(what, None, **({'data': True} if SERVICES[what] is SetBool else {}))
+                self._ask(what)
 
 
 def _parse(arguments: list[str]) -> Namespace:

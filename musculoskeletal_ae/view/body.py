@@ -25,7 +25,7 @@ from musculoskeletal_ae.robot.routes import ARC
 
 LARGEST_MESH = 50_000_000  # [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-POSTURES = 20  # random postures that have to fit into the picture
+POSTURES = 50  # random postures of either kind that have to fit into the picture
 DASHES = 5  # tubes per straight segment of a muscle; healthy muscles show no gaps
 #: red, green, blue at T_bias and at T_limit
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
@@ -124,17 +124,17 @@ def _capsules(robot: Robot) -> list[Solid]:
     return solids
 
 
-def space(robot: Robot, solids: list[Solid]) -> tuple[Array, float, float]:
-    """Return centre [m] and radius [m] of a sphere that contains the arm, and its lowest z [m].
+def space(robot: Robot, solids: list[Solid]) -> Array:
+    """Return points [m], (N, 3), between which the arm moves.
 
-    The sphere contains the drawn solids and muscles in the middle posture and in random postures.
+    They are corners of the drawn solids and points of the muscles, in random postures within the
+    joint limits, of which half have every joint at a limit.
     """
-    middle = 0.5 * (robot.lower + robot.upper)
-    spread = 0.25 * (robot.upper - robot.lower)
     rng = np.random.default_rng(0)
-    others = middle + spread * rng.uniform(-1.0, 1.0, (POSTURES, robot.joint_count))
+    shares = rng.uniform(0.0, 1.0, (2 * POSTURES, robot.joint_count))
+    shares[POSTURES:] = shares[POSTURES:].round()
     kin, points = robot.kinematics, []
-    for theta in [middle, *others]:
+    for theta in robot.lower + shares * (robot.upper - robot.lower):
         points.append(robot.routes.points(theta[None])[0])
         places = kin.tree.transforms(theta[None])[0]
         for joint, mesh in solids:
@@ -144,9 +144,32 @@ def space(robot: Robot, solids: list[Solid]) -> tuple[Array, float, float]:
         for link in robot.description.end_effectors:
             joint, tip = kin.placement(link)
             points.append((places[joint] @ tip.homogeneous)[None, :3, 3])
-    every = np.concatenate(points)
-    centre = 0.5 * (every.min(axis=0) + every.max(axis=0))
-    return centre, float(np.linalg.norm(every - centre, axis=1).max()), float(every[:, 2].min())
+    return np.concatenate(points)
+
+
+def viewpoint(points: Array, direction: Array, half: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the target and the position of the closest camera that sees all points.
+
+    A point at depth s in front of the camera is visible if its distances from the optical axis are
+    at most s times `half`.
+
+    Args:
+        points: The points [m], (N, 3).
+        direction: Unit vector from the target to the camera, (3,); not vertical.
+        half: Tangents of the visible half-angles, sideways and upwards.
+    """
+    side = np.cross([0.0, 0.0, 1.0], direction)
+    side /= np.linalg.norm(side)
+    near = points @ direction
+    target, distance = np.zeros(3), 0.0
+    for axis, tangent in zip((side, np.cross(direction, side)), half):
+        # |p·axis − centre| ≤ tangent (distance − near): the two tightest bounds meet at the centre.
+        high = float((points @ axis + tangent * near).max())
+        low = float((-points @ axis + tangent * near).max())
+        target += 0.5 * (high - low) * axis
+        distance = max(distance, 0.5 * (high + low) / tangent)
+    depth = 0.5 * float(near.min() + near.max())
+    return target + depth * direction, target + distance * direction
 
 
 def grid_cell(reach: float) -> float:

@@ -3,8 +3,8 @@
 
 Requests of visitors call `act` in viser's threads, with the name of the request and its value:
 
-    targets {joint: rad} · hand xyz [m] · reset · push xyz [N] · cut name · mend name · payload kg
-    position s · or the name of a service without a value
+    targets {joint: rad} · hand xyz [m] · reset · push xyz [N] · rupture name · repair name
+    payload kg · position s · end exploring · or the name of a service without a value
 """
 
 import contextlib
@@ -27,15 +27,18 @@ from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, Kind
-from musculoskeletal_ae.view.readings import ARMS, HTML, History, Readings
+from musculoskeletal_ae.view.readings import ARMS, HTML, LEFT_PANEL, History, Readings
 from musculoskeletal_ae.view.visits import checked_visits
 
 NARROW = 900  # [pixels] width below which two panels would hide the arm
 CAMERA_FOV = 0.8  # [rad] vertical field of view
-#: half-angle that is visible between the panels of a window of 1280 × 800 pixels
-VISIBLE = math.atan(0.7 * math.tan(0.5 * CAMERA_FOV))
+FILLED = 0.95  # share of the visible width and height that the arm may fill
 VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
-EXPLORE, RESET, RESTORE, MEND = 'Explore', 'Reset after a stop', 'Restore isolated muscles', 'Mend'
+RIGHT_PANEL = 330  # [pixels] width
+WINDOW = 1280, 800  # [pixels] width and height for which the initial camera is placed
+EXPLORE, END_EXPLORING = 'Explore', 'End exploring'
+RESET, RESTORE = 'Reset after a stop', 'Restore isolated muscles'
+RUPTURE, REPAIR = 'Rupture', 'Repair'
 CALIBRATE = 'Find the length offsets'
 #: phrases in remedies of stops, and the button for each; longer phrases first
 BUTTONS = {
@@ -102,7 +105,6 @@ class Page:
         self._build_scene()
         self._build_panels()
         self._controls: dict[str, Any] = {}  # by node; shown while it runs
-        self._restore: Any = None
         if not read_only:
             self._build_controls()
         self.offer(())
@@ -110,7 +112,12 @@ class Page:
         server.on_client_disconnect(self._on_disconnect)
 
     def _on_connect(self, client: viser.ClientHandle) -> None:
-        is_narrow = client.camera.image_width < NARROW
+        camera = client.camera
+        is_narrow = camera.image_width < NARROW
+        window = camera.image_width, camera.image_height
+        look_at, position = self._viewpoint(*window, is_narrow)
+        # In this order, because the position moves the target along.
+        camera.position, camera.look_at = position, look_at
         self._readings[client.client_id] = Readings(client.gui, self._robot, is_narrow)
         self._count(client.client_id, True)
 
@@ -136,7 +143,9 @@ class Page:
         robot, scene, kin = self._robot, self._server.scene, self._robot.kinematics
         solids, self.notes = body.link_solids(robot)
         middle = 0.5 * (robot.lower + robot.upper)
-        centre, reach, bottom = body.space(robot, solids)
+        self._space = body.space(robot, solids)
+        size = self._space.max(axis=0) - self._space.min(axis=0)
+        reach = 0.5 * float(np.linalg.norm(size))
         self._arms: dict[str, list[Any]] = {}  # root frame, then joint frames
         for arm, colour in ARMS.items():
             frames = self._arms[arm] = [scene.add_frame(f'/{arm}', show_axes=False, visible=False)]
@@ -165,29 +174,41 @@ class Page:
         self._owner = body.pieces(robot).repeat(body.DASHES)
         own = [np.flatnonzero(self._owner == m) for m in range(robot.muscle_count)]
         self._middles = [each[len(each) // 2] for each in own]
-        floor = (*centre[:2], bottom - 0.1 * reach)
-        size = 8.0 * reach
-        scene.add_grid('/floor', size, size, position=floor, cell_size=body.grid_cell(reach))
+        look_at, position = self._viewpoint(*WINDOW, False)
+        floor, width = (*look_at[:2], self._space[:, 2].min() - 0.1 * reach), 8.0 * reach
+        scene.add_grid('/floor', width, width, position=floor, cell_size=body.grid_cell(reach))
         # Lights that do not tint colours.
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_ambient('/light', intensity=1.5)
         scene.add_light_directional('/lamp', intensity=1.0, position=(2.0, -1.0, 3.0))
         camera = self._server.initial_camera
-        camera.look_at, camera.fov = centre, CAMERA_FOV
-        distance = reach / math.sin(VISIBLE)
-        camera.position = centre + distance * VIEW_DIRECTION
+        camera.look_at, camera.position, camera.fov = look_at, position, CAMERA_FOV
+        distance = float(np.linalg.norm(position - look_at))
         camera.near, camera.far = 0.01 * distance, 100.0 * distance
         self._reach = reach
+
+    def _viewpoint(self, width: int, height: int, is_narrow: bool) -> tuple[Array, Array]:
+        """Return the target and the position [m] of a camera that sees the whole arm.
+
+        Args:
+            width: Width of the visitor's window [pixels].
+            height: Its height [pixels].
+            is_narrow: Whether there is no panel on the left.
+        """
+        free = width - RIGHT_PANEL - (0 if is_narrow else LEFT_PANEL)
+        up = math.tan(0.5 * CAMERA_FOV)
+        side = up * max(free, 1) / max(height, 1)
+        return body.viewpoint(self._space, VIEW_DIRECTION, (FILLED * side, FILLED * up))
 
     def _build_panels(self) -> None:
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 114, 178))
         gui.set_panel_label('musculoskeletal_ae')
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(330)
-        with gui.add_folder('Show'):
-            self._names = gui.add_checkbox('names of muscles', False)
+        gui.main_panel.set_width(RIGHT_PANEL)
+        with gui.add_folder('Show', order=50.0):
+            self._names = gui.add_checkbox('muscle names', False)
             self._names.on_update(lambda _: self._mark())
             self._wanted = {arm: gui.add_checkbox(f'{arm} arm', True) for arm in ARMS}
 
@@ -290,14 +311,16 @@ class Page:
         def connect(register: Any, what: str, value: Any = None) -> None:
             def on_event(event: Any) -> None:
                 if event.client is not None:  # None: `follow` has set the control
-                    if what in ('targets', 'hand', 'reset', 'controller/explore'):
-                        self._targeted = what in ('targets', 'hand')
+                    if what in ('targets', 'hand'):
+                        self._targeted = True
                     self._act(what, *[value(event)] if value else [])
 
             register(on_event)
 
-        def button(label: str, what: str, value: Any = None, color: Any = None) -> None:
-            connect(gui.add_button(label, color=color).on_click, what, value)
+        def button(label: str, what: str, value: Any = None, color: Any = None) -> Any:
+            made = gui.add_button(label, color=color)
+            connect(made.on_click, what, value)
+            return made
 
         def slider(label: str, low: float, high: float, step: float, what: str, value: Any) -> Any:
             made = gui.add_slider(label, low, high, step, min(max(0.0, low), high))
@@ -309,12 +332,12 @@ class Page:
 
         with gui.add_folder('Arm') as arm:
             button('Stop', 'controller/stop', color='red')
-            button(EXPLORE, 'controller/explore')
-            button(RESET, 'reset')
-            button(CALIBRATE, 'estimator/zero')
-            self._restore = gui.add_button(RESTORE, visible=False)
-            connect(self._restore.on_click, 'estimator/restore')
-            gizmo = gui.add_checkbox('move the hand with the mouse', False)
+            self._explore = button(EXPLORE, 'controller/explore')
+            self._end_exploring = button(END_EXPLORING, 'end exploring')
+            button(RESET, 'reset', color='gray')
+            button(CALIBRATE, 'estimator/zero', color='gray')
+            self._restore = button(RESTORE, 'estimator/restore')
+            gizmo = gui.add_checkbox('drag the hand', False, hint='by arrows at the hand')
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
             # Steps of at most a hundredth of the range keep the ends near the limits.
             spans = np.minimum(robot.upper - robot.lower, 100.0)
@@ -328,8 +351,8 @@ class Page:
         with gui.add_folder('Faults of the emulated arm') as faults:
             self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on a muscle')
             self._muscle.on_update(lambda event: self._pick(chosen(event)))
-            button('Cut', 'cut', lambda _: self._muscle.value, 'orange')
-            button(MEND, 'mend', lambda _: self._muscle.value)
+            button(RUPTURE, 'rupture', lambda _: self._muscle.value, 'orange')
+            button(REPAIR, 'repair', lambda _: self._muscle.value, 'gray')
             self._payload = slider('payload [kg]', 0.0, MOST_PAYLOAD, 0.1, 'payload', chosen)
         with gui.add_folder('Recording') as recording:
             self._timeline = slider('at [s]', 0.0, 1.0, 0.1, 'position', chosen)
@@ -348,14 +371,21 @@ class Page:
         self._controls = {'controller': arm, 'hardware_emulator': faults, 'replay': recording}
         self._controls['pushed'] = self._ball
 
-    def offer(self, nodes: Iterable[str]) -> None:
-        """Show the controls of the running nodes only."""
+    def offer(self, nodes: Iterable[str], explores: bool = False) -> None:
+        """Show the controls of the running nodes only.
+
+        Args:
+            nodes: Names of the running nodes.
+            explores: Whether the controller explores.
+        """
         for node, handle in self._controls.items():
             handle.visible = node in nodes
         if self._controls and 'controller' not in nodes:
             self._gizmo.visible = False
-        if self._restore is not None:
+        if self._controls:
             self._restore.visible = bool((self._kinds == Kind.ISOLATED).any())
+            self._explore.visible, self._end_exploring.visible = not explores, explores
+            self._targeted = self._targeted and not explores
 
     def follow(self, payload: float, played: Sequence[float] | None) -> None:
         """Update the controls; sliders show the estimate until a visitor sets a target."""

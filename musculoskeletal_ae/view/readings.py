@@ -14,6 +14,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 
+LEFT_PANEL = 350  # [pixels] width
 ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
 HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # its macros
@@ -21,7 +22,16 @@ DURATION = 60.0  # [s] length of the curves
 GAP = 1.0  # [s] without a value after which a curve restarts
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
-HEIGHT = 104  # [pixels] of a plot
+HEIGHT = 84  # [pixels] of a plot
+TIME_AXIS = {'incrs': [0.25 * DURATION], 'space': 30, 'size': 26}
+#: uPlot takes the smallest distance of ticks of at least `space` pixels: half of any `scale_top`.
+#: The axes never change, because viser's charts lose the time axis when they do.
+VALUE_AXIS = {
+    'incrs': [step * 10.0**power for power in range(-6, 7) for step in (0.5, 1.0, 2.5)],
+    'space': 18,
+    'size': 56,
+}
+AXES = TIME_AXIS, VALUE_AXIS
 
 
 class Curve(NamedTuple):
@@ -101,7 +111,7 @@ class Readings:
             self._bars = gui.add_html('')
             self._add_legend(gui)
         panel.dock_left()
-        panel.set_width(350)
+        panel.set_width(LEFT_PANEL)
 
     @staticmethod
     def _add_legend(gui: Any) -> None:
@@ -113,7 +123,7 @@ class Readings:
             empty = (np.zeros(0),) * (1 + len(curve.lines))
             plot = gui.add_uplot(
                 empty, ({}, *curve.lines), title=curve.title, height=HEIGHT,
-                scales=_scales(1.0), axes=_axes(1.0), padding=(8, 8, 0, 0), **look,
+                scales=_scales(1.0), axes=AXES, padding=(8, 8, 0, 0), **look,
             )  # fmt: skip
             self._plots.append((curve, plot))
             self._tops.append(1.0)
@@ -126,15 +136,10 @@ class Readings:
             top = scale_top(1.05 * max(float(line.max(initial=0.0)) for line in data[1:]))
             if top != self._tops[number]:
                 self._tops[number] = top
-                plot.scales, plot.axes = _scales(top), _axes(top)
+                plot.scales = _scales(top)
             plot.data = data
 
 
 def _scales(top: float) -> dict[str, Any]:
     x = {'time': False, 'auto': False, 'range': (-DURATION, 0.0)}
     return {'x': x, 'y': {'auto': False, 'range': (0.0, top)}}
-
-
-def _axes(top: float) -> tuple[Any, ...]:
-    """Return axes with ticks at 0, at half of the range and at its end."""
-    return {'size': 30, 'space': 40}, {'incrs': [0.5 * top], 'space': 8, 'size': 56}

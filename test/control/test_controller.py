@@ -229,7 +229,7 @@ def test_exploration_started_again_continues_its_stream_of_postures():
         bench.core.explore(True)
         bench.core.explore(True)  # a second request does not restart the exploration
         bench.step(5)
-        observed.append(bench.core.target_state.theta)
+        observed.append(bench.core.activities.exploring.theta)
         bench.core.explore(False)
         bench.step(5)
     assert len({tuple(theta) for theta in observed}) == 3
@@ -241,7 +241,7 @@ def test_the_preset_decides_whether_exploration_takes_joints_to_their_limits(pre
     for _ in range(30):
         bench.core.explore(True)
         bench.step(2)
-        theta = bench.core.target_state.theta
+        theta = bench.core.activities.exploring.theta
         at_limit |= bool(((theta == ROBOT.lower) | (theta == ROBOT.upper)).any())
         bench.core.explore(False)
     assert at_limit == sends
@@ -254,6 +254,18 @@ def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
     bench.step()
     bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
     np.testing.assert_allclose(bench.core.target_state.theta, [0.1, REST[1]])
+
+
+def test_a_target_of_one_joint_ends_exploring_and_leaves_the_others_where_they_are():
+    bench = Bench()
+    for ends in (lambda: None, lambda: bench.core.explore(False), bench.stop):
+        bench.core.explore(True)
+        bench.step(5)
+        assert (bench.core.activities.exploring.theta != bench.theta).any()
+        ends()
+        bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
+        np.testing.assert_allclose(bench.core.target_state.theta, [0.1, REST[1]])
+        bench.core.reset(bench.now)
 
 
 def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
@@ -302,7 +314,8 @@ def test_a_stop_is_reported_with_every_cause_that_refuses_the_reset():
     assert reported.values['stop cause'] == 'operator_stop'
     assert 'also several publishers: two estimators; also muscle_states' in reported.message
     remedy = reported.values['remedy']
-    assert 'check that the driver is running; check that the estimator is running' in remedy
+    assert 'check that the driver is running' in remedy
+    assert 'check that the estimator is running' in remedy
     assert remedy.endswith('call controller/reset')
     assert bench.core.reset(bench.now).cause.identifier == 'second_publisher'
 

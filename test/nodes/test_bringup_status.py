@@ -122,6 +122,34 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     assert situation.trouble() == ''
 
 
+def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_else():
+    situation = Situation('/left')
+    suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps', 'evidence': 'no tension'}
+    situation.diagnosed(diagnostics('/left/estimator', **suspect, verification='running'))
+    stopped_learner = 'stopped by an anomaly', DiagnosticStatus.WARN
+    situation.diagnosed(diagnostics('/left/learner', *stopped_learner, waits_for='anomaly'))
+    verifying = 'ANOMALY: biceps is being verified: no tension'
+    assert situation.trouble() == verifying  # before the controller reports it
+    situation.diagnosed(stopped(StopCause.ANOMALY))
+    assert situation.trouble() == verifying
+    situation.diagnosed(diagnostics('/left/estimator', **suspect, verification='none'))
+    assert situation.trouble().startswith('ANOMALY: biceps: no tension, STOPPED: ')
+    assert 'learner' not in situation.trouble()
+
+
+def test_several_silent_nodes_are_put_down_to_the_computer():
+    now = 100.0
+    situation = Situation('/left', lambda: now)
+    for node in ('sim', 'learner'):
+        situation.diagnosed(diagnostics(f'/left/{node}'))
+    for _ in range(4):
+        now += 1.0
+        situation.tick()
+    assert situation.trouble().startswith(
+        '/left/sim, /left/learner: no report for 4 s: is the computer overloaded (load '
+    )
+
+
 def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
     situation = Situation('/left')
     situation.diagnosed(

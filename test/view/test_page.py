@@ -81,9 +81,9 @@ def test_readings_and_controls_leave_room_for_the_arm(arm26, tmp_path, size):
         browser._wait(page.looked_at.is_set, 'the visitor')
         for now in range(3):
             page.draw({'estimated': np.array([0.0, -1.0])}, states[0], np.array([2, *[0] * 5]))
-            page.offer(['controller'])
+            page.offer(['controller'], explores=True)
             page.tell(['error 0.1'], 'STOPPED: why', states, now, (0.1, np.nan, np.nan, np.nan))
-        for text in ('STOPPED: why', 'Explore', 'Restore isolated muscles', '30 N', 'A: '):
+        for text in ('STOPPED: why', 'End exploring', 'Restore isolated muscles', '30 N', 'A: '):
             browser.wait_for(text)
         width = browser.evaluate('document.querySelector("canvas").getBoundingClientRect().width')
         assert width > 0.45 * size[0]
@@ -95,22 +95,30 @@ def test_readings_and_controls_leave_room_for_the_arm(arm26, tmp_path, size):
 
 
 @pytest.mark.parametrize('robot', ['arm26', 'musashi_left_arm', 'musashi_upper_body', 'slider'])
-def test_the_camera_sees_the_whole_arm_with_its_hand(robot, tmp_path):
+@pytest.mark.parametrize(('width', 'height'), [(1280, 800), (1920, 1080), (800, 800)])
+def test_the_camera_sees_the_whole_arm_in_every_posture(robot, width, height, tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True) if robot == 'slider' else robot)
     page = Page(robot, '127.0.0.1', free_port(), True, lambda *_: None)
     try:
-        camera = page._server.initial_camera
-        eye, ahead = np.array(camera.position), np.array(camera.look_at) - camera.position
-        middle = 0.5 * (robot.lower + robot.upper)
-        visible = [*robot.routes.points(middle[None])[0]]
-        visible += [
-            robot.kinematics.link_pose(middle, link).translation
-            for link in robot.description.end_effectors
-        ]
+        is_narrow = width < 900
+        target, eye = page._viewpoint(width, height, is_narrow)
+        shares = np.random.default_rng(1).uniform(0.0, 1.0, (20, robot.joint_count))
+        visible = []
+        for theta in robot.lower + shares * (robot.upper - robot.lower):
+            visible += [*robot.routes.points(theta[None])[0]]
+            visible += [
+                robot.kinematics.link_pose(theta, link).translation
+                for link in robot.description.end_effectors
+            ]
+        ahead = (target - eye) / np.linalg.norm(target - eye)
+        side = np.cross(ahead, [0.0, 0.0, 1.0])
+        side /= np.linalg.norm(side)
         to = np.array(visible) - eye
-        cosine = to @ ahead / (np.linalg.norm(to, axis=1) * np.linalg.norm(ahead))
-        # Half of the height is 0.4 rad; panels leave less than that of the width.
-        assert np.arccos(cosine).max() < math.atan(0.7 * math.tan(0.4))
+        # Half of the height is 0.4 rad; the panels cover 330 or 680 pixels of the width.
+        free = width - (330 if is_narrow else 680)
+        up = np.abs(to @ np.cross(side, ahead)) / (to @ ahead)
+        assert up.max() < math.tan(0.4)
+        assert (np.abs(to @ side) / (to @ ahead)).max() < math.tan(0.4) * free / height
     finally:
         page.close()
 
@@ -206,15 +214,19 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.close_notifications()
         assert page.screenshot(SCREENSHOTS / 'moving.png') != before
         assert not targets and not any(message.data for message in detected)
-        page.click(*page.centre('Cut'))
+        page.click(*page.centre('End exploring'))
+        graph.wait(lambda: graph.report('controller').values['mode'] == 'idle', 'the end')
+        page.click(*page.centre('Explore'))
+        see('exploring')
+        page.click(*page.centre('Rupture'))
         see('ANOMALY: ')
         assert detected[-1].data
         page.click(*page.centre('Reset after a stop'))  # otherwise it would stop again
-        see('press "Mend" first')
+        see('press "Repair" first')
         assert 'controller/reset' not in page.text
         graph.spin(1.0)
         page.close_notifications()
-        page.screenshot(SCREENSHOTS / 'cut.png')
+        page.screenshot(SCREENSHOTS / 'rupture.png')
     finally:
         page.close()
     graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'nobody to look any more')
