@@ -272,10 +272,9 @@ class Situation:
         if len(silent) > 1:  # one cause is more likely than several nodes that end together
             load = f'{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores'
             names = ', '.join(silent)
-            return [
-                f'{names}: no report for {max(silent.values()):.0f} s: is the computer overloaded '
-                f'(load {load})? Otherwise see their logs, then restart them'
-            ]
+            since = f'no report for {max(silent.values()):.0f} s'
+            advice = f'is the computer overloaded (load {load})? Otherwise see their logs'
+            return [f'{names}: {since}: {advice}, then restart them']
         return [
             f'{name}: no report for {silence:.0f} s; see its log, then restart it'
             for name, silence in silent.items()
