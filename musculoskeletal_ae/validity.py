@@ -150,15 +150,17 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
     if count > 1:
         raise MessageError('duplicate joint', repr(name))
     efforts = np.array(message.effort if len(message.effort) else [0.0] * len(names), dtype=float)
-    if len(too_large := efforts[np.abs(efforts) > MOST_EFFORT]):
-        effort, most = distinct(too_large[0], np.copysign(MOST_EFFORT, too_large[0]))
-        raise MessageError('oversized', f'effort {effort} N·m, at most ±{most.lstrip("-")}')
     for what, values in (
         ('position', message.position), ('effort', efforts), ('velocity', message.velocity)
     ):  # fmt: skip
         wrong = [name for name, value in zip(names, values) if not math.isfinite(value)]
         if wrong:
             raise MessageError('not finite', f'{what} of {", ".join(wrong)}')
+    for name, effort in zip(names, efforts.tolist()):
+        if abs(effort) > MOST_EFFORT:
+            value, most = distinct(effort, math.copysign(MOST_EFFORT, effort))
+            legal = f'at most ±{most.lstrip("-")}'
+            raise MessageError('oversized', f'effort {value} N·m of {name}, {legal}')
     return dict(zip(names, zip(message.position, efforts.tolist())))
 
 

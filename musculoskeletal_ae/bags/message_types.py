@@ -57,13 +57,13 @@ def mismatch(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> 
     """Return why messages of a recorded type cannot be decoded, '' if they can.
 
     The RIHS01 hash and a definition in .msg format must agree with the type of this name in ROS 2
-    Jazzy. Recorders may omit both ('' and an empty encoding).
+    Jazzy. Recorders may omit both ('' and an empty encoding or definition).
     """
     if not is_known(type_name):
         return f'has the type {type_name[:80]!r}, which ROS 2 Jazzy does not define'
     if recorded_hash not in ('', type_hash(type_name)):
         differs = f'the hash {recorded_hash[:80]!r} instead of {type_hash(type_name)!r}'
-    elif encoding == MSG:
+    elif encoding == MSG and text.strip():
         differs = _differing_fields(type_name, text)
     else:
         differs = ''

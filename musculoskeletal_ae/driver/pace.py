@@ -13,6 +13,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.report import is_overloaded, load_text
 
 RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
 LONGEST_GAP = 0.2  # longest gap between two messages [s]; the controller's `max_age`
@@ -81,6 +82,11 @@ class Pace:
             _note_load(verdict)
         else:
             verdict.passed('rate')
+        if verdict.faults and rate < self._rate and is_overloaded():
+            verdict.notes.append(
+                f'this computer is overloaded (load {load_text()}). A driver that runs on it may '
+                'be slow for this reason alone: end other programs and try again'
+            )
 
     def _explain(self, gap: float, came: Array, now: float) -> bool:
         """Return whether pauses of this process make up most of the longest gap."""

@@ -8,7 +8,6 @@ reporting. Decisions compare identifiers only, such as the controller's values `
 
 import contextlib
 import math
-import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from musculoskeletal_ae.control.remedy import REPAIR, Step
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
-from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level
+from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
 
 LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
 #: time without a report after which a node counts as silent [s]; nodes report once a second
@@ -253,7 +252,7 @@ class Situation:
     def _mismatches(self) -> list[str]:
         return [
             f'{node} uses network {version}, but the estimator uses network {self._accepted[-1]}; '
-            f'restart {node}'
+            f'if this lasts, restart {node} or bringup.sh'
             for node, (version, reports) in self._other_networks.items()
             if reports >= REPORTS
         ]
@@ -270,13 +269,12 @@ class Situation:
     def _silent(self) -> list[str]:
         silent = self.silent_nodes()
         if len(silent) > 1:  # one cause is more likely than several nodes that end together
-            load = f'{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores'
             names = ', '.join(silent)
             since = f'no report for {max(silent.values()):.0f} s'
-            advice = f'is the computer overloaded (load {load})? Otherwise see their logs'
-            return [f'{names}: {since}: {advice}, then restart them']
+            advice = f'is the computer overloaded (load {load_text()})? Otherwise see their logs'
+            return [f'{names}: {since}: {advice}, then restart them or bringup.sh']
         return [
-            f'{name}: no report for {silence:.0f} s; see its log, then restart it'
+            f'{name}: no report for {silence:.0f} s; see its log, then restart it or bringup.sh'
             for name, silence in silent.items()
         ]
 

@@ -67,7 +67,14 @@ def test_topics_of_another_type_than_declared_are_not_decoded(options, problem, 
             interface_topics(bag)
 
 
-@pytest.mark.parametrize('options', [{'encoding': '', 'text': ''}, {'encoding': 'ros2idl'}])
+@pytest.mark.parametrize(
+    'options',
+    [
+        {'encoding': '', 'text': ''},
+        {'text': ' \n'},
+        {'encoding': 'ros2idl'},
+    ],
+)
 def test_a_known_type_needs_no_definition_in_our_format(options, tmp_path):
     bag = Bag.open(write(tmp_path / 'a.mcap', **options))
     assert [bag.decode(message).data for message in bag.messages()] == [1.0]

@@ -4,6 +4,7 @@
 import copy
 import inspect
 import math
+import os
 import re
 from dataclasses import replace
 from functools import cache
@@ -292,6 +293,16 @@ def test_messages_that_wait_in_a_busy_computer_are_no_fault_of_the_driver():
     messages.bring(300, sent, lambda n: 0.01 * n + (0.5 if 100 <= n < 150 else 0.0))
     verdict = messages.listening.verdict(3.0)
     assert not verdict.faults, str(verdict)
+
+
+def test_a_slow_driver_on_an_overloaded_computer_is_reported_with_the_load(monkeypatch):
+    for load, is_noted in (1e3, True), (0.0, False):
+        monkeypatch.setattr(os, 'getloadavg', lambda load=load: (load, 0.0, 0.0))
+        driver = Driver(ROBOT)
+        driver.period = 0.02
+        verdict = driver.listen()
+        assert verdict.wrong == {'rate'}
+        assert ('is overloaded (load 1000 on ' in str(verdict)) == is_noted
 
 
 def test_messages_that_are_lost_on_the_way_are_no_fault_of_the_driver():
