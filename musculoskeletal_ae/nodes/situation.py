@@ -19,6 +19,7 @@ from musculoskeletal_ae.control import remedy
 from musculoskeletal_ae.control.remedy import REPAIR, Step
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
+from musculoskeletal_ae.estimation.finding import REVOKING, Kind
 from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
 from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
 
@@ -41,6 +42,12 @@ REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
 ACTIVITIES = {activity.value for activity in Activity}
+#: steps that help against a kind of finding; `REPAIR` against all others
+FINDING_STEPS = {
+    Kind.JOINT_SENSORS_DISAGREE.value: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
+    **{kind.value: (Step.CALIBRATE_LENGTHS,) for kind in REVOKING},
+}
+ANOMALY_STEPS = tuple(step.identifier for step in StopCause.ANOMALY.steps)
 EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value
 
 
@@ -104,6 +111,7 @@ class Situation:
         self.detected = False
         self.samples = self.checkpoints = self.doing = ''
         self.suspect = self.evidence = ''
+        self._finding = ''  # kind of the estimator's finding or 'none'; '' if it is unknown
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._has_explored = False  # whether the arm explored before the last stop
@@ -147,7 +155,8 @@ class Situation:
                 self._compare_network(name, node.values.get(VERSION, ''))
 
     def _take_estimator(self, values: dict[str, str]) -> None:
-        self.detected = values.get('finding', 'none') != 'none'
+        self._finding = values.get('finding', '')
+        self.detected = self._finding not in ('', 'none')
         self.suspect = values.get('suspect muscle', '')
         self.evidence = values.get('evidence', '')
         self.distance = self.limit = math.nan
@@ -231,18 +240,23 @@ class Situation:
         is_stopped = mode in (STOPPED, VERIFYING)
         is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
         evidence = f': {self.evidence}' if self.evidence else ''
+        of_finding = FINDING_STEPS.get(self._finding, REPAIR) if self.detected else ()
         troubles = []
         if self.detected and is_verifying:
             troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified{evidence}'))
         elif self.detected and is_stopped_by_anomaly:
             troubles.append(Trouble(f'ANOMALY: {self.suspect}{evidence}'))
         elif self.detected:
-            troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *REPAIR))
+            troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
         if is_stopped and not (is_verifying and is_stopped_by_anomaly):
             text, steps = (
                 control.get('remedy', ''),
                 remedy.parse(control.get(remedy.REMEDY_STEPS, '')),
             )
+            if steps == ANOMALY_STEPS and self._finding:
+                # The estimator knows the kind of the finding, and whether it is over.
+                known = *of_finding, Step.RESET_CONTROLLER
+                text, steps = remedy.sentence(known), tuple(step.identifier for step in known)
             if self._has_explored:
                 text, steps = f'{text}; {Step.EXPLORE.text}', (*steps, Step.EXPLORE.identifier)
             stop = control.get('stop', cause)
@@ -290,7 +304,9 @@ class Situation:
         key = 'unknown length offsets'
         if unknown := values.get(key) or self._values('controller').get(key):
             text = f'length offsets unknown: {unknown}'
-            troubles.append(_with_remedy(text, Step.CALIBRATE_LENGTHS))
+            is_calibrating = values.get('state') == 'calibrating'
+            steps = () if is_calibrating else (Step.CALIBRATE_LENGTHS,)
+            troubles.append(_with_remedy(text, *steps) if steps else Trouble(text))
         return troubles
 
     @property

@@ -137,6 +137,31 @@ def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_e
     assert 'learner' not in situation.trouble()
 
 
+@pytest.mark.parametrize(
+    ('kind', 'first'),
+    [
+        ('joint_sensors_disagree', 'check the named sensor'),
+        ('lengths_jumped', 'call estimator/zero'),
+        ('slack_tendon', 'repair the muscle'),
+        ('none', 'call controller/reset'),  # the cause of the stop is over
+    ],
+)
+def test_the_remedy_of_an_anomaly_is_that_of_its_kind(kind, first):
+    situation = Situation('/left')
+    situation.diagnosed(diagnostics('/left/estimator', finding=kind, suspect_muscle='biceps'))
+    situation.diagnosed(stopped(StopCause.ANOMALY))
+    _, _, remedy = situation.trouble().partition('STOPPED: anomaly detected (to go on: ')
+    assert remedy.startswith(first) and 'call controller/reset' in remedy
+    assert (kind == 'slack_tendon') == ('repair' in situation.trouble())
+
+
+def test_a_calibration_that_runs_is_not_to_be_started():
+    situation = Situation('/left')
+    lengths = {'state': 'calibrating', 'unknown_length_offsets': 'biceps'}
+    situation.diagnosed(diagnostics('/left/estimator', finding='none', **lengths))
+    assert situation.trouble() == 'length offsets unknown: biceps'
+
+
 def test_several_silent_nodes_are_put_down_to_the_computer():
     now = 100.0
     situation = Situation('/left', lambda: now)
@@ -182,7 +207,8 @@ def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seco
     for _ in range(3):
         second(20, 3)
     assert situation.trouble() == (
-        'controller uses network 3, but the estimator uses network 20; restart controller'
+        'controller uses network 3, but the estimator uses network 20; '
+        'if this lasts, restart controller or bringup.sh'
     )
     second(20, 20)
     assert situation.trouble() == ''

@@ -180,4 +180,4 @@ class JointDisagreement(Detector):
         j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
         offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
         cause = f'as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
-        return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f'{evidence}, {cause}')
+        return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f'{cause}: {evidence}')
