@@ -41,6 +41,8 @@ BACKGROUND = 'Ctrl-C ends it'
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
 START_PATIENCE = 1800  # longest wait for the first status line, installation included [s]
 COMMAND_PATIENCE = 900  # longest duration of all other commands of a page [s]
+#: longest duration of one `ros2` command, which would wait for ever for a system that has ended [s]
+ANSWER_PATIENCE = 300
 NAME = 'musculoskeletal_ae'
 INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'
 FUNCTIONS = f"""
@@ -54,8 +56,8 @@ stop() {{ # SCRIPT: ends what runs in the background
   unset "running[$1]"
 }}
 trap 'for script in "${{!running[@]}}"; do stop "$script"; done' EXIT
-ask() {{ # COMMAND: fails if the command does, or if its answer is a refusal
-  eval "$1" | tee answer.log
+ask() {{ # COMMAND: fails if the command does or does not end, or if its answer is a refusal
+  eval "timeout {ANSWER_PATIENCE} $1" | tee answer.log
   [ "${{PIPESTATUS[0]}}" = 0 ] &&
     ! grep -qE 'success(ful)?=False|[Ss]etting parameter failed' answer.log
 }}
