@@ -73,7 +73,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
     warnings = []
     if target.clamped:
         values['target clamped at'] = ', '.join(target.clamped)
-        warnings.append('target clamped to the joint limits')
+        warnings.append(f'target clamped to the joint limits: {", ".join(target.clamped)}')
     _add_stiffness(core, values)
     if target.effort.any() and core.settings.method in ('geometric', 'first', 'second'):
         warnings.append(f'method {core.settings.method} exerts no effort')

@@ -132,6 +132,7 @@ def test_a_target_beyond_the_limits_is_clamped_and_joints_not_named_keep_theirs(
     np.testing.assert_array_equal(bench.core.target_state.theta, [-0.2, ROBOT.lower[1]])
     bench.step()
     assert bench.report().values['target clamped at'] == ROBOT.joints[1]
+    assert f'joint limits: {ROBOT.joints[1]}' in bench.report().message
     bench.core.target({ROBOT.joints[1]: (-1.0, 0.0)})
     assert 'target clamped at' not in bench.report().values
 
