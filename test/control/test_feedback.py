@@ -7,13 +7,13 @@ from robots import write_robot
 
 from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.control.feedback import (
-    BETWEEN,
     CORRECTION,
     DEADBAND,
-    RELIEF,
+    RELIEF_INTERVAL,
     SETTLING,
     RestFeedback,
 )
+from musculoskeletal_ae.robot.actuation import RELIEF
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
@@ -70,7 +70,7 @@ def test_relief_pays_out_antagonists_and_exerts_no_torque(robot):
     while (feedback.relief == before).all():
         step(feedback, robot, np.zeros(robot.joint_count), needless)
         steps += 1
-    assert steps * DT <= BETWEEN + 2 * DT
+    assert steps * DT <= RELIEF_INTERVAL + 2 * DT
     change = feedback.relief - before
     # The arm came to rest at the first step.
     expected = GAIN * (steps + 1) * DT * (needless - holding(robot)) / robot.stiffness

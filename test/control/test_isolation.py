@@ -14,10 +14,11 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import METHODS
-from musculoskeletal_ae.control.stopping import DEPTH, LARGEST_RISE, PAYING_OUT
+from musculoskeletal_ae.control.stopping import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.robot.actuation import DEPTH
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
