@@ -93,7 +93,7 @@ def test_the_arm_reaches_a_target_by_lengths_alone_and_reports_missing_tensions(
     assert np.abs(loop.arm.theta - THETA).max() < 0.15
     assert loop.core.limiter.command.kind == LENGTH
     values = status.report(loop.core, loop._now).values
-    assert 'heat limits' in values['tension'] and 'contact' in values['tension']
+    assert 'heat limit' in values['tension'] and 'contact' in values['tension']
 
 
 def test_no_command_runs_further_ahead_of_a_module_than_its_release(loop):
