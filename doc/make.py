@@ -266,7 +266,8 @@ def capabilities_table() -> str:
     results = read(FOLDER / 'results')
     lines = ['| capability on `kin` | result | command |', '|---|---|---|']
     for what, text, name in CAPABILITIES:
-        lines.append(f'| {what} | {text.format(**results[name])} | `experiment {name}` |')
+        command = f'`experiment {name}`, {individuals(results[name]["about"]["seeds"])}'
+        lines.append(f'| {what} | {text.format(**results[name])} | {command} |')
     return '\n'.join(lines)
 
 

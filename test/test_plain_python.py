@@ -117,7 +117,7 @@ def test_bringup_and_the_recordings_are_installed_with_the_package(monkeypatch):
     monkeypatch.chdir(ROOT)
     files = dict(core.run_setup('setup.py', stop_after='init').data_files)
     assert files['lib/musculoskeletal_ae'] == ['bringup.sh']
-    assert files['share/musculoskeletal_ae/.ci'] == ['.ci/environment.sh']
+    assert files['share/musculoskeletal_ae/.ci'] == ['.ci/environment.sh', '.ci/compile.py']
     installed = {name for names in files.values() for name in names}
     recordings = {file.as_posix() for file in Path('bags').glob('*/*')}
     assert recordings and recordings <= installed

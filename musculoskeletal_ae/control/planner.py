@@ -23,7 +23,9 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-ROUNDING = 1e-6  # distance by which a point may exceed a joint limit [rad]
+#: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times RACK [m].
+#: The estimate of an arm that is held against a joint stop exceeds the limit by less.
+TOLERANCE = 0.01
 SAME = 1e-6  # difference below which two poses are equal
 
 
@@ -70,7 +72,7 @@ class Planner:
 
     def through(self, mae: Mae, start: Setpoint, points: Points, passed: float) -> Plan:
         """Plan a motion through points that started `passed` [s] ago."""
-        self._check_limits(points)
+        points = self._clipped(points)
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
         return Plan(planned)
@@ -141,12 +143,18 @@ class Planner:
             raise MessageError('not holdable', problem)
         return held, f'{problem}; going there'
 
-    def _check_limits(self, points: Points) -> None:
+    def _clipped(self, points: Points) -> Points:
+        """Return the points within the joint limits, which they may exceed by `TOLERANCE`.
+
+        Raises:
+            MessageError: If a point is further outside.
+        """
         robot = self._robot
         low, high = robot.lower[points.joints], robot.upper[points.joints]
-        beyond = (points.position < low - ROUNDING) | (points.position > high + ROUNDING)
+        tolerance = TOLERANCE * robot.kinematics.radian[points.joints]
+        beyond = (points.position < low - tolerance) | (points.position > high + tolerance)
         if not beyond.any():
-            return
+            return points._replace(position=np.clip(points.position, low, high))
         k, j = np.argwhere(beyond)[0]
         unit = robot.units[points.joints[j]].theta
         value, least, most = distinct(points.position[k, j], low[j], high[j], digits=4)

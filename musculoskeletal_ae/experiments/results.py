@@ -281,8 +281,11 @@ def table(results: Results) -> list[Cells]:
 
 
 def individuals(seeds: Sequence[int]) -> str:
-    """Return the individuals' names, such as 'individual 0'."""
-    return f'individual{"s" * (len(seeds) > 1)} {", ".join(map(str, seeds))}'
+    """Return the individuals' names, such as 'individual 0' or 'individuals 0–4'."""
+    names = ', '.join(map(str, seeds))
+    if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        names = f'{seeds[0]}–{seeds[-1]}'
+    return f'individual{"s" * (len(seeds) > 1)} {names}'
 
 
 def readme_table(results: Results) -> str:

@@ -232,7 +232,7 @@ def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
     output = replay.end(signal.SIGTERM)
     assert replay.process.returncode == 0
     assert 'Traceback' not in output
-    assert 'without --clock' in output
+    assert 'add --clock' in output
 
 
 def test_an_impossible_request_is_reported_in_one_line(tool, bag, tmp_path):

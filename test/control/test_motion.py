@@ -103,6 +103,15 @@ def test_a_new_trajectory_replaces_the_old_from_its_start_time_and_an_empty_one_
     assert np.abs(bench.core.activities.follower.desired.theta - REST).max() > 0.1
 
 
+def test_a_point_that_exceeds_a_joint_limit_by_the_error_of_an_estimate_is_moved_to_the_limit(
+    bench,
+):
+    """A posture taught against a joint stop is estimated a little beyond it."""
+    bench.core.trajectory(points(ROBOT.lower + [0.5, -0.005]))
+    end = bench.core.activities.follower.trajectory.end
+    np.testing.assert_allclose(end, ROBOT.lower + [0.5, 0.0])
+
+
 def test_a_refused_trajectory_changes_nothing(bench):
     with pytest.raises(MessageError, match='beyond the joint limits'):
         bench.core.trajectory(points(ROBOT.upper + 0.1))
@@ -466,8 +475,8 @@ def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apar
     assert f'takes {follower.latest.duration:.3g} s' in text, text
 
 
-def test_a_target_just_beyond_a_limit_is_refused_in_numbers_that_differ(bench):
-    beyond = np.array([0.0, ROBOT.upper[1] + 2e-6])
+def test_a_point_just_beyond_the_tolerance_of_a_limit_is_refused_in_numbers_that_differ(bench):
+    beyond = np.array([0.0, ROBOT.upper[1] + 0.010001])
     with pytest.raises(MessageError) as error:
         bench.core.trajectory(points(beyond))
     assert len(set(re.findall(r'-?\d+\.\d+', str(error.value)))) == 3

@@ -167,6 +167,7 @@ class StatedPosture:
     touch: TouchStatistics
     exact = ExactMae(ARM)
     friction, elasticity = exact.friction, None
+    transmission = exact.transmission
 
     def estimate(self, *_):
         return SimpleNamespace(theta=self.theta)

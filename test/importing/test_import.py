@@ -303,7 +303,7 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
 def test_a_model_without_routes_is_refused_with_the_dropped_muscles(tmp_path):
     text = re.sub('<spatial .*?</spatial>', '', bodies.MJCF, flags=re.DOTALL)
     file = put(tmp_path, 'own.xml', re.sub('<muscle [^>]*>', '', text))
-    with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: a fixed one'):
+    with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: it is fixed'):
         read_source(file)
 
 
