@@ -18,7 +18,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_robot(default=None)
     parser.add_out('FILE.safetensors', 'the checkpoint')
-    parser.add_preset('paper: network and training as printed; default: the best measured')
+    parser.add_preset('paper: network and training as in the paper; default: the best measured')
     parser.add_seed('of data and weights')
     parser.add_plot('loss and errors')
     for flag, text in (
