@@ -8,14 +8,15 @@
 
 f is the length of the route with displaced points p + δ, wrapping included; κ are logarithmic
 changes of the elastic constants c, and o is a length offset. Each muscle is fitted separately, by
-the Levenberg–Marquardt method. The residual is the part of the network that such a body cannot
-represent.
+the Levenberg–Marquardt method of SciPy. The residual is the part of the network that such a body
+cannot represent.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
@@ -29,9 +30,6 @@ STATES = 1000  # number of random states in the fit
 NOISE = 3e-3
 ATTACHMENT, ELASTIC, OFFSET = 0.01, 0.5, 0.05  # s_δ [m], s_κ, s_o [m]
 LARGEST_LOG = 1.5  # bound on |κ|
-ROUNDS = 30
-EASIER, HARDER = 0.3, 5.0  # factors of the damping after a better and a worse step
-DAMPING, MOST_DAMPED = 1e-2, 1e4  # at the start, and where the search ends; shares of the diagonal
 ENOUGH = 1e-4  # the search ends at a smaller relative improvement
 
 
@@ -47,9 +45,9 @@ class FittedBody:
 class _States(NamedTuple):
     """Lengths that one muscle shall have in N states."""
 
-    poses: JointPoses  # of θ, with θ = 0 as an additional last row
-    tension: Array  # [N], (N,)
-    length: Array  # [m], (N,)
+    poses: JointPoses  # poses of the joints at θ, with θ = 0 as an additional last row
+    tension: Array  # T [N], (N,)
+    length: Array  # l of the network [m], (N,)
 
 
 def fit(robot: Robot, mae: Mae, seed: int = 0) -> FittedBody:
@@ -93,30 +91,24 @@ class _Muscle:
 
     def fitted(self, states: _States) -> tuple[Array, Array]:
         """Return the parameters, and the errors that remain [m], (N,)."""
-        parameters, damping = np.zeros(len(self._spread)), DAMPING
-        prior = (NOISE / self._spread) ** 2
-        length, jacobian = self._linearised(parameters, states)
-        error = states.length - length
-        loss = error @ error
-        for _ in range(ROUNDS):
-            normal = jacobian.T @ jacobian + np.diag(prior)
-            slope = jacobian.T @ error - prior * parameters
-            damped = normal + damping * np.diag(np.diag(normal))
-            tried = parameters + np.linalg.solve(damped, slope)
-            length, jacobian_there = self._linearised(tried, states)
-            error_there = states.length - length
-            loss_there = error_there @ error_there + prior @ tried**2
-            if loss_there >= loss:
-                damping *= HARDER
-                if damping > MOST_DAMPED:
-                    break
-                continue
-            is_flat = loss - loss_there < ENOUGH * loss
-            parameters, jacobian, error, loss = tried, jacobian_there, error_there, loss_there
-            damping *= EASIER
-            if is_flat:
-                break
-        return parameters, error
+
+        def residuals(parameters: Array) -> Array:
+            length, _ = self._linearised(parameters, states)
+            return np.concatenate([(length - states.length) / NOISE, parameters / self._spread])
+
+        def jacobian(parameters: Array) -> Array:
+            _, by_parameters = self._linearised(parameters, states)
+            return np.concatenate([by_parameters / NOISE, np.diag(1.0 / self._spread)])
+
+        found = least_squares(
+            residuals,
+            np.zeros(len(self._spread)),
+            jacobian,
+            x_scale='jac',
+            ftol=ENOUGH,
+            method='lm',
+        )
+        return found.x, NOISE * found.fun[: len(states.length)]
 
     def _linearised(self, parameters: Array, states: _States) -> tuple[Array, Array]:
         """Return the muscle's lengths [m], (N,), and their derivatives by the parameters."""
