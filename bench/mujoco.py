@@ -66,7 +66,7 @@ HEAD = (
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
 ARM_POSTURES = 300
-RATE = 100.0  # [Hz] of muscle_states with --nodes
+RATE = 100.0  # rate of muscle_states with --nodes [Hz]
 LISTS = 'joints', 'muscles', 'without'
 
 

@@ -180,7 +180,7 @@ def _ends(changes: Array, count: int, rows: int) -> Array:
 def soft_neck(files: Files) -> Recording:
     """Read the open-loop runs of the soft neck: encoders [degrees] and an IMU, 100 per second."""
     folder = 'paper-results/csv-results/Frontiers-Test-Bench-Evaluation-Soft-Robotic-Link'
-    spool, ratio = 0.01, 5.69  # [m] radius of the spool; distance of the tendons over it
+    spool, ratio = 0.01, 5.69  # radius of the spool [m]; distance of the tendons over that radius
     runs = []
     for load in (0, 500, 1000):
         column = _columns(files.text(f'{folder}/imu_openloop/spring_test_{load}gr.csv'))

@@ -10,8 +10,8 @@ from typing import Any
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
-SHOWN = 10.0  # [s] for which `refusal` reports the last refusal
-LONGEST_PERIOD = 1.5  # [s] between two reports; more means that this node itself has paused
+SHOWN = 10.0  # time for which `refusal` reports the last refusal [s]
+LONGEST_PERIOD = 1.5  # time between two reports above which this node itself has paused [s]
 # A source time that lies further back than this comes from another clock, not from reordering.
 REORDERING = 1_000_000_000  # [ns]
 

@@ -18,7 +18,7 @@ from types import ModuleType
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED = 130  # exit status of an interrupted tool
-GRACE = 2  # [s] from the signal to the exit under `Reaction.EXIT_SOON`
+GRACE = 2  # time from the signal to the exit under `Reaction.EXIT_SOON` [s]
 
 
 class Reaction(Enum):

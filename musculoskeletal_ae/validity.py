@@ -23,9 +23,10 @@ from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSourc
 MOST_ENTRIES = 10_000  # far more than any arm needs; longer messages are rejected unread
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)  # [N], [N·m] at the end effector
 MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # commanded [m/s], [rad/s] of the end effector
-LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0  # [m/s²] plausible accelerometer readings on an arm
-LAST_VELOCITY = 1e-6  # [rad/s] highest velocity at the end of a trajectory
-MOST_EFFORT = 1000.0  # [N·m] requested of one joint
+#: range of plausible accelerometer readings on an arm [m/s²]
+LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
+LAST_VELOCITY = 1e-6  # highest velocity at the end of a trajectory [rad/s]
+MOST_EFFORT = 1000.0  # highest torque that may be requested of one joint [N·m]
 MOST_ISOLATED = 1e6  # highest value of an isolated muscle; powers of larger ones overflow
 UNIT_TOLERANCE = 0.01  # deviation of a quaternion's norm from 1
 QUANTITIES = ('length', 'tension', 'temperature')

@@ -27,9 +27,9 @@ from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_mess
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
-DEADLINE = 180.0  # [s] for a wait on a loaded machine, after which the test fails
-PATIENCE = 600.0  # [s] for a process to write its next line or to end
-LOOK = 0.05  # [s] between two checks of a condition
+DEADLINE = 180.0  # longest wait on a loaded machine; then the test fails [s]
+PATIENCE = 600.0  # longest time until a process writes its next line or ends [s]
+LOOK = 0.05  # time between two checks of a condition [s]
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
 

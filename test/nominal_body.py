@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 SETTLING, PERIOD = 3.0, 0.02  # [s]
 QUARTERS = (0.125, 0.875)  # middles of the lower and the upper quarter of the reachable range
-PUSH = 1.0  # [N·m] of torque at the joint
+PUSH = 1.0  # torque at the joint [N·m]
 
 
 def nominal_arm(robot: Robot) -> EmulatedArm:

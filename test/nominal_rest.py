@@ -26,7 +26,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 STEP = 0.01  # [s]
 STILL = 1e-4  # [rad/s]
 LONGEST_WAIT = 20.0  # [s]
-TENSION_UNIT = 100.0  # [N] per unknown, so that all are of one size
+TENSION_UNIT = 100.0  # unit of the unknown tensions [N], so that all unknowns are of one size
 FLEXED, FLEXION = 'elbow_pitch', np.radians(-90.0)
 FORCED, FORCED_TO = 'shoulder_pitch', np.radians(30.0)
 #: motion of a joint of the nominal body above which it is compared with that of the simulator [rad]

@@ -32,9 +32,10 @@ from musculoskeletal_ae.validity import (
 
 MOST_REPEATED = 0.2  # share of messages that may equal the one before to the last digit
 QUIET = 3  # so few different values, but more than one, indicate a sensor without noise
-TEMPERATURES = -20.0, 130.0  # [°C] possible range
-BEYOND = 0.1, 1.0  # [m] that l may exceed its range, with and without length calibration
-BEYOND_JOINT = 0.3  # [rad] that θ may exceed the joint limits
+TEMPERATURES = -20.0, 130.0  # range of possible temperatures [°C]
+#: distance by which l may exceed its range, with and without length calibration [m]
+BEYOND = 0.1, 1.0
+BEYOND_JOINT = 0.3  # distance by which θ may exceed the joint limits [rad]
 # Tolerance of T − T_bias while nothing is commanded, for errors of the sensor and its zero.
 #: tolerance of T at rest [N], and relative to T_bias; the smaller one applies
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5

@@ -18,8 +18,11 @@ RELEASE = 0.6  # wait after a release [s]
 MEAN = 0.3  # time over which readings are averaged [s]
 SETTLE = 1.5  # time in which the arm comes to rest after a motion [s]
 HOLD = 0.5  # time for which a demand is held [s]
+SPEED = 0.01  # speed at which a target continues inwards [m/s]
 RELEASE_SPEED = 0.03  # speed at which a target returns [m/s]
 ABOVE_BIAS = 40.0  # default of the highest tension, above T_bias [N]
+#: excess over the highest or the demanded tension at which a muscle is released [N]
+RUN_AWAY_TENSION = 60.0
 MOMENT = 0.1  # time for which a muscle may exceed a limit, for example because the arm falls [s]
 LATEST = 0.1  # longest time from a command to the first response [s]
 RESPONSE = 4.0, 0.0006  # changes of T [N] and l [m] above noise that count as a response

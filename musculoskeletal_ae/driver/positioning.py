@@ -20,7 +20,9 @@ from musculoskeletal_ae.driver.motion import (
     LATEST,
     RELEASE,
     RESPONSE,
+    RUN_AWAY_TENSION,
     SETTLE,
+    SPEED,
     MotionTest,
     RunAwayError,
     Wait,
@@ -30,12 +32,10 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
 STEP = 0.003  # first step inwards, by which latency is measured [m]
-SPEED = 0.01  # speed at which the target continues inwards [m/s]
 FURTHEST = 0.015  # farthest that the target moves inwards [m]
 OUTWARDS = 0.005  # distance by which the target moves outwards [m]
 FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
 SHARES = 0.7, 1.4  # legal range of the motion of l, divided by that of l_target
-RUN_AWAY_TENSION = 60.0  # excess over the highest tension that ends a test [N]
 RUN_AWAY = 0.03  # distance of l from l_target that ends a test [m]
 
 

@@ -27,7 +27,9 @@ from musculoskeletal_ae.driver.motion import (
     MEAN,
     RELEASE,
     RESPONSE,
+    RUN_AWAY_TENSION,
     SETTLE,
+    SPEED,
     MotionTest,
     RunAwayError,
     Wait,
@@ -38,10 +40,8 @@ from musculoskeletal_ae.report import distinct
 
 #: responses to lower demands above T_bias cannot be distinguished from noise [N]
 LEAST_ABOVE_BIAS = 20.0
-SPEED = 0.01  # speed at which a target continues inwards while the arm gives way [m/s]
 FURTHEST = 0.025  # largest distance by which a muscle is wound in [m]
 SLACK = 0.01  # distance by which l_target is then set beyond l [m]
-RUN_AWAY_TENSION = 60.0  # excess over the demand at which a muscle is released [N]
 RUN_AWAY = 0.05  # shortening at which a muscle is released [m]
 #: tolerance of T [N], and relative to the demand; the larger one applies
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
@@ -205,7 +205,7 @@ class Winding(MotionTest):
 
     def _try(self, m: int) -> Wait:
         robot, verdict, home = self._robot, self.verdict, self._mean()
-        half, whole = list[float](), list[float]()  # [s] to the response
+        half, whole = list[float](), list[float]()  # times to the response [s]
         # The demand at home may exceed T_bias, because the muscle carries the arm's weight.
         rise = (self._highest - self._bias)[m]
         yield from self._wind(m, home.demand[m] + 0.5 * rise, home.length[m], half)

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
 LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # [m], [rad] of `Effects.links`
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # share, [m]
-THICKEST = 0.045  # [m] radius of a bone's head or a muscle
+THICKEST = 0.045  # radius of a bone's head or a muscle [m]
 POSTURES = 300  # random postures over which their radii are fitted
 # MuJoCo ignores the ratio of a coupling when it scales its stiffness. With the default, a prismatic
 # joint that follows a revolute one would lag by centimetres.

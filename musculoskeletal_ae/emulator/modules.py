@@ -32,13 +32,14 @@ STEP = 0.001  # [s]
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # These values are chosen; those of Musashi are not public.
-RELEASE_RATE = 100.0  # [N/s] at which a module in the safe state approaches T_bias
+#: rate at which a module in the safe state approaches T_bias [N/s]
+RELEASE_RATE = 100.0
 MOTOR_GAIN = 0.004  # [m/s/N]
-POSITION_LAG = 0.02  # [s] time constant of a position-controlled module
+POSITION_LAG = 0.02  # time constant of a position-controlled module [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
 AMBIENT = 25.0  # [°C]
-LOSS = 20.0  # [W] at T_limit
+LOSS = 20.0  # heat loss of a motor at T_limit [W]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
 WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
 HEAT_SPREAD = 0.15  # standard deviation of the logarithm of each of these five constants

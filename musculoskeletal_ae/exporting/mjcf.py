@@ -33,8 +33,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 POSTURES = 1000  # postures in which the model and the network are compared
-DAMPING = 0.05  # [N·m·s/rad] of a joint, or times joint_gear; chosen for a stable simulation
-THIN = 0.008  # [m] radius of the capsules that draw bones
+#: damping of a joint, or times joint_gear [N·m·s/rad]; chosen for a stable simulation
+DAMPING = 0.05
+THIN = 0.008  # radius of the capsules that draw bones [m]
 TIMESTEP = 0.002  # [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths

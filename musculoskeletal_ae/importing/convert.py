@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
 LARGEST = 20_000_000  # largest file [bytes]
-WARM_UP, PLAYED = 0.1, 1.0  # [s] of model time
+WARM_UP, PLAYED = 0.1, 1.0  # simulated times before and during the speed test [s]
 REAL_TIME = 0.5  # CPU time per second of model time that is fast enough beside the other nodes [s]
 SLOW = 3  # exit status for a model that is slower than real time
 OPENSIM = (

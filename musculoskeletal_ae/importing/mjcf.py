@@ -43,7 +43,7 @@ COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
 RANGE_POSTURES = 200  # postures in which the range of a tendon's length is measured
-LEAST_REACH = 1e-3  # [m] smallest distance of a far end from the origin of its body
+LEAST_REACH = 1e-3  # smallest distance of a far end from the origin of its body [m]
 STRONGEST = 1e6  # [N]; MuJoCo assigns more to muscles without an initial moment arm
 
 

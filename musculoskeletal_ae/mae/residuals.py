@@ -52,7 +52,7 @@ def anomaly(error: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AnomalyStatistics:
-    """Mean and covariance of e over healthy data."""
+    """Mean and covariance of the residuals e (module docstring) over healthy data."""
 
     mean: Array  # mean μ of e, (2M,)
     covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)

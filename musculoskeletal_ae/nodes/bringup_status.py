@@ -22,7 +22,8 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.report import Report
 
-SETTLING = 4.0  # [s] after the first estimate, during which troubles of the start are not shown
+#: time after the first estimate during which problems of the start are not shown [s]
+SETTLING = 4.0
 
 
 class BringupStatus(Shell):

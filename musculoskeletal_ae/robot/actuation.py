@@ -27,23 +27,25 @@ Kinded = tuple[str, Array]  # kind and value of a command
 LENGTH, TENSION = 'length', 'tension'  # kinds of commands
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
 
-DESIRED_SHARE = 0.3  # tension of a well-tensed arm, as a share of T_limit
+DESIRED_SHARE = 0.3  # tension of a well-tensed arm, relative to T_limit
 #: largest relief of needless tension by modules under stiffness control [m]; covers length errors
 #: and the tension that friction retains in a tendon
 RELIEF = 0.01
-#: the same of position-controlled modules [m]; covers errors of a network that has not learned
-#: the arm yet, which such modules turn into slack or into tension
+#: the same for position-controlled modules [m]; covers errors of a network that has not learned the
+#: arm yet, which these modules turn into slack or into tension
 SLACK = 0.03
-#: share of the stretch that remains up to T_limit that a command to a position-controlled module
-#: may use; the rest covers errors of L_e and the age of T
+#: fraction of the stretch left up to T_limit that a command to a position-controlled module may
+#: use; the rest covers errors of L_e and the age of T
 SHARE = 0.7
 #: time for which a rise of the tension is extrapolated [s]: the age of T, and the lag of the module
 AHEAD = 0.04
-#: share of a difference of tensions that a command to such a module removes
+#: fraction of the tension error that one length command to a position-controlled module corrects
 ADMITTANCE = 0.5
-#: speed at which such a module may wind in again beyond a length at which it exceeded T_limit [m/s]
+#: speed at which a position-controlled module may wind in again beyond a length at which its
+#: tension exceeded T_limit [m/s]
 RECOVERY = 0.01
-DEPTH = 0.015  # by which a suspect under stiffness control is wound in, at most [m]
+#: largest distance by which a suspect muscle under stiffness control is wound in [m]
+DEPTH = 0.015
 
 
 class Actuation(ABC):
@@ -58,7 +60,7 @@ class Actuation(ABC):
     follows_tensions: bool
 
     def __init__(self, robot: Robot) -> None:
-        """Take the body; isolated muscles have a bias of 0."""
+        """Describe the modules of `robot`, in which isolated muscles have a bias of 0."""
         description = robot.description
         self._robot, self._whole = robot, description.tension
         self._stiffness, self._stated_release = description.stiffness, description.release
@@ -331,7 +333,7 @@ class StiffnessControl(Actuation):
 
 
 class PositionControl(Actuation):
-    """Position-controlled modules, and keep no tension by themselves."""
+    """Position-controlled modules, which keep no tension by themselves."""
 
     follows_tensions = False
     largest_relief = SLACK
@@ -400,7 +402,7 @@ class PositionControl(Actuation):
         return self.release
 
     def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
-        """Return 0 m: such a module winds in by its lead even if the arm is blocked."""
+        """Return 0 m: the module would wind in by its lead even if the arm is blocked."""
         return 0.0
 
     def recovered(self, shortest: Array, dt: float) -> Array:

@@ -23,7 +23,8 @@ EXAMPLE_NOISE = 1e-4  # [m], the resolution of a caliper
 LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # range of `force`, relative to the highest tension
 SLIGHTLY = 1e-3  # distance of the starting point from the bounds
 LEAST_ELONGATION = -0.002  # [m]; noise can make an elongation negative
-LONGEST = 10.0  # [m] of a muscle on a testbed; larger numbers are probably in another unit
+#: largest length of a muscle on a testbed [m]; larger numbers are probably in another unit
+LONGEST = 10.0
 
 
 def main(argv: list[str] | None = None) -> int:

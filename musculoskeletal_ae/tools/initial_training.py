@@ -44,7 +44,8 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 HELD_OUT_STATES = 5000
-REPORT_INTERVAL = 5.0  # [s] between lines of progress if there is no terminal
+#: time between two lines of progress without a terminal [s]
+REPORT_INTERVAL = 5.0
 ENTERED = {
     Mask.THETA_TENSION: '① (θ, T)',
     Mask.TENSION_LENGTH: '② (T, l)',

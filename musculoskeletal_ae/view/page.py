@@ -30,12 +30,13 @@ from musculoskeletal_ae.view.body import MARKS, Kind
 from musculoskeletal_ae.view.readings import ARMS, HTML, LEFT_PANEL, History, Readings
 from musculoskeletal_ae.view.visits import checked_visits
 
-NARROW = 900  # [pixels] width below which two panels would hide the arm
-CAMERA_FOV = 0.8  # [rad] vertical field of view
+NARROW = 900  # width below which two panels would hide the arm [pixels]
+CAMERA_FOV = 0.8  # vertical field of view [rad]
 FILLED = 0.95  # share of the visible width and height that the arm may fill
 VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
-RIGHT_PANEL = 330  # [pixels] width
-WINDOW = 1280, 800  # [pixels] width and height for which the initial camera is placed
+RIGHT_PANEL = 330  # width of the right panel [pixels]
+#: width and height for which the initial camera is placed [pixels]
+WINDOW = 1280, 800
 EXPLORE, END_EXPLORING = 'Explore', 'End exploring'
 RESET, RESTORE = 'Reset after a stop', 'Restore isolated muscles'
 RUPTURE, REPAIR = 'Rupture', 'Repair'
@@ -49,10 +50,10 @@ BUTTONS = {
     'call estimator/zero': CALIBRATE,
     'call controller/explore to explore again': EXPLORE,
 }
-PUSH_STIFFNESS = 200.0  # [N/m] force per distance that the mouse drags
+PUSH_STIFFNESS = 200.0  # force per distance that the mouse drags [N/m]
 MOST_PUSH = 60.0  # [N]
 MOST_PAYLOAD = 5.0  # [kg]
-HOT = 80.0  # [°C] at the right end of a bar
+HOT = 80.0  # temperature at the right end of a bar [°C]
 
 
 class Page:

@@ -14,15 +14,15 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 
-LEFT_PANEL = 350  # [pixels] width
+LEFT_PANEL = 350  # width of the left panel [pixels]
 ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
 HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # its macros
-DURATION = 60.0  # [s] length of the curves
-GAP = 1.0  # [s] without a value after which a curve restarts
+DURATION = 60.0  # time that the curves show [s]
+GAP = 1.0  # time without a value after which a curve restarts [s]
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
-HEIGHT = 84  # [pixels] of a plot
+HEIGHT = 84  # height of a plot [pixels]
 TIME_AXIS = {'incrs': [0.25 * DURATION], 'space': 30, 'size': 26}
 #: uPlot takes the smallest distance of ticks of at least `space` pixels: half of any `scale_top`.
 #: The axes never change, because viser's charts lose the time axis when they do.

@@ -193,6 +193,7 @@ def test_a_killed_learner_does_not_disturb_a_motion(moving):
     arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'a movement under way')
     arm.kill(learner)
     arm.goes_to(THERE)
-    for node in ('controller', 'estimator', 'hardware_emulator'):  # once the arm is at rest
+    # The nodes report no problem as soon as the arm is at rest.
+    for node in ('controller', 'estimator', 'hardware_emulator'):
         arm.graph.wait(lambda node=node: arm.state(node).level == 'ok', f'{node} to be well')
     arm.never_jumped(before)

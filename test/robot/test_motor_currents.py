@@ -21,7 +21,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 from musculoskeletal_ae.validity import read_muscle_states
 
 DRIVE = {'torque_constant': 0.05, 'gear': 20.0, 'spool_radius': 0.01}
-PER_AMPERE = 100.0  # [N/A] of DRIVE
+PER_AMPERE = 100.0  # tension per motor current of DRIVE [N/A]
 BY_CURRENT = {'actuation': 'position', 'tension_source': 'current'}
 ROBOT = Robot(with_modules(Robot.load('arm26').description, **BY_CURRENT))
 COUNT = ROBOT.muscle_count
