@@ -143,9 +143,8 @@ class Follower(ActivityControl):
         self._blend: Ramp | None = None
         self.tension: Array = robot.tension.bias.copy()
         self._motor: Array = self.tension  # planned motor-side tension [N], (M,)
-        self._sliding: Array = np.zeros(
-            robot.muscle_count
-        )  # sliding direction s of each tendon, (M,)
+        #: sliding direction s of each tendon, (M,)
+        self._sliding: Array = np.zeros(robot.muscle_count)
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.
