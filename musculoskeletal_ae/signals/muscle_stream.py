@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
+from musculoskeletal_ae.arrays import Array, Bools, Ints, median_of_rows
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
@@ -144,10 +144,15 @@ class StepCheck:
     """Checks that no length changes faster than a muscle can; accepts a new level that lasts.
 
     It uses lengths as measured, so that new length offsets do not look like jumps.
+
+    A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, its length
+    appears to jump as well. One slack tendon that has become shorter while the others pull is
+    therefore accepted without being named, and left to the detectors of ruptures.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self._slack = LIMITS.slack_share * robot.description.tension.bias
         self._accepted: Array | None = None  # the last accepted lengths [m], (M,)
         #: the last lengths, accepted or not [m], (M,)
         self._last: Array = np.zeros(robot.muscle_count)
@@ -157,10 +162,18 @@ class StepCheck:
         self.jumped: tuple[int, ...] = ()  # muscles whose new level was just accepted
         self.jumped_in_pause = False
 
-    def problem(self, length: Array, used: Bools, now: float) -> tuple[str, str] | None:
+    def problem(
+        self, length: Array, tension: Array, used: Bools, now: float
+    ) -> tuple[str, str] | None:
         """Return reason and detail if a length jumped, or None.
 
         When a new level is accepted, `jumped` contains the muscles that have jumped to it.
+
+        Args:
+            length: Lengths as measured [m], (M,).
+            tension: T_read [N], (M,); NaN where it is unknown.
+            used: Which muscles to check, (M,).
+            now: Time of reception by a steady clock [s].
         """
         self.jumped = ()
         pause = max(now - self._last_at, 0.0)
@@ -184,13 +197,22 @@ class StepCheck:
         if now - self._settled_since > LIMITS.settled:
             # Some lengths may have returned meanwhile, and others may have changed as much by
             # moving.
-            self.jumped = tuple(np.flatnonzero(self._far & (change > allowed)).tolist())
+            far = np.flatnonzero(self._far & (change > allowed))
+            if not self._is_rupture(far, length, tension, used):
+                self.jumped = tuple(far.tolist())
             self.jumped_in_pause = self._after_pause
             self._accept(length)
             return None
         muscle = int(change.argmax())
         by = 1e3 * (length - self._accepted)[muscle]
         return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {by:.0f} mm'
+
+    def _is_rupture(self, far: Ints, length: Array, tension: Array, used: Bools) -> bool:
+        """Return whether one tendon alone is slack and wound in, as after a rupture."""
+        slack = np.flatnonzero((tension < self._slack) & used)
+        if self._accepted is None or not np.array_equal(slack, far) or len(far) != 1:
+            return False
+        return bool(length[far[0]] < self._accepted[far[0]])
 
     def _accept(self, length: Array) -> None:
         self._accepted, self._settled_since = length, math.inf
@@ -366,7 +388,7 @@ class MuscleStream:
         problem = self._levels.problem(states, self.body.used, known)
         if problem is not None:
             return problem
-        problem = steps.problem(read[0], self.body.used, now)
+        problem = steps.problem(read[0], read[1], self.body.used, now)
         if steps.jumped:
             self.has_displaced_unseen = steps.jumped_in_pause
             self.displaced |= set(steps.jumped)

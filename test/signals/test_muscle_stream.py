@@ -131,6 +131,23 @@ def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
     assert stream.has_displaced_unseen
 
 
+def jumps_of_a_winding_tendon(by, tension):
+    """Return the muscles named if muscle 1 winds in by `by` [m] while the messages pause."""
+    stream, jumped = MuscleStream(ROBOT), []
+    for n in range(300):
+        if not 20 <= n < 60:
+            wound = resting(length=(1, by), tension=(1, tension))
+            with suppress(RejectionError):
+                jumped += stream.take_states(wound if n > 20 else resting(), n * PERIOD).jumped
+    return jumped
+
+
+def test_a_tendon_that_ruptures_while_messages_are_late_is_not_reported_as_a_jump_of_its_length():
+    assert jumps_of_a_winding_tendon(-0.1, 0.0) == []
+    assert jumps_of_a_winding_tendon(0.1, 0.0) == [1]
+    assert jumps_of_a_winding_tendon(-0.1, ROBOT.tension.bias[1]) == [1]
+
+
 def test_an_isolated_muscle_is_no_longer_displaced():
     stream = MuscleStream(ROBOT)
     jump_together(stream)
