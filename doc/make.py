@@ -199,13 +199,13 @@ def command_line() -> str:
     return '\n'.join(lines).rstrip() + '\n'
 
 
-#: rows of README's table: key of `experiment robustness`, label, and the paper's value on Musashi
+#: rows of README's table: key of `experiment robustness`, and label
 ESTIMATES = {
-    'before_rad': ('before learning', '0.414'),
-    'least_squares_rad': ('least squares on the geometric model (no learning)', '–'),
-    'paper_after_rad': ('preset `paper`, after learning', '0.186'),
-    'after_rad': ('**preset `default`, after learning**', '–'),
-    'joint_sensors_rad': ('the joint sensors themselves', '–'),
+    'before_rad': 'before learning',
+    'least_squares_rad': 'least squares on the geometric model (no learning)',
+    'paper_after_rad': 'preset `paper`, after learning',
+    'after_rad': '**preset `default`, after learning**',
+    'joint_sensors_rad': 'the joint sensors that it learned from',
 }
 #: of README: what, a text with numbers of an experiment's result.json, and the experiment
 CAPABILITIES = (
@@ -215,22 +215,30 @@ CAPABILITIES = (
         'sensors',
     ),
     (
-        'the same, if a camera sees a marker on the hand in one of ten resting postures',
+        'the same, if a camera sees a marker on the hand in a tenth of the resting postures',
         '{marker_tenth_rad:.3f} rad',
         'sensors',
     ),
     (
         'naming the ruptured muscle, if it carried tension',
-        '{named_share:.0%} of {counted_cuts}, {detection_s:.2f} s after the rupture on average',
+        '{named} of {counted_cuts}, {detection_s:.2f} s after the rupture on average',
         'estimation',
     ),
-    ('false alarms in one healthy hour', '{false_alarms}', 'estimation'),
+    (
+        'false alarms of healthy arms',
+        '{false_alarms} in {hours:.0f} h',
+        'estimation',
+    ),
     (
         'isolating exactly the ruptured muscle within 10 s (`on_anomaly: isolate`)',
-        '{right_isolations_share:.0%} of the ruptures',
+        '{isolated} of {ruptures}',
         'resilience',
     ),
-    ('wrong isolations in ten healthy hours', '{wrong_isolations}', 'resilience'),
+    (
+        'wrong isolations of healthy arms',
+        '{wrong_isolations} in {hours:.0f} h',
+        'resilience',
+    ),
     (
         'mean tracking error of point-to-point motions of 1 s',
         '{track_1s_rad:.3f} rad',
@@ -248,27 +256,39 @@ def estimates_table() -> str:
     """Return the table of errors in README."""
     result = read(FOLDER / 'results')['robustness']
     about = result['about']
-    lines = [
-        '| | emulator `kin` | emulator `foreign` | paper, on Musashi |',
-        '|---|---|---|---|',
-    ]
-    for key, (label, printed) in ESTIMATES.items():
+    lines = ['| | emulator `kin` | emulator `foreign` |', '|---|---|---|']
+    for key, label in ESTIMATES.items():
         cells = [f'{result[reality][key]:.3f}' for reality in ('kin', 'foreign')]
         if key == 'after_rad':
             cells = [f'**{cell}**' for cell in cells]
-        lines.append(f'| {label} | {" | ".join(cells)} | {printed} |')
+        lines.append(f'| {label} | {" | ".join(cells)} |')
     lines += ['', f'`experiment robustness`, means over {individuals(about["seeds"])}.']
     return '\n'.join(lines)
 
 
 def capabilities_table() -> str:
-    """Return the table of capabilities in README."""
-    results = read(FOLDER / 'results')
-    lines = ['| capability on `kin` | result | command |', '|---|---|---|']
+    """Return the table of capabilities in README, with both emulator models."""
+    kin, foreign = (read(FOLDER / 'results' / folder) for folder in ('', 'foreign'))
+    lines = ['| capability | `kin` | `foreign` | experiment |', '|---|---|---|---|']
     for what, text, name in CAPABILITIES:
-        command = f'`experiment {name}`, {individuals(results[name]["about"]["seeds"])}'
-        lines.append(f'| {what} | {text.format(**results[name])} | {command} |')
+        cells = [_with_numbers(text, results.get(name)) for results in (kin, foreign)]
+        which = individuals(kin[name]['about']['seeds'])
+        lines.append(f'| {what} | {" | ".join(cells)} | `{name}`, {which} |')
     return '\n'.join(lines)
+
+
+def _with_numbers(text: str, result: dict[str, Any] | None) -> str:
+    """Return a text with the numbers of a result and with counts that follow from them."""
+    if result is None:
+        return '–'
+    numbers = dict(result)
+    numbers['hours'] = result.get('healthy_s', 0.0) / 3600.0
+    if 'named_share' in result:
+        numbers['named'] = round(result['named_share'] * result['counted_cuts'])
+    if 'right_isolations_share' in result:
+        numbers['ruptures'] = len(result['muscles']) * len(result['about']['seeds'])
+        numbers['isolated'] = round(result['right_isolations_share'] * numbers['ruptures'])
+    return text.format(**numbers)
 
 
 def recordings_tables() -> str:
