@@ -71,7 +71,7 @@ def test_links_between_documents_lead_somewhere():
 
 def test_the_python_of_the_readme_estimates_without_ros(trained_file, tmp_path):
     (lines,) = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text('utf-8'), re.S)
-    (tmp_path / 'arm.safetensors').write_bytes(Path(trained_file).read_bytes())
+    (tmp_path / 'learned.safetensors').write_bytes(Path(trained_file).read_bytes())
     robot = Robot.load('arm26')
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, 80.0)
