@@ -11,7 +11,6 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
 SHOWN = 10.0  # time for which `refusal` reports the last refusal [s]
-LONGEST_PERIOD = 1.5  # time between two reports above which this node itself has paused [s]
 # A source time that lies further back than this comes from another clock, not from reordering.
 REORDERING = 1_000_000_000  # [ns]
 
@@ -19,9 +18,16 @@ REORDERING = 1_000_000_000  # [ns]
 class Reception:
     """Counts received, rejected and ignored messages."""
 
-    def __init__(self, warn: Callable[[str], object]) -> None:
-        """Start with empty counters; `warn` receives the first rejection for each reason."""
-        self._warn = warn
+    def __init__(
+        self, warn: Callable[[str], object], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Start with empty counters.
+
+        Args:
+            warn: Receives the first rejection for each reason.
+            clock: Returns the time on which silence is measured [s].
+        """
+        self._warn, self._clock = warn, clock
         self.last_rejected = ''  # source and fault of the last rejected message
         self.rejected: Counter[str] = Counter()  # messages by topic and reason
         #: unused parts of messages that were otherwise used, by topic and part
@@ -30,7 +36,8 @@ class Reception:
         self.commands: set[str] = set()
         self._refusal = '', -math.inf  # text of the last refusal, and its time [s]
         self._received: Counter[str] = Counter()
-        self._started_at = time.monotonic()
+        self._rates_taken_at = time.monotonic()  # [s]
+        self._started_at = clock()  # [s]
         self._used_at: dict[str, float] = {}  # time of the last used message by topic [s]
         #: sequence number of the newest message by topic; 0: unknown
         self.numbers: Counter[str] = Counter()
@@ -88,11 +95,11 @@ class Reception:
     def note_used(self, topic: str) -> None:
         """Count a message that was used, perhaps later than it was received."""
         self._received[topic] += 1
-        self._used_at[topic] = time.monotonic()
+        self._used_at[topic] = self._clock()
 
     def silence(self, topic: str) -> float:
         """Return the time since the last used message of a topic, or since the start [s]."""
-        return time.monotonic() - self._used_at.get(topic, self._started_at)
+        return self._clock() - self._used_at.get(topic, self._started_at)
 
     def was_used(self, topic: str) -> bool:
         """Whether any message of a topic was used."""
@@ -130,29 +137,15 @@ class Reception:
         kind = type(error).__name__
         return self.reject(source, kind, f'{kind}: {printable(error)}')
 
-    def take_received(self) -> dict[str, int]:
-        """Return the number of messages used since the last call, by topic."""
-        received = dict(self._received)
-        self._received = Counter(dict.fromkeys(received, 0))
-        return received
+    def take_rates(self) -> dict[str, float]:
+        """Return the rate of used messages since the last call [Hz], by topic.
 
-
-class Pauses:
-    """Decides whether a pause of this node itself excuses the silence of a stream.
-
-    After a pause, messages wait unread. A report that comes late is therefore no proof of silence,
-    but the next one is: a node that always reports late would otherwise never name a silent stream.
-    """
-
-    def __init__(self) -> None:
-        self._reported_at, self._was_late = math.inf, False
-
-    def excuse(self, now: float) -> bool:
-        """Return whether to ignore silence in the report at `now`, on a steady clock [s]."""
-        is_late = now - self._reported_at > LONGEST_PERIOD
-        self._reported_at = now
-        was_late, self._was_late = self._was_late, is_late
-        return is_late and not was_late
+        A topic of which a message was ever used stays in the result.
+        """
+        now = time.monotonic()
+        elapsed, self._rates_taken_at = now - self._rates_taken_at, now
+        received, self._received = self._received, Counter(dict.fromkeys(self._received, 0))
+        return {topic: count / elapsed for topic, count in received.items()}
 
 
 class Stamps:

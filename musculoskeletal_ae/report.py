@@ -18,6 +18,12 @@ class Report(NamedTuple):
     message: str
     values: dict[str, str]
 
+    def with_warning(self, warning: str) -> 'Report':
+        """Return a report with one more warning; an error is returned unchanged."""
+        if self.level == 'error':
+            return self
+        return Report('warn', f'{self.message}; {warning}', self.values)
+
 
 def load_text() -> str:
     """Return the load of this computer in the last minute, such as "5 on 2 cores"."""

@@ -4,7 +4,7 @@
 `now` is the time of a steady clock [s], which determines ages. `time` is the time of the messages'
 clock [s], which determines the change of commands. If the messages' clock is slow, as in a slow
 simulator, the allowed age grows in proportion, up to 1/`SLOWEST`. A fast clock does not shorten it.
-Pauses of the controller itself do not count as age.
+Pauses of the controller itself do not count as age (`AwakeClock`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.report import distinct
@@ -50,12 +51,12 @@ class DataAge:
         self.stepped_at = -math.inf
         self._came_at = {MUSCLE_STATES: -math.inf, ESTIMATE: -math.inf}
         self._time = math.nan  # time of the messages at the last step [s]
-        self._asleep = 0.0  # total time of the controller's own pauses [s]
+        self._awake = AwakeClock(OWN_PAUSE)
         self.pace = 1.0  # pace of the messages' clock relative to the steady clock
 
     def awake(self, now: float) -> float:
         """Return the time without the controller's own pauses [s]."""
-        return now - self._asleep
+        return self._awake.at(now)
 
     def received(self, cause: StopCause, now: float) -> float:
         """Record that data was received; return the time since the previous data [s].
@@ -85,8 +86,8 @@ class DataAge:
         if self.stepped_at == -math.inf or math.isnan(passed):
             elapsed = passed = 0.0
         self.stepped_at, self._time = now, time
+        self._awake.tick(now)
         counted = min(elapsed, OWN_PAUSE)
-        self._asleep += elapsed - counted
         has_jumped = not 0.0 <= passed < LONGEST_STEP + 10.0 * counted
         if counted > 0.0 and not has_jumped:
             share = 1.0 - math.exp(-counted / PACE_SPAN)

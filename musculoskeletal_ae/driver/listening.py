@@ -138,9 +138,9 @@ class Listening:
             if not self._stated:  # joints may come in several messages
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
 
-    def pause(self, begin: float, end: float) -> None:
-        """Record that this process was ready but did not run in this interval."""
-        self._pace.pause(begin, end)
+    def tick(self, now: float) -> None:
+        """Record that this process runs; call this more often than every `pace.LONGEST_TICK`."""
+        self._pace.tick(now)
 
     @contextmanager
     def _rejecting(self, topic: str) -> Iterator[None]:

@@ -2,8 +2,8 @@
 """Measure the rate at which a driver publishes, which can differ from the rate of reception.
 
 Source time and sequence number of a message give the rate of publication. Without them, the time of
-reception is used. A busy computer may delay or lose messages, or block the driver. `Pace` therefore
-also records when this process itself was blocked.
+reception is used. A busy computer may delay or lose messages, or block the driver. An
+`AwakeClock` therefore tells whether this process itself was blocked.
 """
 
 import os
@@ -12,18 +12,21 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded, load_text
 
 RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
 LONGEST_GAP = 0.2  # longest gap between two messages [s]; the controller's `max_age`
-OWN_PAUSE = 0.05  # shorter pauses of this process are ignored [s]
+#: time between two ticks above which this process was blocked [s]; check_driver ticks every 0.02 s
+LONGEST_TICK = 0.07
 OVERLOAD = 1.5  # load average per core above which this computer may slow the driver down
 LEAST_LOST = 0.05  # a larger fraction of lost messages is reported
 
 
 class _Message(NamedTuple):
     came: float  # time of reception [s]
+    came_awake: float  # the same without pauses of this process [s]
     sent: float  # source time by the driver's clock [s]; NaN if unknown
     number: int  # sequence number; 0 if unknown
 
@@ -35,7 +38,7 @@ class Pace:
         """Expect messages at a rate [Hz]."""
         self._rate = rate
         self._messages: list[_Message] = []
-        self._pauses: list[tuple[float, float]] = []  # begin and end [s]
+        self._awake = AwakeClock(LONGEST_TICK)
 
     @property
     def count(self) -> int:
@@ -44,16 +47,15 @@ class Pace:
 
     def message(self, came: float, sent: float, number: int) -> None:
         """Record times [s] and sequence number of a message."""
-        self._messages.append(_Message(came, sent, number))
+        self._messages.append(_Message(came, self._awake.at(came), sent, number))
 
-    def pause(self, begin: float, end: float) -> None:
-        """Record that this process was ready but did not run in this interval [s]."""
-        if end - begin > OWN_PAUSE:
-            self._pauses.append((begin, end))
+    def tick(self, now: float) -> None:
+        """Record that this process runs; call this more often than every LONGEST_TICK."""
+        self._awake.tick(now)
 
     def judge(self, verdict: Verdict, now: float) -> None:
         """Check the rate and the gaps until now [s]."""
-        came, sent, number = map(np.array, zip(*self._messages))
+        came, came_awake, sent, number = map(np.array, zip(*self._messages))
         is_dated = bool(np.isfinite(sent).all() and (np.diff(sent) >= 0.0).all())
         is_numbered = is_dated and bool((number > 0).all() and (np.diff(number) > 0).all())
         times = sent if is_dated else came
@@ -69,7 +71,8 @@ class Pace:
         # Gaps with lost messages are left out, because the driver did publish in them.
         gaps = np.append(gaps[steps == 1], now - came[-1])
         gap = float(gaps.max())
-        if self._explain(gap, came, now):
+        came, came_awake = np.append(came, now), np.append(came_awake, self._awake.at(now))
+        if gap > LONGEST_GAP and _explained(came, came_awake):
             verdict.notes.append(
                 f'this computer is busy: no message was received for {gap:.2f} s, and check_driver '
                 'was blocked as well. The rate was not checked; end other programs and try again'
@@ -88,15 +91,12 @@ class Pace:
                 'be slow for this reason alone: end other programs and try again'
             )
 
-    def _explain(self, gap: float, came: Array, now: float) -> bool:
-        """Return whether pauses of this process make up most of the longest gap."""
-        if gap <= LONGEST_GAP:
-            return False
-        ends = np.append(came, now)
-        longest = int(np.diff(ends).argmax())
-        begin, end = ends[longest], ends[longest + 1]
-        own = sum(max(0.0, min(end, b) - max(begin, a)) for a, b in self._pauses)
-        return bool(own > 0.5 * (end - begin))
+
+def _explained(came: Array, came_awake: Array) -> bool:
+    """Return whether pauses of this process make up most of the longest gap between times."""
+    gaps = np.diff(came)
+    longest = int(gaps.argmax())
+    return bool(np.diff(came_awake)[longest] < 0.5 * gaps[longest])
 
 
 def _note_load(verdict: Verdict) -> None:

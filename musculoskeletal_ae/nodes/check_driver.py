@@ -63,16 +63,11 @@ class CheckDriver:
         kind = message_class(self.motors.state_type)
         subscribe(kind, self.topic, lambda m, info: self.muscles(m, info), SENSOR)
         subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
-        self.on_pause: Callable[[float, float], object] = lambda *_: None
-        self._ticked_at = time.monotonic()
-        self.node.create_timer(TICK, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.tick: Callable[[float], object] = lambda _: None
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.node.create_timer(TICK, lambda: self.tick(time.monotonic()), clock=clock)
         self.spin_until = Spinner(self.node).spin_until
         self.spin_until(lambda: False, DISCOVERY_TIME)
-
-    def _tick(self) -> None:
-        now = time.monotonic()
-        self.on_pause(self._ticked_at + TICK, now)
-        self._ticked_at = now
 
     def _mistyped(self) -> str:
         kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(self.topic)}
@@ -90,7 +85,7 @@ class CheckDriver:
             number = info['publication_sequence_number']
             listening.muscles(message, time.monotonic(), sent, number)
 
-        self.muscles, self.joints, self.on_pause = take, listening.joints, listening.pause
+        self.muscles, self.joints, self.tick = take, listening.joints, listening.tick
         self.spin_until(lambda: listening.count, 2.0)
         if not listening.count:
             _say(f'waiting for {self.topic} (ROS_DOMAIN_ID {node.context.get_domain_id()})')

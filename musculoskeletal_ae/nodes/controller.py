@@ -303,7 +303,7 @@ class Controller(Shell):
         if problem := self.memory.problem:
             report.values['stop that is not kept'] = problem
             if report.level == 'ok':
-                report = report._replace(level='warn', message=f'{report.message}; {problem}')
+                report = report.with_warning(problem)
         if left_out := self.recording.left_out:
             report.values['messages too large for a stop recording'] = str(left_out)
         stopped = [] if self.core.supervisor.is_running else [report.message]

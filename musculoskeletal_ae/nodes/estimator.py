@@ -65,7 +65,7 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=self.published_anomaly))
         self.needed.add('muscle_states')
         if not self.get_parameter('use_sim_time').value:  # simulated time may be slow
-            self._diagnostics.expected_rates['muscle_states'] = self.rate
+            self.needed.expect_rate('muscle_states', self.rate)
         self.posture: tuple[float, ...] = ()  # value of the parameter zero_posture
         self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
         self.follow_parameter('zero_posture', self._on_posture)

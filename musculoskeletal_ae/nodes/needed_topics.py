@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics that a node needs to work: which are missing, and which have fallen silent."""
+"""The topics that a node needs to work: which are missing, have fallen silent, or are slow."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.control.remedy import REMEDY_STEPS, Step
-from musculoskeletal_ae.nodes.sources import SILENT_TOPIC
-from musculoskeletal_ae.reception import Pauses, Reception
+from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 
 if TYPE_CHECKING:
@@ -17,18 +16,22 @@ if TYPE_CHECKING:
 
 #: needed topics that are published continually, whose silence is therefore an error
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
+SILENT_TOPIC = 'silent topic'  # key of a value in reports
 SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
+SLOW = 0.4  # fraction of the expected rate below which messages come too slowly
+SLOW_REPORTS = 3  # number of successive reports with such a rate after which it is reported
 
 
 class NeededTopics:
-    """Reports missing and silent topics of one node."""
+    """Reports missing, silent and slow topics of one node."""
 
     def __init__(self, node: Shell, reception: Reception) -> None:
         """Start without needed topics."""
         self._node, self._reception = node, reception
         self._topics: list[str] = []
+        self._expected_rates = dict[str, float]()  # [Hz], by topic
+        self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
         self._waiting = ''  # the missing topics, as last logged
-        self._pauses = Pauses()
 
     def __contains__(self, topic: object) -> bool:
         return topic in self._topics
@@ -37,14 +40,28 @@ class NeededTopics:
         """Report these topics while they are missing or silent."""
         self._topics += topics
 
+    def expect_rate(self, topic: str, rate: float) -> None:
+        """Report a topic, too, while its messages come much more slowly than at `rate` [Hz]."""
+        self._expected_rates[topic] = rate
+
     def remove(self, topic: str) -> None:
         """Stop reporting a topic."""
         self._topics = [other for other in self._topics if other != topic]
 
-    def with_silence(self, report: Report) -> Report:
+    def checked(self, report: Report, rates: Mapping[str, float]) -> Report:
+        """Return a report that also names a silent stream and slow topics; log missing topics.
+
+        Args:
+            report: The report of the node.
+            rates: Rate of used messages since the last report [Hz], by topic.
+        """
+        self._log_missing()
+        return self._with_slowness(self._with_silence(report), rates)
+
+    def _with_silence(self, report: Report) -> Report:
         """Return a report that also names a stream on which no usable message arrives."""
         silent = next(filter(self._is_silent, self._topics), None)
-        if self._pauses.excuse(time.monotonic()) or silent is None:
+        if silent is None:
             return report
         step = STREAMS[silent]
         text = f'no usable {silent} for {self._reception.silence(silent):.0f} s: {step.text}'
@@ -52,11 +69,27 @@ class NeededTopics:
         values = {**report.values, SILENT_TOPIC: text, REMEDY_STEPS: steps}
         return Report('error', f'{report.message}; {text}', values)
 
-    def log_missing(self, received: Collection[str]) -> None:
-        """Log the topics that are not among the received ones, with the reason, on any change."""
+    def _with_slowness(self, report: Report, rates: Mapping[str, float]) -> Report:
+        """Return a report with a warning for each topic whose messages keep coming too slowly.
+
+        A topic without any message is silent, not slow.
+        """
+        for topic, expected in self._expected_rates.items():
+            rate = rates.get(topic, 0.0)
+            is_slow = 0.0 < rate < SLOW * expected
+            self._slow_reports[topic] = self._slow_reports[topic] + 1 if is_slow else 0
+            if self._slow_reports[topic] >= SLOW_REPORTS:
+                report = report.with_warning(
+                    f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz: the driver is '
+                    'slow, or this computer is overloaded'
+                )
+        return report
+
+    def _log_missing(self) -> None:
+        """Log the topics without any usable message, with the reason, on any change."""
         reasons = []
         for topic in self._topics:
-            if topic in received:
+            if self._reception.was_used(topic):
                 continue
             name = self._node.full_name(topic)
             has_publisher = self._node.count_publishers(name) > 0

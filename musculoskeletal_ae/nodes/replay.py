@@ -151,7 +151,7 @@ class Replay(Node):
                     self._next_report = now + PERIOD
                     doing = 'paused' if self._timeline.paused else 'playing'
                     report = Report('ok', doing, {'position': self._position()})
-                    self._diagnostics.tell(report)
+                    self._diagnostics.tell(report, {})
                     seconds = self._before + np.array([self._done(), self.length])
                     self._position_publisher.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))

@@ -28,6 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
@@ -74,6 +75,7 @@ if TYPE_CHECKING:  # a slow import, because it loads the bag writer
 #: clock for message ages and watchdogs; independent of /clock
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
+LONGEST_LOOK = 0.3  # time between two checks of the graph above which the node has paused [s]
 MOST_OFFSET = 10.0  # largest offset of a length sensor [m]
 #: remedies for incompatible QoS, by the side that states the policy and by policy
 QOS_REMEDIES = {
@@ -121,7 +123,11 @@ class Shell(Node):
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
-        self._reception = Reception(lambda text: warn(f'{text} (counted in /diagnostics)'))
+        self._awake = AwakeClock(LONGEST_LOOK)
+        self._reception = Reception(
+            lambda text: warn(f'{text} (counted in /diagnostics)'),
+            lambda: self._awake.at(time.monotonic()),
+        )
         #: subscription of each latched topic, and a function that subscribes again
         self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}
         self.sources = Sources(self, self.full_name, self._reception.turns, self._subscribe_anew)
@@ -411,6 +417,7 @@ class Shell(Node):
         self._latched[topic] = subscribe(), subscribe
 
     def _look_around(self) -> None:
+        self._awake.tick(time.monotonic())
         self.sources.look()
         self.on_intruders(self.intruders)
 
@@ -523,8 +530,8 @@ class Shell(Node):
             steps = Step.STOP_SECOND_PUBLISHER.identifier
             values = {**report.values, SEVERAL: intruders, REMEDY_STEPS: steps}
             report = Report('error', text, values)
-        received = self._diagnostics.tell(self.needed.with_silence(report))
-        self.needed.log_missing(received)
+        rates = self._reception.take_rates()
+        self._diagnostics.tell(self.needed.checked(report, rates), rates)
 
 
 def _recorded(

@@ -15,21 +15,20 @@ from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control import remedy
 from musculoskeletal_ae.control.remedy import REPAIR, Step
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.estimation.finding import REVOKING, Kind
-from musculoskeletal_ae.nodes.sources import SEVERAL, SILENT_TOPIC
+from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
+from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
 
 LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
 #: time without a report after which a node counts as silent [s]; nodes report once a second
 SILENCE = 2.0
-TICK = 1.0  # time between two ticks [s]
-#: Interval between two ticks above which this process was paused [s]. Nodes do not become silent
-#: during such a pause.
-LONGEST_TICK = 1.5
+TICK = 1.0  # longest time between two ticks unless this process was paused [s]
 #: time without a report after which a node that is not in NEEDED no longer counts [s]
 FORGET_TIME = 5.0
 #: nodes whose silence is an error once they have reported
@@ -106,7 +105,7 @@ class Situation:
 
     def __init__(self, namespace: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begin without reports; `clock` returns steady time [s]."""
-        self._clock = clock
+        self._clock, self._awake = clock, AwakeClock(TICK)
         self._here = namespace.rstrip('/')
         self.detected = False
         self.samples = self.checkpoints = self.doing = ''
@@ -118,20 +117,18 @@ class Situation:
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
         #: version of a node's other network and the number of reports that name it, by node
         self._other_networks: dict[str, tuple[str, int]] = {}
-        self._ticked_at = math.nan  # time of the last tick [s]
-        self._slept = 0.0  # total duration of the pauses of this process [s]
 
     def tick(self) -> None:
-        """Update ages; call this about once a second, before `trouble` and `level`."""
-        now = self._clock()
-        elapsed = now - self._ticked_at
-        if elapsed > LONGEST_TICK:  # after a pause, messages still wait to be read
-            self._slept += elapsed - TICK
-        self._ticked_at = now
-        awake = now - self._slept
+        """Forget nodes that have ended; call this about once a second, to recognize pauses."""
+        self._awake.tick(self._clock())
         for name, node in list(self._nodes.items()):
-            if not _is_needed(name) and awake - node.heard_at > FORGET_TIME:
+            if not _is_needed(name) and self._now - node.heard_at > FORGET_TIME:
                 del self._nodes[name]
+
+    @property
+    def _now(self) -> float:
+        """The present time, excluding pauses of this process [s]."""
+        return self._awake.at(self._clock())
 
     def diagnosed(self, message: DiagnosticArray) -> None:
         """Process a message of /diagnostics."""
@@ -140,7 +137,7 @@ class Situation:
             namespace, _, name = full_name.rpartition('/')
             if namespace != self._here:
                 continue
-            node = self._nodes[full_name] = Node(status, self._clock() - self._slept)
+            node = self._nodes[full_name] = Node(status, self._now)
             if name == 'learner':
                 self.samples = node.values.get('samples', '')
                 self.checkpoints = node.values.get('checkpoints', '')
@@ -273,7 +270,7 @@ class Situation:
 
     def silent_nodes(self) -> dict[str, float]:
         """Return the time since the last report of each needed node that has become silent [s]."""
-        now = self._ticked_at - self._slept
+        now = self._now
         return {
             name: now - node.heard_at
             for name, node in self._nodes.items()

@@ -46,7 +46,6 @@ AUTHORS = {
 }
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
 SEVERAL = 'several publishers'  # rejection reason
-SILENT_TOPIC = 'silent topic'  # key of a value in reports
 
 LOOK_PERIOD = 0.1  # time between checks of the graph [s]
 LOOKS = 20  # number of checks within which turns of two publishers are counted

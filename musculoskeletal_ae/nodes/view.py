@@ -182,7 +182,7 @@ class View(Node):
             if (now := time.monotonic()) >= self.reported_at + diagnostics.PERIOD:
                 self.reported_at = now
                 state = 'viewed' if is_viewed else 'the page has no visitors'
-                self.diagnostics.tell(Report('ok', state, {}))
+                self.diagnostics.tell(Report('ok', state, {}), self.reception.take_rates())
             while not self.requests.empty():  # including the last visitor's requests
                 what, *value = self.requests.get()
                 try:

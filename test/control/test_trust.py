@@ -235,6 +235,18 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
     assert pause > OWN_PAUSE
 
 
+@pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
+def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(pause):
+    """Messages that are read before the first step after the pause were too fresh by its length."""
+    bench = DistortingBench(max_age=0.2, hold_time=0.5)
+    bench.step()
+    bench.now += pause
+    bench.step()
+    bench.blind = {'muscles'}
+    bench.step(30)
+    assert bench.cause == 'stale_muscle_states'
+
+
 # -- clocks ---------------------------------------------------------------------------------------
 
 
