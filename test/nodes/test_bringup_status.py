@@ -11,8 +11,8 @@ from sensor_msgs.msg import JointState
 from musculoskeletal_ae.control.remedy import identifiers
 from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.nodes import bringup_status
-from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
+from musculoskeletal_ae.nodes.situation import Situation, figures
 
 
 def diagnostics(
