@@ -28,10 +28,11 @@ say 'mypy'
 # Use a private ROS graph, separate from the network and from other runs on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 use_udp
-export ROS_DOMAIN_ID=$(($$ % 33 * 3 + 1)) # and the next two, one for each process of pytest
+export ROS_DOMAIN_ID=$(($$ % 25 * 4 + 1)) # and the next three, one for each process of pytest
 export ROS_LOG_DIR=$repository/log/test
-# The processes of pytest occupy all cores, so further threads of torch would slow them down.
+# Many tests wait for messages in real time. Four processes of pytest keep two cores busy
+# meanwhile, and further threads of torch would slow them down.
 export OMP_NUM_THREADS=1
 
 say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"
-exec "$python" -m pytest -n 3 --dist worksteal "$@"
+exec "$python" -m pytest -n 4 --dist worksteal "$@"

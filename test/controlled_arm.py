@@ -13,6 +13,9 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.validity import read_array, read_muscle_states
 
 RATE_LIMIT = 0.2  # [m/s]
+#: the longest legal max_age [s], so that a loaded machine does not stop the arm
+PATIENT = 10.0
+IMPATIENT = 1.0  # max_age while a test waits for a stop because of missing data [s]
 NODES = {
     'hardware_emulator': HardwareEmulator,
     'estimator': Estimator,
@@ -56,7 +59,7 @@ class ControlledArm:
             first_duration=1.0,
             second_duration=0.5,
             rate_limit=RATE_LIMIT,
-            max_age=1.0,  # avoids stops because of a loaded machine
+            max_age=PATIENT,
             **parameters,
         )
 
@@ -65,6 +68,9 @@ class ControlledArm:
         self.graph.processes.remove(process)
         process.process.kill()
         self.graph.wait(lambda: not process.alive(), f'the end of {process.name}')
+
+    def set_max_age(self, seconds):
+        assert self.graph.set_parameter('controller', 'max_age', seconds)[0]
 
     def target(self, theta, effort=()):
         self.targets.publish(

@@ -116,7 +116,7 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     import_robot(model, robot)
     model.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
     # The paper's network is trained in a few seconds.
-    chosen = ['--robot', str(robot), '--preset', 'paper']
+    chosen = ['--robot', str(robot), '--preset', 'paper', '--no-learner']
 
     # Shown to the network on request, and killed.
     shown = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}

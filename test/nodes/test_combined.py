@@ -17,7 +17,7 @@ def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, tra
         graph.listen(kind, topic)
     graph.start('hardware_emulator', robot='arm26')
     process = graph.start(
-        'combined', robot='arm26', checkpoint=trained_file, explore=True, max_age=2.0
+        'combined', robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0
     )
     graph.next('estimated_joint_states', 20)
     graph.next('muscle_length_command', 20)

@@ -93,7 +93,7 @@ def test_a_callback_that_awaits_a_future_goes_on_when_it_is_done(graph):
 
     graph.node.create_subscription(String, 'begin', ask, 10)
     graph.publisher(String, 'begin').publish(String())
-    graph.wait(lambda: answers, 'the answer', 10.0)
+    graph.wait(lambda: answers, 'the answer')
     assert isinstance(answers[0], Trigger.Response)
 
 
@@ -111,7 +111,7 @@ def test_messages_are_handled_while_a_callback_awaits(graph):
     graph.wait(lambda: heard, 'the message')
     future.set_result('done')
     quick.publish(String(data='again'))
-    graph.wait(lambda: 'done' in heard, 'the end', 10.0)
+    graph.wait(lambda: 'done' in heard, 'the end')
     assert heard[0] == 'meanwhile'
 
 

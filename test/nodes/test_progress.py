@@ -8,12 +8,14 @@ import threading
 import time
 from pathlib import Path
 
+from graph import DEADLINE
+
 from musculoskeletal_ae.nodes.progress import STALLED, ProgressWatch
 
 START = (
     'from musculoskeletal_ae.nodes.progress import ProgressWatch\n'
     'import time\n'
-    'watch = ProgressWatch(longest=0.5, look_period=0.1)\n'
+    'watch = ProgressWatch(longest=1.0, look_period=0.1)\n'
     'watch.start()\n'
     'print("started", flush=True)\n'
 )
@@ -28,14 +30,14 @@ def run(code: str) -> subprocess.Popen[str]:
 
 def test_without_progress_the_process_ends_with_the_stacks_in_its_log():
     process = run('time.sleep(60)')
-    _, errors = process.communicate(timeout=50)
+    _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == STALLED
     assert 'no progress' in errors and 'most recent call first' in errors
 
 
 def test_a_native_call_that_keeps_the_lock_of_python_ends_the_process_too():
     process = run('sum(range(10**12))')
-    _, errors = process.communicate(timeout=50)
+    _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == -signal.SIGVTALRM
     assert 'most recent call first' in errors
 
@@ -47,16 +49,16 @@ def test_a_suspended_process_is_no_process_that_hangs():
     process.send_signal(signal.SIGSTOP)
     time.sleep(1.5)
     process.send_signal(signal.SIGCONT)
-    _, errors = process.communicate(timeout=50)
+    _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == 0, errors
 
 
 def test_progress_keeps_the_watch_quiet_until_it_ends():
     stalled = threading.Event()
-    watch = ProgressWatch(longest=0.4, look_period=0.05, on_stall=stalled.set)
+    watch = ProgressWatch(longest=1.0, look_period=0.05, on_stall=stalled.set)
     watch.start()
-    for _ in range(20):
+    for _ in range(30):
         watch.note()
         assert not stalled.wait(0.05)
-    assert stalled.wait(30.0)
+    assert stalled.wait(DEADLINE)
     watch.stop()

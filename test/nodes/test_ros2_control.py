@@ -121,7 +121,7 @@ def test_the_emulator_plays_the_same_robot(graph, arm26):
 def test_our_nodes_command_the_emulator_by_its_motors(graph, trained_file):
     emulator = host(graph, HardwareEmulator)
     host(graph, Estimator, checkpoint=trained_file)
-    host(graph, Controller, checkpoint=trained_file, max_age=5.0, explore=True)
+    host(graph, Controller, checkpoint=trained_file, max_age=10.0, explore=True)
     graph.wait(lambda: not emulator.arm.safe, 'a command to the motors')
     assert not emulator.rejected
 

@@ -175,7 +175,7 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
     graph.host(Sim, **common, as_robot=True)
     graph.host(Estimator, **common)
     # A large max_age avoids stops on a loaded machine.
-    graph.host(Controller, **common, first_duration=1.0, max_age=1.0)
+    graph.host(Controller, **common, first_duration=1.0, max_age=10.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
     assert graph.received['robot_description'][0].data == arm26.description.urdf

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rclpy
 from controlled_arm import ControlledArm
-from graph import LOOK
+from graph import DEADLINE, LOOK
 from network_attacks import ATTACKS
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -95,8 +95,16 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
     nodes = arm.estimator, arm.controller
     first = trained['default'].version
     network = replace(trained['paper'], version=first + 1)
-    arm.graph.send_network(checkpoint.to_bytes(network))
-    arm.graph.wait(lambda: all(n.core.mae.version == first + 1 for n in nodes), 'the new one')
+    rejected = -1
+
+    def is_used():  # on a busy machine, late messages may contradict a healthy network
+        nonlocal rejected
+        if arm.estimator.rejected[REFUSED] > rejected:
+            rejected = arm.estimator.rejected[REFUSED]
+            arm.graph.send_network(checkpoint.to_bytes(network))
+        return all(node.core.mae.version == first + 1 for node in nodes)
+
+    arm.graph.wait(is_used, 'the new one')
     arm.estimator.candidates.on_anomaly(True)
     arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven one')
 
@@ -167,7 +175,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         target_duration=0.0,
         first_duration=2.0,
         feedback_gain=0.0,
-        max_age=1.0,
+        max_age=10.0,
         use_sim_time=True,
     )
     clock = graph.node.create_publisher(Clock, '/clock', 10)
@@ -191,7 +199,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         if follower.trajectory is not None and not follower.is_moving:
             done_at = now
         graph.spin(0.01)
-        assert time.monotonic() - started < 60.0
+        assert time.monotonic() - started < DEADLINE
     assert node.core.supervisor.is_running
     # By the steady clock, the trajectory would end after 0.6 s of simulated time.
     assert follower.trajectory.duration >= 2.0
@@ -207,6 +215,6 @@ def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
     graph.next('muscle_states', 300)
     detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
     estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
-    graph.host(Controller, robot='arm26', checkpoint=trained_file, explore=True, max_age=1.0)
-    graph.wait(lambda: detected and detected[-1].data, 'the detection', 40.0)
+    graph.host(Controller, robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0)
+    graph.wait(lambda: detected and detected[-1].data, 'the detection')
     assert estimator.core.cause.startswith(muscle)

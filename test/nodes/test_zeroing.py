@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from graph import DEADLINE
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -36,6 +37,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     graph.wait(
         lambda: all(n.body.offsets.known and n.body.offsets.offset.any() for n in nodes),
         'the zeros',
+        8 * DEADLINE,
     )
     offset = hardware.arm.faults.zero
     assert np.abs(offset).min() > 0.05
