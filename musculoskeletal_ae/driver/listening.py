@@ -112,6 +112,11 @@ class Listening:
         """Number of messages of muscle_states, valid or not."""
         return self._pace.count
 
+    @property
+    def measured(self) -> Array:
+        """The newest θ of the joint sensors [rad], (D,); NaN where it is unknown."""
+        return np.full_like(self._theta, math.nan) if self._stated else self._theta
+
     def muscles(self, message: object, now: float, sent: float = math.nan, number: int = 0) -> None:
         """Record a message of muscle_states, or of the motors.
 
@@ -276,7 +281,26 @@ class Listening:
                 what, names = explanation
                 verdict.failed(what, names=', '.join(names))
                 return
+        if lengths_verdict.faults:
+            lengths_verdict.notes += self._suspected_signs(theta, length, tension)
         verdict.add(lengths_verdict)
+
+    def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
+        """Return a note on joints that did not move, if another sign of θ (N, D) explains all l."""
+        names = []
+        for j, name in enumerate(self._robot.joints):
+            turned, other = theta.copy(), Verdict(self._robot)
+            turned[:, j] *= -1.0
+            self._judge_lengths(other, turned, length, tension)
+            if not other.faults:
+                names.append(name)
+        if not names:
+            return []
+        note = (
+            f'all lengths would fit if the sign of the angle of {" or ".join(names)} were '
+            'reversed: check these joint sensors first'
+        )
+        return [note]
 
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
         """Yield possible corrections of θ (N, D), each with its fault and joints.

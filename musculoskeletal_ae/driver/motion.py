@@ -3,6 +3,8 @@
 
 A muscle that does not do what it was commanded to do is released at once, and the test ends. Each
 kind of test decides what that means (`MotionTest._run_away`).
+
+The test also moves the joints. Afterwards, the joint sensors are compared with the lengths.
 """
 
 from abc import ABC, abstractmethod
@@ -13,6 +15,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.signals.joint_sensors import judge
 
 RELEASE = 0.6  # wait after a release [s]
 MEAN = 0.3  # time over which readings are averaged [s]
@@ -47,17 +50,28 @@ class MotionTest(ABC):
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._muscles = robot, muscles or range(robot.muscle_count)
         self.trying = ''  # current step, for messages
+        self._tested = -1  # index of the muscle that is being tested, −1 for none
         self.done = False
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
         self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
         #: last time at which each muscle was within its limits [s]
         self._tame_at: Array = np.zeros(robot.muscle_count)
+        #: θ (D,), states (3, M) and tested muscle of each message, −1 for none
+        self._history: list[tuple[Array, Array, int]] = []
         self._run = self._sequence()
 
-    def step(self, states: Array, now: float) -> Array | None:
-        """Take l, T, temperature (3, M) at a time [s]; return l_target [m] (M,), or None."""
+    def step(self, states: Array, now: float, theta: Array | None = None) -> Array | None:
+        """Take the newest readings; return l_target [m] (M,), or None.
+
+        Args:
+            states: l [m], T [N] and temperature [°C], (3, M).
+            now: Time [s].
+            theta: θ of the joint sensors [rad], (D,), with NaN if unknown; None without sensors.
+        """
         self._now = now
+        if theta is not None:
+            self._history.append((theta, states, self._tested))
         self._recent.append((now, states))
         while now - self._recent[0][0] > MEAN:
             self._recent.popleft()
@@ -95,8 +109,9 @@ class MotionTest(ABC):
             self.trying = 'hold'
             yield from self._hold()
             for m in self._muscles:
-                self.trying = self._robot.muscles[m]
+                self.trying, self._tested = self._robot.muscles[m], m
                 yield from self._try(m)
+            self._judge_joints()
         except RunAwayError as error:
             self.verdict.failed(error.fault, error.muscle, **error.values)
             self._pay_out(error.muscle)
@@ -104,6 +119,32 @@ class MotionTest(ABC):
             end = self._now + RELEASE
             while self._now < end:
                 yield
+
+    def _judge_joints(self) -> None:
+        """Compare the joint sensors with the lengths, unless these are wrong."""
+        verdict, robot = self.verdict, self._robot
+        if not self._history or {'order', 'unit', 'sign'} & verdict.wrong:
+            return
+        theta, states, tested = map(np.array, zip(*self._history, strict=True))
+        if not np.isfinite(theta).all(axis=1).any():
+            verdict.notes.append('signs of joint sensors are not checked without θ of all joints')
+            return
+        judgement = judge(robot, theta, states[:, 0], states[:, 1], segments=tested)
+        for fault in judgement.faults:
+            verdict.failed(fault.kind, names=', '.join(robot.joints[j] for j in fault.joints))
+        if judgement.faults:
+            verdict.withdraw('zero')  # it was compared with the model at wrong angles
+            return
+        unknown = [name for j, name in enumerate(robot.joints) if j not in judgement.right]
+        if judgement.right:
+            names = ', '.join(robot.joints[j] for j in judgement.right)
+            verdict.notes.append(f'the joint sensors have the right sign: {names}')
+        if unknown:
+            verdict.notes.append(
+                f'the sign of these joint sensors is not known, because the joint moved too '
+                f'little: {", ".join(unknown)}. Repeat the test with a higher --tension, or move '
+                'the arm by hand while check_driver listens'
+            )
 
     def _wait(self, duration: float) -> Wait:
         """Wait [s].

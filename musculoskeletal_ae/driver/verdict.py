@@ -73,6 +73,13 @@ class Verdict:
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))
         self.faults.append(Fault(texts.check, muscles, observation, change, what))
 
+    def withdraw(self, what: str) -> None:
+        """Remove the faults of this name, because they have another cause."""
+        check = CHECKS.index(FAULTS[what].check)
+        for fault in [fault for fault in self.faults if fault.name == what]:
+            self.faults.remove(fault)
+            self._state[list(fault.muscles), check] = OPEN
+
     def add(self, other: 'Verdict') -> None:
         """Add the results of another verdict on the same driver."""
         wrong = other._state == WRONG

@@ -59,6 +59,7 @@ class CheckDriver:
         self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
         self.muscles: Callable[[Any, dict[str, int]], object] = lambda *_: None
         self.joints: Callable[[JointState], object] = lambda _: None
+        self.measured: Callable[[], Any] = lambda: None  # the newest θ of the joint sensors
         subscribe: Any = self.node.create_subscription
         kind = message_class(self.motors.state_type)
         subscribe(kind, self.topic, lambda m, info: self.muscles(m, info), SENSOR)
@@ -86,6 +87,7 @@ class CheckDriver:
             listening.muscles(message, time.monotonic(), sent, number)
 
         self.muscles, self.joints, self.tick = take, listening.joints, listening.tick
+        self.measured = lambda: listening.measured
         self.spin_until(lambda: listening.count, 2.0)
         if not listening.count:
             _say(f'waiting for {self.topic} (ROS_DOMAIN_ID {node.context.get_domain_id()})')
@@ -138,7 +140,7 @@ class CheckDriver:
                 states = read(self.motors.reading(message))
             except MusculoskeletalError:
                 return
-            last, target = now, winding.step(states, now)
+            last, target = now, winding.step(states, now, self.measured())
             if target is not None:
                 if self.motors.command_topic:
                     publisher.publish(motor_command(self.motors, target))

@@ -85,8 +85,8 @@ class Driver:
         kind = self.robot.actuation.choose(Winding, Positioning)
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
-            for _, rows in self.step():
-                if (target := winding.step(rows, self.now)) is not None:
+            for theta, rows in self.step():
+                if (target := winding.step(rows, self.now, self.angles(theta))) is not None:
                     self.command(target)
         return winding.verdict
 

@@ -101,6 +101,7 @@ def test_a_sound_driver_is_found_sound(seed):
         assert not verdict.faults, str(verdict)
     verdict = settled(seed).wind()
     assert not verdict.faults, str(verdict)
+    assert f'joint sensors have the right sign: {", ".join(ROBOT.joints)}' in str(verdict)
     reported = str(verdict).splitlines()
     for name, line in zip(ROBOT.muscles, reported[1:]):
         assert line.startswith(name)
@@ -442,6 +443,16 @@ def test_a_fault_is_found_by_winding_in(name):
     verdict = driver.wind((0, BICEPS))
     assert check in verdict.wrong, str(verdict)
     assert reported in str(verdict)
+
+
+@pytest.mark.parametrize('joint', range(ROBOT.joint_count))
+def test_a_joint_sensor_of_wrong_sign_is_named_by_winding_in(joint):
+    driver, sign = settled(), np.ones(ROBOT.joint_count)
+    sign[joint] = -1.0
+    driver.angles = lambda theta: sign * theta
+    verdict = driver.wind(heard=driver.listen(2.0))
+    assert {fault.name for fault in verdict.faults} == {'joint sign'}, str(verdict)
+    assert f'sign of the angle of {ROBOT.joints[joint]} is reversed' in str(verdict)
 
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():

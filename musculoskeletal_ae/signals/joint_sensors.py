@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Judges the joint sensors of a moving arm by its muscle lengths.
+
+The geometric model states how every l changes with each joint. For N messages of a moving arm,
+
+    l(t) − l̂(t) ≈ c + Σ_j a_j (l_j(t) − l̂(t)),    l̂: model at the median posture
+                                                  l_j: the same with the measured θ_j of joint j
+
+is fitted by least squares, with a constant c for each muscle and segment of the recording. It does
+not depend on length offsets. For a correct sensor a_j is about 1. If the sign of θ_j is wrong, a_j
+is about −1. Leaving out one muscle at a time gives the standard error of a_j (jackknife).
+
+A sign cannot be judged if the joint hardly moves, or if the lengths of its muscles are the same at
+θ and −θ. Such a joint reads a position beyond its limits if its sign is wrong, because its limits
+are on one side of 0.
+"""
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.robot.robot import Robot
+
+LEAST_MOTION = 0.05  # range of θ from which a joint is judged [rad]
+#: smallest |a_j| by which a sign is judged. On the emulated individuals 0–4 of both shipped arms
+#: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
+LEAST_SCALE = 0.3
+BEYOND = 0.3  # distance by which a correct θ may exceed the joint limits [rad]
+#: fraction of the misfit of l that remains if another unit or order of θ is right
+BETTER = 0.8
+MOST_SAMPLES = 600  # messages that are used, evenly distributed
+LEAST_SAMPLES = 20
+STUCK_TIME = 5.0  # shortest time for which a stuck sensor repeats its reading [s]
+STUCK_MOTION = 0.2  # motion of the joint according to the lengths meanwhile [rad]
+STUCK_EXPLAINED = 0.5  # fraction of the misfit of l that this motion must explain
+DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
+
+
+class JointFault(NamedTuple):
+    """A fault of joint sensors."""
+
+    kind: str  # DEGREES, SIGN, ORDER or STUCK
+    joints: tuple[int, ...]  # indices of the joints
+    begin: float = 0.0  # begin and end of a stuck reading [s]
+    end: float = 0.0
+
+
+class Judgement(NamedTuple):
+    """Faults of joint sensors, and the joints whose sign was found to be right."""
+
+    faults: list[JointFault]
+    right: tuple[int, ...]
+
+
+def judge(
+    robot: Robot,
+    theta: Array,
+    length: Array,
+    tension: Array,
+    used: Bools | None = None,
+    segments: Ints | None = None,
+) -> Judgement:
+    """Judge unit, order and sign of the joint sensors of an arm that has moved.
+
+    Args:
+        robot: The geometric model.
+        theta: Measured θ [rad], (N, D). Messages with NaN are not used.
+        length: l [m], (N, M).
+        tension: T [N], (N, M).
+        used: Muscles to judge by, (M,); None for all. The sign of their l must be right.
+        segments: Number of the segment to which each message belongs, (N,); None for one segment.
+            Short segments reduce the effect of drifting lengths.
+    """
+    rows = np.flatnonzero(np.isfinite(theta).all(axis=1))
+    if len(rows) < LEAST_SAMPLES:
+        return Judgement([], ())
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).astype(int)]
+    tension = robot.actuation.known_tension(tension)
+    segments = np.zeros(len(theta), dtype=int) if segments is None else segments
+    lengths = _Lengths(robot, length[rows], tension[rows], used, segments[rows])
+    measured = _Hypothesis(None, theta[rows])
+    best, signs = measured, lengths.signs(measured.theta)
+    least = lengths.misfit(best.theta * signs.sign)
+    if np.isfinite(least):
+        least *= BETTER
+    for other in _hypotheses(lengths, theta[rows]):
+        others = lengths.signs(other.theta)
+        if (misfit := lengths.misfit(other.theta * others.sign)) < least:
+            best, signs, least = other, others, misfit
+    faults = [] if best.fault is None else [best.fault]
+    reversed_joints = set(np.flatnonzero(signs.sign < 0.0).tolist())
+    if best.fault is not None and best.fault.kind == SIGN:
+        reversed_joints ^= set(best.fault.joints)
+        faults = []
+    if reversed_joints:
+        faults.append(JointFault(SIGN, tuple(sorted(reversed_joints))))
+    right = signs.is_known.copy()
+    right[list(reversed_joints)] = False
+    return Judgement(faults, tuple(np.flatnonzero(right).tolist()))
+
+
+def stuck_sensors(
+    robot: Robot,
+    time: Array,
+    theta: Array,
+    length: Array,
+    tension: Array,
+    used: Bools | None = None,
+) -> list[JointFault]:
+    """Return the joint sensors that repeat one reading while the lengths show a motion.
+
+    Args:
+        robot: The geometric model.
+        time: Times of the messages [s], (N,).
+        theta: Measured θ [rad], (N, D).
+        length: l [m], (N, M).
+        tension: T [N], (N, M).
+        used: Muscles to judge by, (M,); None for all.
+    """
+    used = np.ones(robot.muscle_count, dtype=bool) if used is None else used
+    tension = robot.actuation.known_tension(tension)
+    faults = list[JointFault]()
+    for j in range(robot.joint_count):
+        for begin, end in _repeats(time, theta[:, j]):
+            rows = np.linspace(begin, end, min(end - begin + 1, MOST_SAMPLES)).astype(int)
+            rows = rows[np.isfinite(theta[rows]).all(axis=1)]
+            if len(rows) < LEAST_SAMPLES:
+                continue
+            constant = np.flatnonzero(np.ptp(theta[rows], axis=0) == 0.0)
+            error = length[rows] - robot.muscle_lengths(theta[rows], tension[rows])
+            jacobian = robot.routes.muscle_jacobian(theta[rows])[:, used][:, :, constant]
+            hidden = _hidden_motion((error - error.mean(axis=0))[:, used], jacobian)
+            motion = hidden[:, constant == j] / robot.kinematics.radian[j]
+            if np.ptp(np.percentile(motion, [5, 95])) > STUCK_MOTION:
+                faults.append(JointFault(STUCK, (j,), float(time[begin]), float(time[end])))
+    return faults
+
+
+class _Hypothesis(NamedTuple):
+    """An interpretation of the measured angles."""
+
+    fault: JointFault | None  # the fault that it assumes
+    theta: Array  # θ that follows from it [rad], (N, D)
+
+
+class _Signs(NamedTuple):
+    """Signs of the joints, each (D,)."""
+
+    sign: Array  # by which θ must be multiplied, 1 or −1
+    is_known: Bools  # whether the lengths show the sign
+
+
+class _Lengths:
+    """Muscle lengths of a moving arm, with which postures are compared."""
+
+    def __init__(
+        self, robot: Robot, length: Array, tension: Array, used: Bools | None, segments: Ints
+    ) -> None:
+        self.robot, self._length, self._tension = robot, length, tension
+        everything = np.ones(robot.muscle_count, dtype=bool)
+        self._used: Bools = everything if used is None else used
+        self._segments = [np.flatnonzero(segments == each) for each in np.unique(segments)]
+
+    def _model(self, theta: Array) -> Array:
+        """Return the lengths of the used muscles at θ (N, D) by the model [m]."""
+        return self.robot.muscle_lengths(theta, self._tension)[:, self._used]
+
+    def _centred(self, lengths: Array) -> Array:
+        """Return lengths (N, M) without their mean in each segment."""
+        centred = lengths.copy()
+        for rows in self._segments:
+            centred[rows] -= lengths[rows].mean(axis=0)
+        return centred
+
+    def misfit(self, theta: Array) -> float:
+        """Return the root mean square of l − l̂(θ) without its mean [m], or ∞ beyond the limits."""
+        robot = self.robot
+        beyond = np.maximum(theta - robot.upper, robot.lower - theta)
+        if (beyond > BEYOND * robot.kinematics.radian).any():
+            return np.inf
+        error = self._centred(self._length[:, self._used] - self._model(theta))
+        return float(np.sqrt(np.square(error).mean()))
+
+    def moved(self, theta: Array) -> Bools:
+        """Return which joints have moved enough to be judged, (D,)."""
+        is_enough: Bools = np.ptp(theta, axis=0) > LEAST_MOTION * self.robot.kinematics.radian
+        return is_enough
+
+    def signs(self, theta: Array) -> _Signs:
+        """Return the signs of θ (N, D) with which the lengths agree."""
+        sign, known = np.ones(theta.shape[1]), np.zeros(theta.shape[1], dtype=bool)
+        for _ in range(theta.shape[1]):
+            scale, error = self._scales(theta * sign)
+            known = (np.abs(scale) > LEAST_SCALE) & (np.abs(scale) > error)
+            wrong = known & (scale < 0.0)
+            if not wrong.any():
+                break
+            # The others are judged again, because the model was evaluated at a wrong posture.
+            sign[np.where(wrong, scale, 0.0).argmin()] *= -1.0
+        return _Signs(sign, known & (scale > 0.0))
+
+    def _scales(self, theta: Array) -> tuple[Array, Array]:
+        """Return a_j of all joints and their standard errors, both (D,); 0 and ∞ if unknown."""
+        scale, deviation = np.zeros(theta.shape[1]), np.full(theta.shape[1], np.inf)
+        moved = np.flatnonzero(self.moved(theta))
+        muscles = int(self._used.sum())
+        if not len(moved) or muscles <= len(moved):
+            return scale, deviation
+        still = np.tile(np.median(theta, axis=0), (len(theta), 1))
+        base = self._model(still)
+        changes = []
+        for j in moved:
+            posture = still.copy()
+            posture[:, j] = theta[:, j]
+            changes.append(self._centred(self._model(posture) - base))
+        change = np.stack(changes, axis=-1)  # (N, M, joints)
+        measured = self._centred(self._length[:, self._used] - base)
+        # The normal equations of a fit without some muscles are sums over the others.
+        products = np.einsum('nmj,nmk->mjk', change, change)
+        rights = np.einsum('nmj,nm->mj', change, measured)
+        scale[moved] = _solve(products.sum(axis=0), rights.sum(axis=0))
+        without = np.array(
+            [
+                _solve(products.sum(axis=0) - products[m], rights.sum(axis=0) - rights[m])
+                for m in range(muscles)
+            ]
+        )
+        spread = np.square(without - without.mean(axis=0)).sum(axis=0)
+        deviation[moved] = np.sqrt((muscles - 1) / muscles * spread)
+        return scale, deviation
+
+
+def _solve(products: Array, right: Array) -> Array:
+    solution: Array = np.linalg.lstsq(products, right)[0].astype(float)
+    return solution
+
+
+def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
+    """Yield other interpretations of the measured θ (N, D)."""
+    robot = lengths.robot
+    turning = np.flatnonzero(~robot.kinematics.slides).tolist()
+    most = BEYOND * robot.kinematics.radian
+    is_beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0) > most
+    far = np.flatnonzero(is_beyond).tolist()
+    if far:  # a reading that is legal with the other sign or in degrees
+        changed = theta.copy()
+        changed[:, far] *= -1.0
+        yield _Hypothesis(JointFault(SIGN, tuple(far)), changed)
+    for joints in (sorted({*far} & {*turning}), turning):
+        if far and joints:
+            changed = theta.copy()
+            changed[:, joints] = np.radians(changed[:, joints])
+            yield _Hypothesis(JointFault(DEGREES, tuple(joints)), changed)
+    pairs = list(combinations(np.flatnonzero(lengths.moved(theta)).tolist(), 2))
+    if pairs:  # only the best exchange is examined further, because signs take time
+        misfits = [lengths.misfit(_exchanged(theta, pair)) for pair in pairs]
+        pair = pairs[int(np.argmin(misfits))]
+        yield _Hypothesis(JointFault(ORDER, pair), _exchanged(theta, pair))
+
+
+def _exchanged(theta: Array, pair: tuple[int, int]) -> Array:
+    """Return θ (N, D) with two joints exchanged."""
+    exchanged = theta.copy()
+    exchanged[:, list(pair)] = theta[:, list(reversed(pair))]
+    return exchanged
+
+
+def _repeats(time: Array, values: Array) -> Iterator[tuple[int, int]]:
+    """Yield the first and last index of each run of equal values that lasts STUCK_TIME."""
+    edges = np.flatnonzero(values[1:] != values[:-1]) + 1
+    begins = np.concatenate([[0], edges])
+    ends = np.concatenate([edges, [len(values)]]) - 1
+    for begin, end in zip(begins.tolist(), ends.tolist()):
+        if end > begin and time[end] - time[begin] >= STUCK_TIME:
+            yield begin, end
+
+
+def _hidden_motion(error: Array, jacobian: Array) -> Array:
+    """Return the motion of joints that explains errors of lengths; 0 if it explains too little.
+
+    Args:
+        error: l − l̂ without its mean [m], (N, M).
+        jacobian: G of these joints [m/rad], (N, M, S).
+    """
+    hidden: Array = np.einsum('nsm,nm->ns', np.linalg.pinv(jacobian), error)
+    unexplained = error - np.einsum('nms,ns->nm', jacobian, hidden)
+    if np.square(unexplained).sum() > STUCK_EXPLAINED * np.square(error).sum():
+        return np.zeros_like(hidden)
+    return hidden

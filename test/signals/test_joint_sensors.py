@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wrong joint sensors of a moving arm are named, by the muscle lengths alone."""
+
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+import pytest
+from driver.scripted import Driver
+
+from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.winding import Winding
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.joint_sensors import (
+    DEGREES,
+    ORDER,
+    SIGN,
+    STUCK,
+    judge,
+    stuck_sensors,
+)
+
+ROBOTS = {name: Robot.load(name) for name in ('arm26', 'musashi_left_arm')}
+JOINTS = [(name, j) for name, robot in ROBOTS.items() for j in range(robot.joint_count)]
+
+
+@cache
+def motion(name):
+    """Return θ, l and T of the motion test of an emulated arm, and the number of the muscle."""
+    driver = Driver(ROBOTS[name], 1)
+    driver.listen(2.0)
+    winding = Winding(Verdict(ROBOTS[name]))
+    theta, length, tension, tested = [], [], [], []
+    while not winding.done:
+        for angles, rows in driver.step():
+            theta.append(angles)
+            length.append(rows[0])
+            tension.append(rows[1])
+            tested.append(winding.trying)
+            if (target := winding.step(rows, driver.now)) is not None:
+                driver.command(target)
+    segments = np.unique(tested, return_inverse=True)[1]
+    return np.array(theta), np.array(length), np.array(tension), segments
+
+
+def judged(name, change):
+    theta, length, tension, segments = motion(name)
+    return judge(ROBOTS[name], change(theta), length, tension, segments=segments)
+
+
+def with_signs(*reversed_joints):
+    def change(theta):
+        changed = theta.copy()
+        changed[:, reversed_joints] *= -1.0
+        return changed
+
+    return change
+
+
+@pytest.mark.parametrize('name', ROBOTS)
+def test_correct_joint_sensors_are_found_correct(name):
+    faults, right = judged(name, lambda theta: theta)
+    assert not faults
+    assert right == tuple(range(ROBOTS[name].joint_count))
+
+
+@pytest.mark.parametrize(('name', 'joint'), JOINTS)
+def test_a_joint_sensor_of_wrong_sign_is_named(name, joint):
+    (fault,), right = judged(name, with_signs(joint))
+    assert fault[:2] == (SIGN, (joint,))
+    assert joint not in right
+
+
+@pytest.mark.parametrize('name', ROBOTS)
+def test_several_joint_sensors_of_wrong_sign_are_named(name):
+    joints = range(ROBOTS[name].joint_count)
+    for wrong in [*combinations(joints, 2), tuple(joints)]:
+        (fault,), _ = judged(name, with_signs(*wrong))
+        assert fault[:2] == (SIGN, wrong)
+
+
+@pytest.mark.parametrize('name', ROBOTS)
+def test_angles_in_degrees_and_exchanged_joints_are_named(name):
+    robot = ROBOTS[name]
+    assert judged(name, np.degrees).faults[0][:2] == (DEGREES, tuple(range(robot.joint_count)))
+    order = [*range(robot.joint_count)]
+    order[-2:] = reversed(order[-2:])
+    (fault,), _ = judged(name, lambda theta: theta[:, order])
+    assert fault[:2] == (ORDER, tuple(range(robot.joint_count))[-2:])
+
+
+def test_the_sign_of_a_joint_that_does_not_move_is_not_judged():
+    theta, length, tension, segments = motion('arm26')
+    still = np.repeat(theta[:1], len(theta), axis=0)
+    assert judge(ROBOTS['arm26'], still, length, tension, segments=segments) == ([], ())
+
+
+def test_a_sensor_that_repeats_a_reading_while_the_joint_moves_is_stuck():
+    robot, rng = ROBOTS['arm26'], np.random.default_rng(0)
+    time = 0.02 * np.arange(2000)
+    middle, span = 0.5 * (robot.lower + robot.upper), robot.upper - robot.lower
+    waves = np.sin(np.outer(time, [0.7, 1.1]))
+    theta = middle + 0.4 * span * waves + 1e-3 * rng.normal(size=waves.shape)
+    tension = np.full((len(time), robot.muscle_count), 60.0)
+    length = robot.muscle_lengths(theta, tension)
+    assert not stuck_sensors(robot, time, theta, length, tension)
+    read = theta.copy()
+    read[500:1000, 1] = read[500, 1]
+    (fault,) = stuck_sensors(robot, time, read, length, tension)
+    assert fault == (STUCK, (1,), time[500], time[999])
+    # A joint that rests repeats its reading as well, if the sensor has no noise.
+    resting = np.where(np.arange(2000)[:, None] // 500 == 1, theta[500], theta)
+    resting[:, 0] = theta[:, 0]
+    length = robot.muscle_lengths(resting, tension)
+    assert not stuck_sensors(robot, time, resting, length, tension)
