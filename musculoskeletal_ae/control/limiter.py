@@ -30,6 +30,9 @@ friction and the age of T would otherwise make a muscle at its limit oscillate (
 modules receive length commands only: a desired tension becomes the length that corrects the
 fraction `ADMITTANCE` of the tension error.
 
+The tension of a motor current is uncertain (`signals.friction.Transmission`). Its limit is lower by
+CONFIDENCE σ_T, so that the true tension does not exceed T_limit either.
+
 T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
 (`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
 
@@ -63,6 +66,7 @@ POSTURES = 200  # number of random postures from which the longest muscle length
 #: largest difference between the lengths of a real muscle and of its model [m]
 LENGTH_MARGIN = 0.03
 LONGEST_INTERVAL = 0.05  # longest time between two messages for which a rate is computed [s]
+CONFIDENCE = 2.0  # number of standard deviations by which an uncertain tension may be too low
 RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
 
@@ -177,6 +181,7 @@ class CommandLimiter:
         # Use the limits of the full description: isolated muscles have a limit of 0 in `_robot`,
         # but a suspect is wound in to verify it.
         limit = np.minimum(tension_limit, self._robot.description.tension.limit)
+        limit = self._certain(limit, sample)
         if kind == TENSION:
             value = np.clip(value, self._robot.tension.bias, limit)
         else:
@@ -192,6 +197,15 @@ class CommandLimiter:
         elif self._last_length is not None:
             self._last_length = self._last_length[0], self._last_length[1] + dt
         return self.command
+
+    def _certain(self, limit: Array, sample: MuscleSample) -> Array:
+        """Return the highest T [N] (M,) whose true value is at most `limit` with confidence.
+
+        A tension of T_bias stays allowed: an uncertain tendon is not paid out until it is slack.
+        """
+        bias = self._robot.description.tension.bias
+        spread = np.nan_to_num(sample.tension_spread)
+        return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
 
     def _tension_rate(self, time: float, tension: Array) -> Array:
         """Return dT/dt [N/s] (M,) between the last two messages."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Expected covariance of a network's estimation errors."""
+"""Expected covariances of a network's estimation errors, and of the learned motor currents."""
 
 import math
 
@@ -69,6 +69,28 @@ def estimate_covariance(
     actual = observed_theta(mae, judging) - judging.theta
     ratio = math.sqrt(_excess(_spread(here - offset_here), actual))
     return _spread(offset + ratio * (error - offset))
+
+
+def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
+    """Return the posterior covariances of γ, b and F of motor currents, (M, 3, 3).
+
+    Returns:
+        The covariances, in [N] for b and F; None for tension sensors.
+    """
+    if body.drive is None:
+        return None
+    covariance = np.empty((len(body.layouts), 3, 3))
+    for muscles, root in fit.root:
+        end = 0
+        for m in muscles.tolist():
+            layout = body.layouts[m]
+            places = end + np.arange(layout.size)[layout.drive]
+            unit = np.zeros((len(root), 3))
+            unit[places, range(3)] = body.drive_units[:, m]
+            half = solve_triangular(root, unit, trans='T')
+            covariance[m] = half.T @ half
+            end += layout.size
+    return covariance
 
 
 def _drawn_errors(

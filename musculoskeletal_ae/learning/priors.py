@@ -12,6 +12,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import Layout
 from musculoskeletal_ae.learning.posture_model import PostureModel
 from musculoskeletal_ae.learning.stops import sensor_zeros
+from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
 #: Errors of the body model are common to all samples. Therefore all samples together count as at
 #: most this number of independent ones, for joint-sensor offsets, for springs of the joints, and
@@ -36,8 +37,10 @@ class Prior:
     smooth: float = 0.002  # σ of the parameters of the residual model [m]
     #: σ of the logarithm of a motor current's scale, and of its offset and drive friction as shares
     #: of T_limit
-    drive: tuple[float, float, float] = (0.2, 0.05, 0.1)
-    drive_friction_mean: float = 0.08  # mean of the drive friction as a share of T_limit
+    drive: tuple[float, float, float] = DRIVE_SPREAD
+    drive_friction_mean: float = (
+        DRIVE_FRICTION_MEAN  # mean of the drive friction as a share of T_limit
+    )
 
     def spread(self, layout: Layout) -> Array:
         """Return the prior spread s of every parameter of a muscle."""

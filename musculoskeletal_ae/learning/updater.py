@@ -17,7 +17,11 @@ import torch
 
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
-from musculoskeletal_ae.learning.covariance import estimate_covariance, observed_theta
+from musculoskeletal_ae.learning.covariance import (
+    drive_covariance,
+    estimate_covariance,
+    observed_theta,
+)
 from musculoskeletal_ae.learning.fit import Fit
 from musculoskeletal_ae.learning.trainer import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
@@ -72,7 +76,10 @@ class Updater(ABC):
         before = before if job.statistics_hold else uncalibrated(before)
         if self.body is not None:
             touch = TouchStatistics(
-                self.body.frictions(), np.ones(self._robot.joint_count), drive=self.body.drive
+                self.body.frictions(),
+                np.ones(self._robot.joint_count),
+                drive=self.body.drive,
+                drive_covariance=None if fit is None else drive_covariance(self.body, fit),
             )
             mae = replace(mae, touch=touch)
             if self.body.elasticity.is_present:

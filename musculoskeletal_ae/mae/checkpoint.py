@@ -130,6 +130,7 @@ class Metadata(Strict, frozen=True):
             shapes |= {'touch.friction': (len(self.muscles),), 'touch.spread': (len(self.joints),)}
         if self.touch_time is not None and self.drive:
             shapes['touch.drive'] = 3, len(self.muscles)
+            shapes['touch.drive_covariance'] = len(self.muscles), 3, 3
         if self.uncertain:
             shapes['covariance'] = len(self.joints), len(self.joints)
         if self.elastic:
@@ -154,7 +155,10 @@ def to_bytes(mae: Mae) -> bytes:
     if touch is not None:
         tensors |= {'touch.friction': touch.friction, 'touch.spread': touch.spread}
         if touch.drive is not None:
+            certain = np.zeros((len(mae.muscles), 3, 3))
+            known = touch.drive_covariance
             tensors['touch.drive'] = touch.drive
+            tensors['touch.drive_covariance'] = certain if known is None else known
     if mae.covariance is not None:
         tensors['covariance'] = mae.covariance
     if (springs := mae.elasticity) is not None:
@@ -274,6 +278,13 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
             _check_covariance(name, tensors[name])
+    for covariance in tensors.get('touch.drive_covariance', ()):
+        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]
+        if not np.array_equal(covariance, covariance.T) or least < -SMALLEST_EIGENVALUE * most:
+            raise CheckpointError(
+                f'tensor touch.drive_covariance is not symmetric, or has eigenvalues from {least:g}'
+                f' to {most:g}; legal: 0 or more'
+            )
     if meta.elastic:
         _check_elasticity(tensors['elasticity.stiffness'], tensors['elasticity.damping'])
     return tensors
@@ -323,8 +334,8 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
     touch = None
     if meta.touch_time is not None:
         friction, spread = tensors['touch.friction'], tensors['touch.spread']
-        drive = tensors.get('touch.drive')
-        touch = TouchStatistics(friction, spread, meta.touch_time, drive)
+        drive = tensors.get('touch.drive'), tensors.get('touch.drive_covariance')
+        touch = TouchStatistics(friction, spread, meta.touch_time, *drive)
     elasticity = None
     if meta.elastic:
         parts = ('stiffness', 'preload', 'damping')

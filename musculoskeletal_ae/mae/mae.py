@@ -427,7 +427,9 @@ class Mae:
     @property
     def transmission(self) -> Transmission:
         """What lies between readings of tension and T_end, as far as it has been learned."""
-        return Transmission(self.friction, None if self.touch is None else self.touch.drive)
+        if self.touch is None:
+            return Transmission(self.friction)
+        return Transmission(self.friction, self.touch.drive, self.touch.drive_covariance)
 
     @property
     def friction(self) -> Array:

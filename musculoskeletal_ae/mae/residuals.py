@@ -105,6 +105,8 @@ class TouchStatistics:
     #: γ, b [N] and F [N] of motor currents (`signals.friction.Transmission`), (3, M); None for
     #: tension sensors
     drive: Array | None = None
+    #: covariances of γ, b and F, (M, 3, 3); None for tension sensors
+    drive_covariance: Array | None = None
 
     @property
     def calibrated(self) -> bool:

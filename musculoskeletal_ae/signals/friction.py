@@ -9,6 +9,8 @@ models the body without friction. Therefore its tension is T_end, into which mea
 have to be converted (`Transmission`).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +24,10 @@ NOISE = 0.00013
 LATEST = 0.07  # weight a of the newest deviation in the running mean ē
 SPIKE = 0.0002  # distance to which a reading outside the range of the last two is limited [m]
 LARGEST_GAIN = 1.5  # largest |γ| of `Transmission`
+#: what is known of γ, b and F of a motor current before anything is learned: standard deviations of
+#: γ, b/T_limit and F/T_limit, and the mean of F/T_limit; the means of γ and b are 0
+DRIVE_SPREAD = 0.2, 0.05, 0.1
+DRIVE_FRICTION_MEAN = 0.08
 
 
 def slid(direction: Array, way: Array, moved: Array) -> Array:
@@ -46,13 +52,30 @@ class Transmission:
     `robot.tension_source`, has an error of scale γ and an offset b. It also drives the friction F
     of motor and gear, which opposes the motion. It can be negative, but a tendon does not push.
 
+    γ, b and F are uncertain. So is the direction of friction while it reverses (|s| < 1):
+
+        σ_T² = aᵀ C a + F² (1 − s²),   a = (e^γ T_read, −1, −s)
+
     Attributes:
         friction: Tendon friction μ, (M,).
         drive: γ, b [N] and F [N] of motor currents, (3, M); None for tension sensors.
+        drive_covariance: Covariances C of γ, b and F, (M, 3, 3); None for tension sensors.
     """
 
     friction: Array
     drive: Array | None = None
+    drive_covariance: Array | None = None
+
+    @classmethod
+    def unknown(cls, limit: Array) -> Transmission:
+        """Return that of motor currents of which nothing has been learned, for T_limit [N] (M,).
+
+        F counts as 0, and its mean adds to its uncertainty.
+        """
+        nothing = np.zeros_like(limit)
+        spread = np.array([np.ones_like(limit), limit, limit]).T * DRIVE_SPREAD  # (M, 3)
+        spread[:, 2] = np.hypot(spread[:, 2], DRIVE_FRICTION_MEAN * limit)
+        return cls(nothing, np.zeros((3, len(limit))), np.eye(3) * np.square(spread)[:, None])
 
     def motor(self, read: Array, direction: Array) -> Array:
         """Return T [N] (..., M) from T_read [N] and s, (..., M) each."""
@@ -61,6 +84,16 @@ class Transmission:
         gain, offset, friction = self.drive
         tension: Array = np.exp(gain) * read - offset - friction * direction
         return np.maximum(tension, 0.0)
+
+    def spread(self, read: Array, direction: Array) -> Array:
+        """Return σ_T [N] (M,) for T_read [N] and s, (M,) each; 0 for tension sensors."""
+        if self.drive is None or self.drive_covariance is None:
+            return np.zeros_like(read)
+        gain, _, friction = self.drive
+        slope = np.stack([np.exp(gain) * read, -np.ones_like(read), -direction], axis=-1)
+        variance = np.einsum('mi,mij,mj->m', slope, self.drive_covariance, slope)
+        variance += np.square(friction) * np.maximum(1.0 - np.square(direction), 0.0)
+        return np.sqrt(variance)
 
     def end(self, read: Array, direction: Array) -> Array:
         """Return T_end [N] (..., M) from T_read [N] and s, (..., M) each."""

@@ -70,6 +70,7 @@ class MuscleSample:
         newest: l (offset removed), T and temperature of the last message alone, without the median
             filter, (3, M).
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
+        tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors.
     """
 
     time: float
@@ -83,6 +84,7 @@ class MuscleSample:
     usable: Bools
     newest: Array
     jumped: tuple[int, ...] = ()
+    tension_spread: Array | float = 0.0
 
     @property
     def model_tension(self) -> Array:
@@ -299,8 +301,8 @@ class MuscleStream:
     def use_transmission(self, transmission: Transmission) -> None:
         """Remove friction and errors of the readings of tension from now on; at first, none."""
         if self._robot.tension_source.is_current and transmission.drive is None:
-            nothing = np.zeros((3, self._robot.muscle_count))
-            transmission = replace(transmission, drive=nothing)  # a tendon does not push
+            unknown = Transmission.unknown(self._robot.description.tension.limit)
+            transmission = replace(unknown, friction=transmission.friction)
         self._transmission = transmission
 
     def use_body(self, body: BodyState) -> None:
@@ -381,6 +383,7 @@ class MuscleStream:
             usable=self.body.used,
             newest=newest,
             jumped=self._steps.jumped,
+            tension_spread=self._transmission.spread(read[1], sliding),
         )
 
     def _problem(self, read: Array, states: Array, now: float) -> tuple[str, str] | None:

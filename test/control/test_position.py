@@ -21,6 +21,7 @@ from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import slid
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 
 ROBOT = Robot(with_modules(Robot.load('arm26').description, actuation='position'))
 COUNT, BIAS = ROBOT.muscle_count, ROBOT.tension.bias[0]
@@ -75,6 +76,20 @@ def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hi
     # Every reversal of friction halves or doubles the tension, so it would reach 2.2 each time.
     assert np.max(tensions[100:]) < 1.3
     assert (np.array(tensions[100:]) > 1.1).mean() < 0.06
+
+
+def test_a_motor_current_that_reads_too_little_does_not_lead_to_too_much_tension():
+    robot = Robot(with_modules(ROBOT.description, 'position', 'current'))
+    stream, limiter = MuscleStream(robot), CommandLimiter(robot, Settings())
+    length, tension, highest = np.zeros(COUNT), np.full(COUNT, BIAS), 0.0
+    for n in range(400):
+        read = 0.75 * tension - 0.05 * LIMIT
+        now = stream.take_states(np.array([length, read, np.full(COUNT, 30.0)]), n * DT)
+        goal = limiter.limit(Command(LENGTH, np.full(COUNT, -0.1)), now, LIMIT, DT).value
+        tension, length = pull_in_this_posture(length, tension, goal), goal
+        highest = max(highest, (tension / LIMIT).max())
+    assert 0.6 < highest < 1.0  # it would be 1.4 without the uncertainty of the current
+    assert (tension > 0.6 * LIMIT).all()  # and the muscle stays usable
 
 
 def test_a_desired_tension_becomes_a_length_command_towards_it():

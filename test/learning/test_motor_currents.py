@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.control.limiter import CONFIDENCE
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.learning import saved_state
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.body_fit import BodyFit
+from musculoskeletal_ae.learning.covariance import drive_covariance
 from musculoskeletal_ae.learning.fit import fit_to_network
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.mae import checkpoint
@@ -64,6 +66,26 @@ def test_tensions_of_currents_are_recovered_from_rests(seed):
     assert error < 0.5 * np.abs(0.08 * LIMIT - true.drive[2]).mean() + 0.01 * LIMIT.mean()
 
 
+@pytest.mark.parametrize('count', [0, 20, 120])
+def test_the_uncertainty_of_tensions_of_currents_covers_their_errors(count):
+    errors = []
+    for seed in range(3):
+        transmission = Transmission.unknown(LIMIT)
+        if count:
+            observed, _, _ = rests(count, seed)
+            fit = BodyFit(ROBOT, None)
+            result = fit.fit(observed, observed.theta)
+            covariance = drive_covariance(fit.body, result)
+            transmission = replace(fit.body.transmission, drive_covariance=covariance)
+        held_out, held_end, true = rests(30, seed)
+        motor = held_end * np.exp(true.friction * held_out.direction)
+        for read, direction, tension in zip(held_out.tension, held_out.direction, motor):
+            spread = transmission.spread(read, direction)
+            errors.append((tension - transmission.motor(read, direction)) / spread)
+    assert (np.array(errors) < CONFIDENCE).mean() > 0.95
+    assert np.std(errors) > 0.2  # the uncertainty is not much too large either
+
+
 def test_derivatives_by_the_drive_are_those_of_the_length():
     observed, _, _ = rests(20, 3)
     body = CalibratedBody(ROBOT)
@@ -90,10 +112,17 @@ def test_derivatives_by_the_drive_are_those_of_the_length():
 
 def test_a_checkpoint_carries_the_transmission_and_fits_only_motor_currents(trained):
     drive = np.array([[0.1], [3.0], [15.0]]) * np.ones(COUNT)
-    touch = TouchStatistics(np.full(COUNT, 0.05), np.ones(2), 90.0, drive)
+    uncertain = Transmission.unknown(LIMIT).drive_covariance
+    touch = TouchStatistics(np.full(COUNT, 0.05), np.ones(2), 90.0, drive, uncertain)
     data = checkpoint.to_bytes(replace(trained['default'], touch=touch))
     mae = checkpoint.from_bytes(data, ROBOT)
     np.testing.assert_array_equal(mae.transmission.drive, drive)
+    np.testing.assert_array_equal(mae.transmission.drive_covariance, uncertain)
+    negative = checkpoint.to_bytes(
+        replace(trained['default'], touch=replace(touch, drive_covariance=-uncertain))
+    )
+    with pytest.raises(CheckpointError, match=r'drive_covariance .* eigenvalues .* 0 or more'):
+        checkpoint.from_bytes(negative)
     with pytest.raises(CheckpointError, match=r'learned with motor currents .* sensor'):
         checkpoint.from_bytes(data, SENSORS)
     body = CalibratedBody(ROBOT)
