@@ -12,7 +12,7 @@ from bags.bare_file import FLOAT, ONE, write
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 
-TRIALS = 50  # of each kind of bag
+TRIALS = 30  # of each kind of bag
 NUMBERS = (0, 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1)
 
 

@@ -196,8 +196,8 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
     assert 'Traceback' not in output
 
 
-@pytest.mark.parametrize('start', [0.0, 0.25])
-def test_a_replay_publishes_its_position_and_follows_requests(tool, graph, tmp_path, start):
+def test_a_replay_publishes_its_position_and_follows_requests(tool, graph, tmp_path):
+    start = 0.25  # share of the recording
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
     positions = graph.listen(Float64MultiArray, 'replay/position')
@@ -239,11 +239,9 @@ def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
     assert 'add --clock' in output
 
 
-def test_an_impossible_request_is_reported_in_one_line(tool, bag, tmp_path):
+def test_an_impossible_request_is_reported_in_one_line(tool, bag):
     cases = [
-        (('replay', tmp_path / 'nothing'), 1, 'No such file'),
         (('record', bag), 1, 'is not empty; name a new directory'),
-        (('replay', bag, '--rate', '2'), 2, '--rate other than 1 needs --clock'),
         (('replay', bag, '--start', '100'), 1, 'is 0.620 s long; choose a smaller --start'),
         (('replay', bag, '--ros-args', '-r', 'bad'), 2, "Couldn't parse remap rule"),
     ]

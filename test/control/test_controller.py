@@ -40,7 +40,7 @@ def shifted():
     return mae
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 150)), max_size=8))
 def test_length_commands_are_finite_and_keep_the_rate_limit_under_any_sequence_of_events(events):
     bench = Bench(first_duration=1.0, second_duration=0.5)

@@ -66,7 +66,7 @@ LIES = st.one_of(
 )
 
 
-@hypothesis_settings(max_examples=60)
+@hypothesis_settings(max_examples=30)
 @given(st.lists(st.tuples(ROWS, LIES, st.integers(1, 30)), min_size=1, max_size=4))
 def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lies):
     bench = DistortingBench()

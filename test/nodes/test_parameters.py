@@ -85,7 +85,6 @@ def test_every_parameter_that_is_settable_is_followed(graph, kind):
 @pytest.mark.parametrize(
     ('node', 'name', 'value'),
     [
-        ('learner', 'update_steps', '-5'),
         ('controller', 'joint_stiffness', '[-1.0, -1.0]'),
         ('controller', 'max_age', '.nan'),
         ('hardware_emulator', 'faults', '[melt]'),
