@@ -30,12 +30,14 @@ def main(argv: list[str]) -> int:
     listed = benches()
     if not argv or argv[0] in ('-h', '--help'):
         print(
-            'python -m bench NAME [options]; each has --help. README.md says what passing means.\n'
+            'Usage: python -m bench NAME [options]. Each bench has --help; bench/README.md says '
+            'what\n'
+            'passing means.\n'
         )
         print('\n'.join(f'{name:<20}{line}' for name, line in listed.items()))
         return 0
     if argv[0] not in listed:
-        print(f'error: no bench {argv[0]!r}; legal: {", ".join(listed)}', file=sys.stderr)
+        print(f'error: unknown bench {argv[0]!r}; legal: {", ".join(listed)}', file=sys.stderr)
         return 2
     return exit_status(lambda: importlib.import_module(f'bench.{argv[0]}').main(argv[1:]))
 

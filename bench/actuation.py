@@ -197,13 +197,15 @@ def main(argv: list[str]) -> int:
     parser.add_seeds(tuple(range(5)))
     parser.add_quick('a quarter of the time')
     add = parser.add_argument
-    add('--realities', type=names, default=(KIN, FOREIGN), help='emulator models')
+    add('--realities', type=names, default=(KIN, FOREIGN), help='emulator models: kin, foreign')
     add('--modules', type=names, default=tuple(KINDS), help=f'kinds: {", ".join(KINDS)}')
     add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
     add('--initial', type=Path, help='initial checkpoint (default: train one)')
     options = parser.parse_args(argv)
     if wrong := set(options.modules) - set(KINDS):
-        raise MusculoskeletalError(f'--modules {sorted(wrong)}; legal: {", ".join(KINDS)}')
+        raise MusculoskeletalError(
+            f'--modules: unknown kinds {", ".join(sorted(wrong))}; legal: {", ".join(KINDS)}'
+        )
     share = (0.25 if options.quick else 1.0) * options.seconds / EXPLORED
     robot = Robot.load(options.robot)
     if options.initial is None:

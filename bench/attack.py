@@ -98,7 +98,7 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
     step, allowed = np.diff(value, axis=0), rate * (np.diff(time)[:, None] + JITTER)
     finite = np.isfinite(value).all()
     if not finite or not len(step):
-        return Steps(len(value), 0.0, 0.0, [] if finite else ['a command that is not finite'])
+        return Steps(len(value), 0.0, 0.0, [] if finite else ['a command was not finite'])
     fast = (step < -allowed) | ((step > allowed) & ~relieved[1:])
     ticks = step[np.diff(number) == 1]
     return Steps(
@@ -106,7 +106,8 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
         -float(ticks.min(initial=0.0)),
         float(ticks.max(initial=0.0)),
         [
-            f'muscle {m} by {1e3 * step[i, m]:.1f} mm in {1e3 * (time[i + 1] - time[i]):.0f} ms'
+            f'the command of muscle {m} changed by {1e3 * step[i, m]:.1f} mm'
+            f' in {1e3 * (time[i + 1] - time[i]):.0f} ms'
             for i, m in zip(*np.nonzero(fast))
         ],
     )
@@ -246,15 +247,19 @@ def evaluate(attack: 'Attack') -> list[Row]:
         Row('tension above 1.1 × limit lasts 0.5 s at most', len(true), tense),
         Row('a stopped arm is not wound in', len(stops), wound),
         Row(
-            'no status is OK for 2 s while something is wrong',
+            'no node reports OK for 2 s or longer while something is wrong',
             tried['status'],
             take('status OK while wrong', []),
         ),
-        Row('the advised steps recover the arm', tried['attacks'], take('the advice helps', [])),
+        Row(
+            'the remedy in /diagnostics recovers the arm',
+            tried['attacks'],
+            take('the advice helps', []),
+        ),
         Row('no sample is lost', tried['kills'], take('samples survive', [])),
         Row('memory does not grow', len(attack.processes), fat),
         Row(
-            'the arm moves again afterwards',
+            'the arm moves again after an attack',
             tried['attacks'] + tried['events'],
             [what for broken in violations.values() for what in broken],
         ),
@@ -277,7 +282,7 @@ def main(argv: list[str]) -> int:
     from bench.attack_kinds import KINDS, all_attacks
 
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
-    parser.add_quick('a minute of it')
+    parser.add_quick('attack for about a minute only')
     parser.add_argument(
         '--messages',
         type=whole(1, 10_000_000),
@@ -286,7 +291,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
     parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
     parser.add_argument('--seeds', type=numbers, help='random seeds (default: 0,1,2,3,4)')
-    parser.add_argument('--kinds', type=names, help='known attacks (default: all)')
+    parser.add_argument('--kinds', type=names, help='names of the attacks to run (default: all)')
     options = parser.parse_args(argv)
     size, begun = QUICK if options.quick else FULL, time.monotonic()
     size = size._replace(messages=options.messages or size.messages)
@@ -318,7 +323,7 @@ def main(argv: list[str]) -> int:
             rows.append(Row('a killed learner loses nothing', count, lost))
     tried, broken, outcomes = attack_files.attack(size.files, seeds[0])
     print(', '.join(f'{count} {what}' for what, count in sorted(outcomes.items())))
-    rows.append(Row('each file is used or refused in time', tried, broken))
+    rows.append(Row('each damaged file is used or refused in time', tried, broken))
     print_rows(rows)
     print(f'{time.monotonic() - begun:.0f} s')
     return int(any(row.broken for row in rows))

@@ -368,7 +368,7 @@ class Attack:
                     return True
             self.spin(0.5)
         why = answer.message if answer is not None else 'no answer'
-        self.found('the arm moves again afterwards', f'in {PATIENCE:g} s: {why}')
+        self.found('the arm moves again after an attack', f'in {PATIENCE:g} s: {why}')
         return False
 
     # -- attacking ------------------------------------------------------------------------------

@@ -84,7 +84,10 @@ def main(argv: list[str]) -> None:
         folder = args.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         driver = initial(robot, folder)
-    print('error [rad] and share inside, with joint sensors and without')
+    print(
+        'estimation error [rad], and share of errors inside the 95 % ellipsoid, with and without '
+        'joint sensors'
+    )
     for reality in args.realities:
         for seed in args.seeds:
             arm = make_arm(robot, seed, reality)

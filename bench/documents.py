@@ -168,9 +168,14 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
 
 def _parse(argv: list[str]) -> Namespace:
     parser = Parser('documents', 'Runs every command of the documents in a fresh clone.')
-    parser.add_argument('pages', nargs='*', metavar='PAGE', help='default: all of them')
+    parser.add_argument('pages', nargs='*', metavar='PAGE', help='documents to run (default: all)')
     parser.add_argument('--list', action='store_true', help='list the commands and run none')
-    parser.add_argument('--keep', type=Path, metavar='DIR', help='work in this folder, and keep it')
+    parser.add_argument(
+        '--keep',
+        type=Path,
+        metavar='DIR',
+        help='folder for the clone, which is kept (default: a temporary one)',
+    )
     return parser.parse_args(argv)
 
 

@@ -53,7 +53,9 @@ class EagerSimulation:
         self.before = _single(turning[1:])
         onto = np.zeros((count - 1, robot.joint_count))
         if tree.terms.shape[1] > 2:
-            raise MusculoskeletalError('eager simulation: couplings are lines only')
+            raise MusculoskeletalError(
+                'the eager simulation supports linear joint couplings only; use another robot'
+            )
         onto[np.arange(count - 1), tree.master[1:]] = tree.terms[1:, 1]
         self.onto = _single(onto)
         self.lever = _single(tree.axis), _single(tree.centre), _single(tree.mass)

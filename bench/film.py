@@ -114,7 +114,7 @@ def main(argv: list[str]) -> int:
     parser = Parser('film', 'Records the film of the README from the running system.')
     parser.add_argument('--port', type=whole(1, 65535), default=8099, metavar='N')
     parser.add_argument('--learning', type=float, default=LEARNING, metavar='S')
-    parser.add_argument('--frames', type=Path, metavar='DIR', help='keep every picture here')
+    parser.add_argument('--frames', type=Path, metavar='DIR', help='folder that keeps every frame')
     parser.add_out('DIR', default=ROOT / 'doc' / 'images')
     options = parser.parse_args(argv)
     command = ['./bringup.sh', '--view', '--port', str(options.port)]

@@ -46,9 +46,9 @@ from musculoskeletal_ae.signals.limits import share_outside
 LOAD, MINUTE = 3.6, 60.0  # mass of the payload [kg]; duration of a minute [s]
 
 MESSAGES = {
-    'step of l in 10 ms [m]': SIGNAL_LIMITS.step,
-    'T beside tension.max': SIGNAL_LIMITS.highest_tension,
-    'θ_est beyond its limits, of the range': SIGNAL_LIMITS.estimate_outside,
+    'change of l in 10 ms [m]': SIGNAL_LIMITS.step,
+    'T relative to tension.max': SIGNAL_LIMITS.highest_tension,
+    'θ_est beyond its limits, relative to the range': SIGNAL_LIMITS.estimate_outside,
 }
 
 
@@ -112,7 +112,9 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
             spread.take(gate, learner.mae, f'individual {seed}, {mae.preset}, {now:.0f} s')
             gate.take(learner.mae, now)
     if learner.keeper.rejected:
-        spread.refused.append(f'individual {seed}, by the learner: {learner.keeper.last_rejected}')
+        spread.refused.append(
+            f'individual {seed}, rejected by the learner: {learner.keeper.last_rejected}'
+        )
     return learner.mae
 
 
@@ -144,7 +146,7 @@ def main(argv: list[str]) -> int:
             arm = make_arm(robot, seed, args.reality)
             last = learned(arm, mae, initial['default'], seed, args.minutes, spread)
             networks.append((f'individual {seed}, {preset}', last))
-    print(f'{spread.count} healthy networks: largest of each measure, limit')
+    print(f'{spread.count} healthy networks: largest value and limit of each measure')
     for name, value in spread.most.items():
         print(f'  {name:<45}{value:10.4g}{limit(name):10.4g}')
     title = 'd with a ruptured muscle (smallest)'

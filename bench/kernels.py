@@ -29,7 +29,7 @@ def main(argv: list[str]) -> int:
     """Run pytest once for each combination; return how many failed."""
     parser = Parser('kernels', 'Runs the tests with the arithmetic of other machines.')
     parser.add_argument('--blas', nargs='+', default=BLAS, help='values of OPENBLAS_CORETYPE')
-    parser.add_argument('--torch', nargs='+', default=TORCH, help='of ATEN_CPU_CAPABILITY')
+    parser.add_argument('--torch', nargs='+', default=TORCH, help='values of ATEN_CPU_CAPABILITY')
     options, pytest = parser.parse_known_args(argv)
     rows = []
     for blas, torch in itertools.product(options.blas, options.torch):

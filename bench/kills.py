@@ -142,13 +142,19 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
         if digests := child.numbers_after('found'):
             fitting = [store for store in possible if digest(store) == digests[0]]
             if not fitting:
-                lost.append(f'life {life}: the samples found are not those accepted before')
+                lost.append(
+                    f'learner {life}: it loaded other samples than the earlier learners had '
+                    'accepted'
+                )
                 break
             if versions[0] < newest:
-                lost.append(f'life {life}: network {versions[0]} found, {newest} was published')
+                lost.append(
+                    f'learner {life}: it loaded network {versions[0]}, but {newest} was published '
+                    'before'
+                )
             possible = grown(fitting[0], robot, life, child.accepted)
         elif last:
-            lost.append(f'the last learner did not come up: {child.trouble()}')
+            lost.append(f'the last learner did not start: {child.trouble()}')
         newest, published = max([newest, *versions]), published + len(versions)
     accepted = possible[0].accepted
     print(f'{kills} kills, {accepted} samples accepted, {published} networks published: ', end='')

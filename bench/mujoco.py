@@ -197,7 +197,10 @@ def model_rows(
 def main(argv: list[str]) -> None:
     """Print the table, row by row."""
     parser = Parser('mujoco', 'Learns MuJoCo models that you have fetched.')
-    text = 'as arm26=arm26.xml, or arm=myoarm.xml:joints=elbow_flexion,pro_sup:without=A,B'
+    text = (
+        'a model, such as arm26=arm26.xml or '
+        'arm=myoarm.xml:joints=elbow_flexion,pro_sup:without=A,B'
+    )
     parser.add_argument('models', nargs='+', type=parse, metavar='NAME=FILE…', help=text)
     parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='a new directory')
     parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='individuals')

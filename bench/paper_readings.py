@@ -96,11 +96,11 @@ def errors(robot: Robot, mae: Mae, reading: Reading, motion: Recording) -> tuple
 
 def main(argv: list[str] | None = None) -> int:
     """Print the table; exit status 1 if the folder lacks a network."""
-    parser = Parser('paper_readings', 'Compares readings of the simulation that the paper prints.')
-    parser.add_argument('folder', type=Path, help='of experiment online_learning --keep')
+    parser = Parser('paper_readings', "Compares interpretations of the paper's simulation.")
+    parser.add_argument('folder', type=Path, help='folder of experiment online_learning --keep')
     parser.add_robot()
     parser.add_seeds((0, 1))
-    parser.add_argument('--seconds', type=positive, default=60.0, help='of the motion')
+    parser.add_argument('--seconds', type=positive, default=60.0, help='duration of the motion [s]')
     args = parser.parse_args(argv)
 
     def measure() -> None:
@@ -109,7 +109,8 @@ def main(argv: list[str] | None = None) -> int:
         part = slice(0, round(args.seconds / SAMPLE_TIME))
         motions = {seed: study.stream(seed, 'held_out').part(part) for seed in args.seeds}
         print(
-            '| reading | before [rad] | before [N] | after [rad] | after [N] | at T_bias, after |'
+            '| interpretation | before [rad] | before [N] | after [rad] | after [N] | share at '
+            'T_bias, after |'
         )
         print('|---|---|---|---|---|---|')
         for reading in READINGS:

@@ -40,9 +40,9 @@ SETTLING = 15.0  # time from the start of the nodes to the recording of a profil
 
 #: times of the first measured version (commit be0daee) on an idle machine with two cores
 BEFORE_CORE = {
-    'estimate: θ, T, l from ②': 19.0, 'control solve: proposed, default': 380.0,
-    'control solve: proposed, paper': 530.0, 'simulation step': 150.0,
-    f'the same, each of {timings.MANY} in one batch': 6.7,
+    'estimate: θ, T, l from ②': 19.0, 'one step of method proposed, preset default': 380.0,
+    'one step of method proposed, preset paper': 530.0, 'simulation step': 150.0,
+    f'simulation step, time per arm in a batch of {timings.MANY}': 6.7,
 }  # fmt: skip
 TORCH_BEFORE = 118.0  # time of the first row in torch on that machine [µs]
 #: values at each rate [Hz]: latency at 50 %, 99 % and largest [ms], and CPU time of all nodes [% of
@@ -174,7 +174,10 @@ def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, flo
         deadline = time.monotonic() + STARTING
         while not system.stamps['muscle_length_command']:
             if time.monotonic() > deadline:
-                raise MusculoskeletalError(f'no command came within {STARTING:g} s')
+                raise MusculoskeletalError(
+                    f'the controller sent no command within {STARTING:g} s; check that the '
+                    'machine is idle, and repeat'
+                )
             time.sleep(0.1)
         used = {name: cpu(process.pid) for name, process in system.nodes.items()}
         time.sleep(SETTLING)
@@ -235,7 +238,7 @@ def main(argv: list[str]) -> None:
     """Measure everything and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
     parser.add_argument(
-        '--seconds', type=number(1.0, 3600.0), default=20.0, help='[s] for which each system runs'
+        '--seconds', type=number(1.0, 3600.0), default=20.0, help='duration of each measurement [s]'
     )
     parser.add_argument(
         '--late',
@@ -243,7 +246,7 @@ def main(argv: list[str]) -> None:
         default=600.0,
         help='duration of the test for late messages [s]',
     )
-    parser.add_argument('--flames', action='store_true', help='draw flame graphs; needs py-spy')
+    parser.add_argument('--flames', action='store_true', help='draw flame graphs; requires py-spy')
     parser.add_out('DIR', 'performance.md and flames/')
     args = parser.parse_args(argv)
     if args.flames and shutil.which('py-spy') is None:
@@ -258,7 +261,10 @@ def main(argv: list[str]) -> None:
         moved = wire(args.seconds)
         ((_, _, long),) = systems(ARM, (FLAME_RATE,), ('with learner',), args.late)
         ratio = {row.name: row.torch_eager / row.ours for row in steps}
-        step, batch = 'simulation step', f'the same, each of {timings.MANY} in one batch'
+        step, batch = (
+            'simulation step',
+            f'simulation step, time per arm in a batch of {timings.MANY}',
+        )
         whole, arms = f', {timings.ALL_TORCH}', f'one of {timings.MANY} arms'
         node = max(held[name][0] for name in ('estimator', 'controller', 'sim'))
         whole_system = sum(moved[ARM, 200.0, 'with learner'].cpu.values())

@@ -67,9 +67,14 @@ def check(file: Path) -> str:
         rclpy.try_shutdown()
     difference = float(np.max(np.abs(np.array(received[0].position) - expected)))
     if not difference < LARGEST_DIFFERENCE:
-        raise RuntimeError(f'the estimates of node and core differ by {difference:g} rad')
+        raise RuntimeError(
+            f'the estimates of node and core differ by {difference:g} rad; legal: below '
+            f'{LARGEST_DIFFERENCE:g}'
+        )
     if process.returncode != 0:
-        raise RuntimeError(f'on SIGTERM the estimator ended with status {process.returncode}')
+        raise RuntimeError(
+            f'the estimator ended with status {process.returncode} after SIGTERM; expected 0'
+        )
     version = '.'.join(map(str, sys.version_info[:3]))
     return f'Python {version}, NumPy {np.__version__}: node and core have the same estimate'
 

@@ -130,7 +130,7 @@ def interpreter(version: str) -> Path | None:
 def _needed(version: str) -> Path:
     python = interpreter(version)
     if python is None:
-        raise MusculoskeletalError(f'python{version} is neither on PATH nor in pyenv')
+        raise MusculoskeletalError(f'python{version} is neither on PATH nor in pyenv; install it')
     return python
 
 
@@ -159,7 +159,7 @@ def _sourced(site: Site) -> None:
     )  # fmt: skip
     if base == Path('/usr'):
         raise MusculoskeletalError(
-            'Python 3.12 is in /usr, which cannot be copied; install it with pyenv'
+            'Python 3.12 is installed in /usr, which cannot be copied; install it with pyenv'
         )
     packages = 'lib/python3.12/site-packages'
     system_python = system / 'bin' / 'python3.12'
@@ -211,7 +211,10 @@ def _debian_13(site: Site) -> None:
     """Create a minimal Debian 13 (Python 3.13, no compiler, no libgomp, no venv), and enter it."""
     root = site.folder / 'debian'
     if os.getuid() != 0 or shutil.which('debootstrap') is None:
-        raise MusculoskeletalError('creating a Debian 13 requires root and debootstrap')
+        raise MusculoskeletalError(
+            'the platform Debian 13 requires root and debootstrap; install debootstrap and run as '
+            'root'
+        )
     site.run(
         'Debian 13',
         f'debootstrap --variant=minbase --include={DEBIAN_PACKAGES} trixie {root}',
@@ -315,9 +318,11 @@ def _options(argv: list[str]) -> argparse.Namespace:
     options = parser.parse_args(argv)
     for name in options.names:
         if name not in PLATFORMS:
-            parser.error(f'platform {name!r}: expected one of {", ".join(PLATFORMS)}')
+            parser.error(f'unknown platform {name!r}; legal: {", ".join(PLATFORMS)}')
         if options.node and name in CHROOTS:
-            parser.error(f'platform {name!r}: --node is not for a chroot')
+            parser.error(
+                f'platform {name!r} is a chroot, which --node does not support; remove --node'
+            )
     return options
 
 

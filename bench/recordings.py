@@ -193,9 +193,7 @@ def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
     address = f'https://github.com/{repository.name}'
     done = subprocess.run(['git', 'clone', '--depth', '1', address, str(target)])
     if done.returncode:
-        raise MusculoskeletalError(
-            f'{address}: git cannot clone it; clone it into {target} yourself'
-        )
+        raise MusculoskeletalError(f'git cannot clone {address}; clone it into {target} yourself')
     return target
 
 
@@ -204,14 +202,17 @@ def main(argv: list[str]) -> int:
     parser = Parser('recordings', "Learns public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')
-    parser.add_argument('--only', default='', help='part of the name of a repository')
+    parser.add_argument('--only', default='', help='use only repositories whose name contains this')
     parser.add_argument('--out', type=Path, default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)
     rows, shown = list[dict[str, Any]](), dict[str, Any]()
     for repository in repositories():
         clone = clone_of(repository, args.clones, args.fetch)
         if args.only not in repository.name or clone is None:
-            print(f'{repository.name}: left out' + '; no clone, see --fetch' * (clone is None))
+            reason = (
+                'it is not cloned; add --fetch' if clone is None else 'it does not match --only'
+            )
+            print(f'{repository.name}: left out, because {reason}')
             continue
         results, also = learn(repository, Files(clone))
         rows += [result._asdict() for result in results]
@@ -219,7 +220,9 @@ def main(argv: list[str]) -> int:
         for key, value in also.items():
             print(f'{key}: {value}')
     if not rows:
-        raise MusculoskeletalError(f'{args.clones}: no clone of any repository; use --fetch')
+        raise MusculoskeletalError(
+            f'no repository of the bench is cloned in {args.clones}; add --fetch to clone them'
+        )
     args.out.mkdir(parents=True, exist_ok=True)
     document = {'errors': rows, 'also': shown}
     text = json.dumps(document, indent=1, ensure_ascii=False)

@@ -160,7 +160,9 @@ class Files:
         return done.stdout
 
     def _lacks(self, name: str) -> MusculoskeletalError:
-        return MusculoskeletalError(f'{self._path}: it lacks {name}; clone the repository again')
+        return MusculoskeletalError(
+            f'the clone {self._path} lacks {name}; clone the repository again'
+        )
 
 
 def _columns(text: str) -> dict[str, Array]:

@@ -116,7 +116,11 @@ def main(argv: list[str]) -> None:
     parser.add_seeds(SEEDS)
     parser.add_quick('a tenth of the time')
     parser.add_argument(
-        '--off', type=names, default=[], metavar='EFFECT,…', help='effects to switch off'
+        '--off',
+        type=names,
+        default=[],
+        metavar='EFFECT,…',
+        help='effects of the emulator model to switch off',
     )
     args = parser.parse_args(argv)
 

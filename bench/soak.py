@@ -91,14 +91,18 @@ def failures_of(worst: float, filled: float, most: float, times: list[float]) ->
     """
     problems = []
     if worst > TOLERATED:
-        problems.append(f'the error rose to {worst:.2f} of its least')
+        problems.append(
+            f'the error rose to {worst:.2f} times its minimum; legal: at most {TOLERATED:g}'
+        )
     if most > TOLERATED * filled:
         problems.append(f'memory rose from {filled:.0f} to {most:.0f} MB')
     quarter = len(times) // 4
     if quarter:
         first, last = np.median(times[:quarter]), np.median(times[-quarter:])
         if last > SLOWER * first:
-            problems.append(f'updates took {first:.2f} s at first and {last:.2f} s at last')
+            problems.append(
+                f'an update took {first:.2f} s at the beginning and {last:.2f} s at the end'
+            )
     return problems
 
 
@@ -158,7 +162,8 @@ def main(argv: list[str]) -> int:
             print(
                 f'{now / 3600.0:5.1f} h  samples {len(learner.samples)} '
                 f'({learner.samples.accepted} accepted)  error {error:.4f} rad  '
-                f'worst/least {worst:.3f}  threshold {threshold:.0f}  muscles reopened {reopened}  '
+                f'largest/smallest {worst:.3f}  threshold {threshold:.0f}  '
+                f'muscles learned again {reopened}  '
                 f'{memory(os.getpid()):.0f} MB  '
                 f'update {np.median(trainer.seconds[reported:]):.2f} s',
                 flush=True,

@@ -42,7 +42,7 @@ def stop(name: str, number: signal.Signals, moment: float, state: Path) -> tuple
         output, _ = process.communicate(timeout=LONGEST_END)
         return process.returncode, time.monotonic() - begun, output
     except subprocess.TimeoutExpired:
-        return 0, LONGEST_END, f'error: it went on for {LONGEST_END:g} s'
+        return 0, LONGEST_END, f'error: the process still ran {LONGEST_END:g} s after the signal'
     finally:
         process.kill()
         process.wait()

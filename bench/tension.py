@@ -155,8 +155,12 @@ def main(argv: list[str]) -> int:
     parser.add_robot()
     parser.add_seeds(tuple(range(5, 15)))
     parser.add_quick('a quarter of the time')
-    parser.add_argument('--reality', default=KIN, help='emulator model: kin, foreign, MJCF file')
-    parser.add_argument('--methods', type=names, default=METHODS, help='control methods; none: -')
+    parser.add_argument(
+        '--reality', default=KIN, help='emulator model: kin, foreign or an MJCF file'
+    )
+    parser.add_argument(
+        '--methods', type=names, default=METHODS, help='control methods to compare, or - for none'
+    )
     parser.add_argument(
         '--seconds', type=positive, default=EXPLORED, help='time of exploration [s]'
     )

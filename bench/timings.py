@@ -130,13 +130,16 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
             products=products(mae, Mask.THETA_TENSION),
         ),
         Row(
-            'decode and gradient by z',
+            'decode, and gradient with respect to z',
             lambda: mae.decode_scaled.with_pullback(z)[1](gradient),
             lambda: _eager_gradient(eager, latent),
             products=2 * products(mae, None),
         ),
         Row('muscle Jacobian G from ①', lambda: mae.muscle_jacobian(theta, tension)),
-        Row('the same by forward difference', lambda: paper.muscle_jacobian(mae, theta, tension)),
+        Row(
+            'muscle Jacobian G by forward difference',
+            lambda: paper.muscle_jacobian(mae, theta, tension),
+        ),
         *control_rows(robot, mae, eager),
     ]
 
@@ -149,17 +152,17 @@ def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
     limit, joints = robot.tension.limit, robot.joint_count
     return [
         Row(
-            'control solve: proposed, default',
+            'one step of method proposed, preset default',
             lambda: control.proposed(robot, mae, theta, torque, tension, limit),
             lambda: eager_proposed(robot, eager, theta, torque, tension),
         ),
         Row(
-            'control solve: proposed, paper',
+            'one step of method proposed, preset paper',
             lambda: paper.proposed(robot, mae, theta, torque, tension),
             lambda: eager_proposed_paper(robot, eager, theta, torque, tension),
         ),
         Row(
-            'control solve: stiffness',
+            'one step of method stiffness',
             lambda: stiffness_command(robot, mae, theta, torque, np.full(joints, 20.0), limit),
         ),
     ]
@@ -253,19 +256,21 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         return lambda: simulated.step(0.01).theta[-1].tolist()
 
     network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
+    one, per_arm = 'simulation step', 'simulation step, time per arm in a batch of'
+    many = f'{per_arm} {MANY}'
     there = [
-        Row(f'simulation step, each of {n} arms on {device}', step(arms(n, device=device)), None, n)
+        Row(f'{per_arm} {n} on {device}', step(arms(n, device=device)), None, n)
         for n in (MANY, 16 * MANY)
         if device is not None
     ]
-    one, many = 'simulation step', f'the same, each of {MANY} in one batch'
+
     return [
         Row(one, step(arms(1)), step(arms(1, network)), 1, work),
         Row(many, step(arms(MANY)), step(arms(MANY, network)), MANY, work),
         Row(f'{one}, {ALL_TORCH}', step(arms(1)), step(EagerSimulation(arms(1)))),
         Row(f'{many}, {ALL_TORCH}', step(arms(MANY)), step(EagerSimulation(arms(MANY))), MANY),
         *there,
-        Row('simulator: taking a new network', partial(Simulation(robot, mae).use, mae)),
+        Row('loading a new network into the simulator', partial(Simulation(robot, mae).use, mae)),
     ]
 
 
@@ -307,7 +312,7 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
 def show(robot: Robot, preset: str, device: str | None = None) -> None:
     """Print the table."""
     name = robot.description.directory.name
-    print(f'{name}, preset {preset}, µs of one call (median), torch on one thread')
+    print(f'{name}, preset {preset}: median time of one call [µs]; torch uses one thread')
     print(f'{"":<64}{"ours":>10}{"torch eager":>14}{"bound":>10}')
     for row in measure(robot, preset, device):
         numbers = zip((row.ours, row.torch_eager, row.bound), (10, 14, 10))

@@ -264,7 +264,9 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
     )
     if not (len(states) and len(commands)):
         problem = f'{len(states)} states and {len(commands)} commands arrived in {passed:.0f} s'
-        raise MusculoskeletalError(f'{problem}: the nodes do not run, or the machine is too busy')
+        raise MusculoskeletalError(
+            f'{problem}; see the logs of the nodes, or repeat on an idle machine'
+        )
     after = np.searchsorted(commands, states)
     known = after < len(commands)
     latency = (commands[after[known]] - states[known]) * 1e-6  # [ms]
@@ -303,14 +305,17 @@ def main(argv: list[str]) -> None:
     robots = 'arm26,musashi_left_arm'
     parser.add_argument('--robots', type=names, default=robots, help='names or directories')
     parser.add_argument(
-        '--rates', type=numbers, default='100,200,500', help='rates of messages [Hz]'
+        '--rates', type=numbers, default='100,200,500', help='message rates of the driver [Hz]'
     )
     parser.add_argument(
         '--seconds', type=number(1.0, 3600.0), default=20.0, help='time of each measurement [s]'
     )
     parser.add_argument('--repeat', type=whole(1, 100), default=1, help='number of repetitions')
     args = parser.parse_args(argv)
-    print('latency [ms]: 50 %, 99 %, largest; late and missed messages [%]; CPU [% of a core]')
+    print(
+        'latency [ms]: median, 99th percentile, maximum; late and missed messages [%]; CPU [% of '
+        'a core]'
+    )
     for robot in args.robots:
         for rate, kind, wire in systems(robot, args.rates, [*KINDS] * args.repeat, args.seconds):
             print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<18}{wire}', flush=True)

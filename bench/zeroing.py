@@ -142,7 +142,10 @@ def main(argv: list[str]) -> int:
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_argument(
-        '--folder', type=Path, default=Path('bench_zeroing'), help='cache of learned networks'
+        '--folder',
+        type=Path,
+        default=Path('bench_zeroing'),
+        help='folder that keeps the learned networks for the next run',
     )
     parser.add_argument('--out', type=Path, help='JSON file for the results')
     args = parser.parse_args(argv)
@@ -158,11 +161,12 @@ def main(argv: list[str]) -> int:
             good &= not (got['alarms'] + got['alarms_after'] or got['stopped'])
             passed &= good
             print(
-                f'individual {seed}, {how:8s} {got["before_rad"]:.4f} → {got["after_rad"]:.4f}'
-                f' rad, × {got["ratio"]:.2f} after {got["seconds"]:.0f} s; offsets within '
-                f'{1e3 * got["worst_zero_m"]:.1f} mm, '
-                f'{got["alarms"]} + {got["alarms_after"]} alarms, '
-                f'≤ {1e3 * got["fastest_m_s"]:.0f} mm/s, ≤ {got["highest_n"]:.0f} N, ranges '
+                f'individual {seed}, {how:8s} error {got["before_rad"]:.4f} → '
+                f'{got["after_rad"]:.4f} rad (× {got["ratio"]:.2f}) after '
+                f'{got["seconds"]:.0f} s; largest error of an offset '
+                f'{1e3 * got["worst_zero_m"]:.1f} mm; {got["alarms"]} alarms during calibration '
+                f'and {got["alarms_after"]} after it; at most {1e3 * got["fastest_m_s"]:.0f} mm/s '
+                f'and {got["highest_n"]:.0f} N; mean range of the joints '
                 f'{got["range_rad"]:.2f} rad; {"meets" if good else "misses"} the goal',
                 got['stopped'],
                 flush=True,
