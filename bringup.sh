@@ -26,19 +26,20 @@ doc/howto/your_robot.md is the guide for your own robot.
   --robot NAME|DIR           a robot under config/, or a directory with robot.urdf and muscles.yaml
                              (default: musashi_left_arm)
   --mujoco FILE.xml          a MuJoCo model instead of a robot: imports it, reports the changes,
-                             trains, and plays the model itself (doc/howto/mujoco.md); with
-                             --joints, --muscles, --without NAME,… and --base, --end NAME as of
-                             import_robot
-  --checkpoint FILE          MAE to start from (default: train one, once, and keep it in the cache)
+                             trains, and emulates the model itself (doc/howto/mujoco.md). The
+                             options --joints, --muscles, --without NAME,…, --base and --end NAME
+                             are passed to import_robot
+  --checkpoint FILE          network to start from (default: train one once, and cache it)
   --hardware                 your own driver instead of the emulator: waits for its muscle_states,
-                             reports faults, and starts when all checks pass
-  --no-controller            nothing may move the arm
+                             reports faults, and starts the nodes when all checks pass
+  --no-controller            start no controller, so that nothing moves the arm
   --combined                 estimator and controller in one process
   --bag DIR                  a recording instead of the emulator: no controller, no emulator
   --explore | --no-explore   random exploration, so that learning has data (default: on; with
                              --hardware off: a real arm moves only on request)
   --no-learner               no online learning
-  --preset default|paper     our own methods, or exactly those of the paper (default: default)
+  --preset default|paper     the most accurate methods, or exactly those of the paper
+                             (default: default)
   --seed N                   seed of the emulated individual (default: 0; for a MuJoCo model:
                              the model without deviations)
   --reality kin|foreign|FILE.xml
@@ -62,7 +63,7 @@ doc/howto/your_robot.md is the guide for your own robot.
                              (default: run until Ctrl-C)
   --record DIR               record the topics to an mcap bag
   --view                     show the arm on a page, http://localhost:8080
-  --port N                   of the page (default: 8080)
+  --port N                   port of the page (default: 8080)
   --read-only                a page without controls
   -h, --help                 this text
 
@@ -107,7 +108,7 @@ nodes='controller|estimator|hardware_emulator|learner|sim'
 sorted=$(getopt --name bringup.sh --options hp: --longoptions robot:,checkpoint:,hardware \
   --longoptions no-controller,combined,bag:,explore,no-explore,no-learner,preset:,seed:,reality: \
   --longoptions joint-source:,params-file:,namespace:,network,duration:,record:,view,port: \
-  --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,help -- "$@") || refuse 'legal options: see ./bringup.sh --help'
+  --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,help -- "$@") || refuse 'see ./bringup.sh --help for the legal options'
 eval set -- "$sorted"
 given=$sorted
 while [ $# -gt 0 ]; do
@@ -128,7 +129,7 @@ while [ $# -gt 0 ]; do
     --reality) reality=$2 && shift ;;
     --joint-source) joint_source=$2 && shift ;;
     --params-file)
-      [ -f "$2" ] || refuse "--params-file '$2' is no file"
+      [ -f "$2" ] || refuse "--params-file '$2' is not a file"
       parameter_files+=("$2") && shift
       ;;
     -p)
@@ -147,7 +148,7 @@ while [ $# -gt 0 ]; do
     --port) port=$2 && shift ;;
     --read-only) read_only=(--read-only) ;;
     -h | --help) usage && exit ;;
-    --) [ $# = 1 ] || refuse "'$2' belongs to no option; see ./bringup.sh --help" ;;
+    --) [ $# = 1 ] || refuse "unexpected argument '$2'; see ./bringup.sh --help" ;;
   esac
   shift
 done
@@ -158,7 +159,7 @@ exclude() { # OPTION OTHER_OPTION…
   local other
   is_given "$1" || return 0
   for other in "${@:2}"; do
-    ! is_given "$other" || refuse "$1 and $other exclude each other"
+    ! is_given "$other" || refuse "$1 and $other cannot be used together; remove one of them"
   done
 }
 exclude --bag --hardware --combined --explore --reality
@@ -166,8 +167,8 @@ exclude --hardware --reality
 exclude --no-controller --combined --explore
 exclude --no-learner --joint-source
 exclude --mujoco --robot --hardware --bag --reality
-[ -n "$mujoco" ] || [ ${#chain[@]} = 0 ] || refuse "${chain[0]} goes with --mujoco"
-[ -z "$mujoco" ] || [ -f "$mujoco" ] || refuse "--mujoco '$mujoco' is no file"
+[ -n "$mujoco" ] || [ ${#chain[@]} = 0 ] || refuse "${chain[0]} requires --mujoco"
+[ -z "$mujoco" ] || [ -f "$mujoco" ] || refuse "--mujoco '$mujoco' is not a file"
 for option in --port --read-only; do
   ! is_given "$option" || [ $view = true ] || refuse "$option requires --view"
 done
@@ -289,7 +290,7 @@ stop() {
     for pid in "${pids[@]}"; do
       [ "${name_of[$pid]-}" != record ] || [ $patience = 30 ] || continue
       ! kill -KILL "$pid" 2>/dev/null ||
-        say "${name_of[$pid]-process $pid} did not stop within $patience s: killed"
+        say "${name_of[$pid]-process $pid} did not stop within $patience s and was killed"
     done
   done
   wait
@@ -316,7 +317,7 @@ train_once() {
     return
   fi
   [ -t 1 ] || export TQDM_MININTERVAL=5 # fewer lines of a progress bar in a file
-  say "training the MAE of $robot, once (a minute or two)"
+  say "training the initial network of $robot (once; it takes a minute or two)"
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
     > >(tee "$logs/train.log") 2>&1
   wait_for train || died train $?

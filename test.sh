@@ -15,7 +15,7 @@ cd "$repository" || exit 1
 
 # Tests of the page need a browser.
 if ! command -v chromium chromium-browser google-chrome >/dev/null; then
-  install_with_apt chromium || say 'no chromium: the page is not tested in a browser'
+  install_with_apt chromium || say 'chromium is not installed, so the page is not tested in a browser'
 fi
 
 say 'ruff check'

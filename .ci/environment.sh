@@ -61,8 +61,8 @@ find_ros() {
       export AMENT_PREFIX_PATH=$venv
       ;;
     *)
-      fail "ROS 2 '$ROS_DISTRO' is sourced in this shell, and this package is for jazzy." \
-        'Source /opt/ros/jazzy/setup.bash in a new shell, or start one in which no ROS is sourced:' \
+      fail "ROS 2 '$ROS_DISTRO' is sourced in this shell, but this package requires jazzy." \
+        'Source /opt/ros/jazzy/setup.bash in a new shell, or use a shell without ROS:' \
         'ROS 2 Jazzy is then installed into .venv.'
       ;;
   esac
@@ -86,18 +86,18 @@ make_venv() {
   case $version in
     3.10 | 3.11 | 3.12 | 3.13) ;;
     *)
-      fail "Python 3.10 to 3.13 is needed, and $base_python is ${version:-not there}." \
-        "Name another one:  PYTHON=python3.12 $0"
+      fail "Python 3.10 to 3.13 is required, but $base_python is ${version:-not installed}." \
+        "Choose another Python:  PYTHON=python3.12 $0"
       ;;
   esac
   if [ "$ros" = sourced ]; then
     options=(--system-site-packages)
     "$base_python" -c 'import rclpy' || fail \
       "ROS_DISTRO is jazzy, but $base_python (Python $version) cannot import rclpy." \
-      'Source /opt/ros/jazzy/setup.bash first, in a shell in which python3 is that of the system.'
+      'Source /opt/ros/jazzy/setup.bash in a shell in which python3 is the Python of the system.'
   elif [ "$(uname -m)" != x86_64 ]; then
-    fail "ROS 2 Jazzy is on PyPI for x86_64 only, and this is $(uname -m)." \
-      'Source /opt/ros/jazzy/setup.bash first.'
+    fail "PyPI has ROS 2 Jazzy for x86_64 only, but this machine is $(uname -m)." \
+      'Install ROS 2 Jazzy, source /opt/ros/jazzy/setup.bash, and try again.'
   fi
   # Minimal installations of Debian and Ubuntu lack venv's pip and a library of pinocchio.
   "$base_python" -c 'import ensurepip' 2>/dev/null || missing+=("python$version-venv")
@@ -107,8 +107,8 @@ make_venv() {
       "This machine lacks ${missing[*]}. On Debian or Ubuntu:  sudo apt-get install ${missing[*]}"
   fi
   rm -rf "$venv"
-  step "making .venv with Python $version" "$base_python" -m venv "${options[@]}" "$venv" ||
-    fail '.venv could not be made.'
+  step "creating .venv with Python $version" "$base_python" -m venv "${options[@]}" "$venv" ||
+    fail '.venv could not be created.'
 }
 
 # Fails without apt-get, or if sudo would require a password.
@@ -116,7 +116,7 @@ install_with_apt() { # PACKAGE…
   local -a as_root=()
   [ "$(id -u)" = 0 ] || as_root=(sudo -n)
   command -v apt-get >/dev/null && "${as_root[@]}" true 2>/dev/null || return
-  step 'updating the lists of apt-get' "${as_root[@]}" apt-get update &&
+  step 'updating the package lists of apt-get' "${as_root[@]}" apt-get update &&
     step "installing $* with apt-get" "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
       apt-get -y -o DPkg::Lock::Timeout=120 install --no-install-recommends "$@"
 }
@@ -135,10 +135,10 @@ urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
   # A killed pip may leave an installation that looks complete. Without this file, .venv is created
   # again.
   rm -f "$installed"
-  step "installing ${*##*/} into .venv (minutes, the first time)" \
+  step "installing ${*##*/} into .venv (this takes minutes the first time)" \
     "$python" -m pip install --no-compile "${arguments[@]}" ||
-    fail 'The packages could not be installed. Is the network there?' \
-      'Run the same command again to go on.'
+    fail 'The packages could not be installed. Check the connection to the internet,' \
+      'and run the same command again to continue.'
   { echo "# $ros $repository" && cat "$@"; } >"$installed"
 }
 
@@ -170,7 +170,7 @@ compile_package() { # PACKAGE STAMP
   if [ -e "$stamp" ] && [ -z "$(find "$package" -name '*.py' -newer "$stamp" \
     -exec grep -l njit {} +)" ]; then return; fi
   find "$package" -name '*.nb[ci]' -delete
-  step 'compiling with numba (half a minute, the first time)' \
+  step 'compiling with numba (this takes half a minute the first time)' \
     env PYTHONPATH="${package%/*}${PYTHONPATH:+:$PYTHONPATH}" "$python" "$repository/.ci/compile.py" ||
     fail 'The package could not be compiled.'
   touch "$stamp"
@@ -189,14 +189,14 @@ environment_setup() { # [test]
   [ "${1-}" != test ] || requirements+=(.ci/requirements-test.txt)
   for folder in "$repository" "$repository"/{.venv,build,install,log}; do
     [ ! -e "$folder" ] || [ -w "$folder" ] ||
-      fail "$folder cannot be written: $folder belongs to $(stat -c %U "$folder"), and you are $(id -un)." \
-        'Clone the repository into a folder of your own, or let its owner run this.'
+      fail "$folder cannot be written: it belongs to $(stat -c %U "$folder"), and you are $(id -un)." \
+        'Clone the repository into a folder of your own, or let the owner run this script.'
   done
   mkdir -p "$repository/log" "$repository/build"
 
   # Only one set-up runs at a time. A second one waits, and then has nothing to do.
   (
-    flock -n 9 || { say 'another set-up is running here: waiting for it' && flock 9; }
+    flock -n 9 || { say 'waiting for another set-up in this repository to finish' && flock 9; }
     : >"$setup_log"
     cd "$repository" || exit
     venv_is_complete || make_venv

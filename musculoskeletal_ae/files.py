@@ -161,9 +161,11 @@ def _check(text: str) -> None:
             is_mapping = isinstance(event, yaml.MappingStartEvent)
             within.append(_Collection(anchor, count - 1, is_mapping))
         if count > MOST_ENTRIES:
-            raise ValueError(f'{where}: more than {MOST_ENTRIES} entries, aliases expanded')
+            raise ValueError(
+                f'{where}: more than {MOST_ENTRIES} entries after aliases are expanded'
+            )
         if len(within) > DEEPEST:
-            raise ValueError(f'{where}: nested more than {DEEPEST} levels')
+            raise ValueError(f'{where}: entries are nested more than {DEEPEST} levels deep')
 
 
 def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:

@@ -106,7 +106,9 @@ CHECKPOINT = Parameter(
     '', 'file of a trained network (empty: wait for one on the topic)', settable=True
 )
 PRESET = Parameter(
-    DEFAULT, 'the most accurate methods, or those printed in the paper', legal=tuple(PRESETS)
+    DEFAULT,
+    'default: the most accurate methods; paper: exactly the methods of the paper',
+    legal=tuple(PRESETS),
 )
 SEED = Parameter(
     0, 'random seed of the emulated individual, exploration and learning', '', (0, UNBOUNDED)

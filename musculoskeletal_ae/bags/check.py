@@ -142,7 +142,9 @@ def _fit(
         return [str(error)], []
     left_out = [f'rejected {n}: {why}' for why, n in streams.rejected.items()]
     left_out += streams.notes
-    left_out += [f'used in part {n}: {why}' for why, n in streams.ignored.items()]
+    left_out += [
+        f'{n} messages were used only in part: {why}' for why, n in streams.ignored.items()
+    ]
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'cannot check the fit to {name}: the bag has no joint_states or muscle_states'
         return [problem], left_out

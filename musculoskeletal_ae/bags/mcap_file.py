@@ -125,7 +125,9 @@ class McapFile:
             self._complete = stream.position
         count = sum(topic.message_count for topic in self.topics.values())
         if statistics is not None and statistics.message_count != count:
-            raise ValueError(f'its summary counts {statistics.message_count} messages, not {count}')
+            raise ValueError(
+                f'its summary counts {statistics.message_count} messages, but it contains {count}'
+            )
 
     def _note_truncation(self) -> None:
         """Record that the file ends within a record."""

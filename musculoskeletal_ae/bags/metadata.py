@@ -142,7 +142,7 @@ def read_metadata(directory: Path) -> Contents:
             files = sorted(file for file in directory.iterdir() if file.suffix in SUFFIXES)
         if not files:
             problem = f'has neither a readable {FILE} nor mcap or sqlite3 files'
-            raise BagError(directory, problem, 'name a bag directory or a .mcap') from error
+            raise BagError(directory, problem, 'name a bag directory or an .mcap file') from error
         problem = f'{FILE} cannot be used ({error}); reading all files of the directory'
         return Contents(files, None, problem)
     information = metadata.rosbag2_bagfile_information

@@ -155,12 +155,12 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
         raise _no_motion(bag, topic)
     gaps = np.diff(time)
     if (gap := float(gaps.max())) > LONGEST_GAP:
-        problem = f'{topic} has no message for {gap:.1f} s after {time[gaps.argmax()]:.1f} s'
-        raise BagError(bag.path, problem, 'choose a part without gaps by --start and --duration')
+        problem = f'{topic} has a gap of {gap:.1f} s, which begins at {time[gaps.argmax()]:.1f} s'
+        raise BagError(bag.path, problem, 'choose a part without gaps with --start and --duration')
     longest = SPACING * (MOST_ENTRIES // joint_count - 2)
     if span > longest:
         problem = f'{topic} lasts {span:.0f} s; a trajectory may last {longest:.0f} s'
-        raise BagError(bag.path, problem, 'choose a part by --start and --duration')
+        raise BagError(bag.path, problem, 'choose a part with --start and --duration')
 
 
 def _no_motion(bag: Bag, topic: str) -> BagError:

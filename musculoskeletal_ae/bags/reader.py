@@ -116,7 +116,9 @@ def _open_file(path: Path) -> StorageFile:
         return sqlite3_file.Sqlite3File(path)
     if head.startswith(mcap_file.MAGIC):
         return mcap_file.McapFile(path)
-    raise BagError(path, 'is neither an mcap nor a sqlite3 file', 'name a bag directory or a .mcap')
+    raise BagError(
+        path, 'is neither an mcap nor a sqlite3 file', 'name a bag directory or an .mcap file'
+    )
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:

@@ -107,7 +107,7 @@ def open_file(path: Path) -> BinaryIO:
     """
 
     def refuse(file: Path, problem: str) -> BagError:
-        return BagError(file, problem, 'name another bag directory or .mcap')
+        return BagError(file, problem, 'name another bag directory or .mcap file')
 
     return open_regular(path, refuse)
 
@@ -131,7 +131,7 @@ def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTo
     """Add a topic, or add its messages to the topic of the same name; return the topic."""
     first = topics.setdefault(topic.name, replace(topic, message_count=0))
     if (first.type, first.problem) != (topic.type, topic.problem):
-        problem = f'topic {topic.name} has the types {first.type[:80]}, {topic.type[:80]}'
+        problem = f'topic {topic.name} has the types {first.type[:80]} and {topic.type[:80]}'
         raise BagError(file, problem, 'record a topic with one type only')
     first.message_count += topic.message_count
     return first

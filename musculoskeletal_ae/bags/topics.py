@@ -61,7 +61,7 @@ def interface_topics(
         _compare_type(bag, name, topics[relative].type)
     if state_topic := motors.motor_state_topic:
         if state_topic not in ours:
-            problem = f'topic {state_topic} of the parameter motor_state_topic is not in the bag'
+            problem = f'topic {state_topic}, which motor_state_topic names, is not in the bag'
             raise BagError(bag.path, problem, _topics_of(bag))
         recorded = ours['muscle_states'] = ours[state_topic]
         if interface_name(recorded) == 'joint_states':

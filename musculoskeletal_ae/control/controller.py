@@ -418,11 +418,12 @@ class Controller:
         if wanted and condition is not None:
             return f'stopped: {condition}'
         if wanted and self.settings.method == 'float':
-            return 'method float: the arm is guided by hand; set another method first'
+            return 'with method float, the arm is guided by hand; set another method first'
         if wanted and not (self.robot.tension_source.is_known or self.stream.body.offsets.known):
             return (
                 'the length offsets are unknown, and exploration cannot determine them without '
-                'tensions (tension_source: none); call estimator/zero with a stated posture'
+                'tensions (tension_source: none); hold the arm still, set the parameter '
+                'zero_posture of the estimator, and call estimator/zero'
             )
         if wanted and not self.stream.body.used.any():
             return f'all muscles are isolated; {RESTORE}'

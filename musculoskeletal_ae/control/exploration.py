@@ -111,7 +111,7 @@ def holdable_postures(
     raise RobotDescriptionError(
         f'{robot.description.directory}: only {len(held)} of {TRIES} random postures are holdable '
         f'with tensions in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N; '
-        'run check_robot'
+        'run check_robot, which suggests changes'
     )
 
 

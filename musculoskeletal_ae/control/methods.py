@@ -62,7 +62,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
     if robot.tension_source.is_current and settings.method in BY_TENSION:
         legal = tuple(method for method in METHODS if method not in BY_TENSION)
         raise MusculoskeletalError(
-            f'method {settings.method!r} regulates measured tensions, and tension_source of '
+            f'method {settings.method!r} requires measured tensions, but tension_source in '
             'muscles.yaml is current: the friction of a resting drive hides the force of a hand; '
             f'legal: {", ".join(legal)}'
         )
@@ -71,7 +71,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
     legal = preset_named(settings.preset).methods_without_tension
     if settings.method not in legal:
         raise MusculoskeletalError(
-            f'method {settings.method!r} needs tensions, and tension_source of muscles.yaml is '
+            f'method {settings.method!r} requires tensions, but tension_source in muscles.yaml is '
             f'none; legal with preset {settings.preset!r}: {", ".join(legal)}'
         )
 

@@ -95,7 +95,7 @@ class Planner:
         towards = self._hand.towards(start, theta, self._settings.hand_speed, now)
         planned = self._within_limits(mae, towards)
         self._last_pose = pose, whole, planned
-        return Plan(planned, problem and f'{problem}; going to the nearest posture')
+        return Plan(planned, problem and f'{problem}; the arm goes to the nearest posture')
 
     def is_under_way(self, pose: pin.SE3, whole: bool, followed: Trajectory | None) -> bool:
         """Return whether the followed trajectory already leads to this pose."""

@@ -17,7 +17,9 @@ MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/r
 class Settings:
     """Settings of control; `Controller.configure` applies changed ones."""
 
-    method: str = settable('proposed', 'how a target posture becomes a command', legal=METHODS)
+    method: str = settable(
+        'proposed', 'control method, which computes commands from targets', legal=METHODS
+    )
     preset: str = replace(PRESET, settable=True).field()
     joint_stiffness: tuple[float, ...] = settable(
         (0.0,),
@@ -27,28 +29,36 @@ class Settings:
         0.0,
         MOST_STIFFNESS / 0.06**2,  # for prismatic joints; 0.06 is RACK, whose import is slow
     )
-    first_duration: float = settable(5.0, 'movement duration', 's', 0.1, 60.0)
+    first_duration: float = settable(
+        5.0,
+        'duration of the movement to the target after a stop, and of the first movement with '
+        'method `geometric`, `first` or `second` (preset paper: also `proposed`)',
+        's',
+        0.1,
+        60.0,
+    )
     second_duration: float = settable(
         2.0,
-        'duration of the second movement of `second`, and of the one after a new checkpoint',
+        'duration of the second movement of method `second`, and of the movement after a new '
+        'checkpoint',
         's',
         0.1,
         60.0,
     )
     target_duration: float = settable(
         1.2,
-        'duration of a movement to a target under `proposed` and `stiffness`, longer if the muscle '
-        'modules need it (0: first_duration)',
+        'duration of a movement to a target with method `proposed` of preset default, or '
+        '`stiffness`; it is extended if the muscle modules are too slow (0: first_duration)',
         's',
         0.0,
         60.0,
     )
     constant_tension: float = settable(
-        0.0, 'T_const of `first`, kept within [T_bias, T_limit]', 'N', 0.0, 1000.0
+        0.0, 'T_const of method `first`, clamped to [T_bias, T_limit]', 'N', 0.0, 1000.0
     )
     rate_limit: float = settable(
         0.1,
-        'largest rate of a length command (for tension commands times K_stiff)',
+        'largest rate of change of a length command (tension commands: times K_stiff)',
         'm/s',
         0.001,
         1.0,
@@ -69,18 +79,19 @@ class Settings:
     )
     feedback_gain: float = settable(
         0.5,
-        'gain of the rest feedback of `proposed` on posture error and needless tension (0: none)',
+        'gain of the rest feedback of method `proposed`, which reduces posture error and needless '
+        'tension at rest (0: none)',
         '1/s',
         0.0,
         2.0,
     )
     hand_speed: float = settable(
-        0.25, 'largest speed of the hand to a single target_pose', 'm/s', 0.01, 2.0
+        0.25, 'largest speed of the hand on the way to a single target_pose', 'm/s', 0.01, 2.0
     )
     unreachable: str = settable(
         'refuse',
         'response to a target_pose out of reach, or to a target that is not holdable without the '
-        'isolated muscles',
+        'isolated muscles: refuse it, or go to the nearest posture',
         legal=UNREACHABLE,
     )
     max_age: float = settable(

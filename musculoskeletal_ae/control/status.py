@@ -76,7 +76,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         warnings.append(f'target clamped to the joint limits: {", ".join(target.clamped)}')
     _add_stiffness(core, values)
     if target.effort.any() and core.settings.method in ('geometric', 'first', 'second'):
-        warnings.append(f'method {core.settings.method} exerts no effort')
+        warnings.append(f'method {core.settings.method} ignores the effort of the target')
     follower = core.activities.follower
     if core.is_following:
         values['lag of the winches'] = f'{1000.0 * follower.winches.lag:.0f} ms'

@@ -61,11 +61,11 @@ class StopMemory:
             exists = file.exists()
         except BlockingIOError as error:
             self.close()
-            remedy = 'stop that controller, or set another directory for another arm'
+            remedy = 'stop that controller, or set another directory if it controls another arm'
             raise MusculoskeletalError(f'{name} is in use by a controller; {remedy}') from error
         except (OSError, ValueError, RuntimeError) as error:  # a NUL; an unknown home directory
             self.close()
-            remedy = "set a writable directory, or '' to keep no stop"
+            remedy = "set a writable directory, or '' to save no stop"
             raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error
         self._file = file
         if exists:
@@ -89,7 +89,9 @@ class StopMemory:
             new.replace(self._file)
         except OSError as error:
             self._next_attempt = time.monotonic() + RETRY_INTERVAL
-            self.problem = f'a restarted controller will not know this stop: {error}'
+            self.problem = (
+                f'the stop cannot be saved, so a restarted controller will not know it: {error}'
+            )
         else:
             self._written, self.problem = cause, ''
 

@@ -65,9 +65,9 @@ UNITS = {
 
 
 MOTOR_NOTE = (
-    'l and T are computed from positions and efforts: correct unit, sign, zero and order by the '
-    'parameters spool_radius, motor_direction, motor_zero, motor_names, tension_per_effort and '
-    'effort_zero'
+    'l and T are computed from positions and efforts; to correct their unit, sign, zero or order, '
+    'set the parameters spool_radius, motor_direction, motor_zero, motor_names, '
+    'tension_per_effort and effort_zero'
 )
 
 
@@ -187,8 +187,8 @@ class Listening:
                 lacking = np.isnan(theta).all(axis=0)
                 which = ', '.join(np.array(self._robot.joints)[lacking]) or 'all joints at once'
                 verdict.notes.append(
-                    f'sign, zero and order of l are not checked without θ of {which}: publish '
-                    'joint_states, or hold the arm still and pass --posture'
+                    f'sign, zero and order of l were not checked, because the angles of {which} '
+                    'are unknown; publish joint_states, or hold the arm still and pass --posture'
                 )
         return verdict
 
@@ -203,7 +203,8 @@ class Listening:
                 columns = states[:, :rows].reshape(len(states), -1).T
                 if 1 < max(len(np.unique(column)) for column in columns) <= QUIET:
                     verdict.notes.append(
-                        'readings hardly change: move the arm to check whether each is new'
+                        'the readings hardly change; move the arm to check whether each message '
+                        'is new'
                     )
                 else:
                     verdict.failed('repeated', share=100.0 * repeated)
@@ -229,7 +230,8 @@ class Listening:
                 verdict.passed('unit')
                 if np.isnan(states[2]).any():
                     verdict.notes.append(
-                        'no temperatures (NaN): nothing protects the motors from heat'
+                        'temperatures are not measured (NaN), so nothing protects the motors from '
+                        'heat'
                     )
                 return True
         for row, m in np.argwhere(~possible).tolist():
@@ -259,7 +261,8 @@ class Listening:
         if np.nanmax(states[2], initial=-math.inf) > HOTTEST_AT_REST:
             hottest = np.nanmax(states[2])
             verdict.notes.append(
-                f'a module at rest reports {hottest:.0f} °C: check that the unit is °C, not °F'
+                f'a module at rest reports {hottest:.0f} °C; check that the driver publishes °C, '
+                'not °F'
             )
 
     def _judge_lengths_and_joints(

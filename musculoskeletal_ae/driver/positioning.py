@@ -64,8 +64,8 @@ class Positioning(MotionTest):
             if highest > tension.limit[m]:
                 wanted, limit = distinct(highest, tension.limit[m])
                 raise MusculoskeletalError(
-                    f'--tension {wanted} N is above tension.limit of {self._robot.muscles[m]!r}, '
-                    f'{limit} N; choose a lower one'
+                    f'--tension {wanted} N exceeds tension.limit of {self._robot.muscles[m]!r}, '
+                    f'{limit} N; choose a lower value'
                 )
             self._highest = np.full(self._robot.muscle_count, highest)
 
@@ -88,7 +88,7 @@ class Positioning(MotionTest):
             return None
         detail = f'T rose to {tension[m]:.0f} N'
         if far[m]:
-            detail = f'l is {1e3 * (length - self._target)[m]:+.0f} mm off l_target'
+            detail = f'l deviates by {1e3 * (length - self._target)[m]:+.0f} mm from l_target'
         return RunAwayError(m, 'position ran away', detail=detail)
 
     def _pay_out(self, m: int) -> None:
@@ -130,13 +130,15 @@ class Positioning(MotionTest):
         pulled = wound[1, m] - home[1, m]
         if not SHARES[0] < moved[m] / asked < SHARES[1]:
             detail = (
-                f'l fell by {1e3 * moved[m]:.1f} mm where l_target fell by {1e3 * asked:.1f} mm'
+                f'l fell by {1e3 * moved[m]:.1f} mm while l_target fell by {1e3 * asked:.1f} mm'
             )
             verdict.failed('position gain', m, detail=detail)
         else:
             verdict.passed('unit', m)
         if np.isnan(pulled):
-            verdict.notes.append(f'{self.trying}: its tension is unknown, sign not checked')
+            verdict.notes.append(
+                f'{self.trying}: its tension is unknown, so its sign was not checked'
+            )
         elif pulled < -RESPONSE[0]:
             detail = f'T fell by {-pulled:.0f} N as l fell by {1e3 * moved[m]:.1f} mm'
             verdict.failed('position sign', m, detail=detail)

@@ -106,7 +106,7 @@ class Winding(MotionTest):
                 needed, limit = distinct(least, self._highest[m])
                 raise MusculoskeletalError(
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, '
-                    f'not {limit} N'
+                    f'but it may command {limit} N at most; pass a higher --tension'
                 )
         self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
 

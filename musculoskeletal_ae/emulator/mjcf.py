@@ -99,7 +99,9 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
             if len(coupling.terms) > 5:
                 degree = len(coupling.terms) - 1
                 problem = f'the coupling of joint {name!r} is a polynomial of degree {degree}'
-                raise MusculoskeletalError(f'reality foreign: {problem}; MuJoCo allows up to 4')
+                raise MusculoskeletalError(
+                    f'reality foreign: {problem}; MuJoCo allows up to 4; use reality kin'
+                )
             data[: len(coupling.terms)] = coupling.terms
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}
             link |= {'data': data, 'solimp': STIFF}
@@ -279,7 +281,7 @@ def _loading(file: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, ValueError, mujoco.FatalError) as error:
-        problem = f'MuJoCo does not load it: {" ".join(str(error).split())}'
+        problem = f'MuJoCo cannot load it: {" ".join(str(error).split())}'
         raise _file_error(file, problem) from error
 
 

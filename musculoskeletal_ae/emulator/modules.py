@@ -317,7 +317,8 @@ class Arm(ABC):
         """
         if not self.robot.actuation.follows_tensions:
             raise MusculoskeletalError(
-                'actuation: position: the modules follow lengths only; send length commands'
+                'with actuation: position, the modules follow lengths only; publish '
+                'muscle_length_command instead of muscle_tension_command'
             )
         self._follow(FOLLOW_TENSION, tension)
 

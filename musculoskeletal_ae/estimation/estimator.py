@@ -201,7 +201,7 @@ class Estimator:
         if not posture and not self.robot.tension_source.is_known:
             raise MusculoskeletalError(
                 'without tensions (tension_source: none), lengths can be calibrated only in a '
-                'known posture; hold the arm still and set the parameter stated_posture'
+                'known posture; hold the arm still and set the parameter zero_posture'
             )
         self._stated_posture = posture
         stated = np.array(posture) if posture else None

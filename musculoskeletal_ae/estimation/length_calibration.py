@@ -155,12 +155,15 @@ class LengthCalibration:
         if residual.max() > LARGEST_RESIDUAL:
             name = self._robot.muscles[int(residual.argmax())]
             limit = 1e3 * LARGEST_RESIDUAL
-            return f'{name} has a residual of {1e3 * residual.max():.1f} mm, limit {limit:g} mm'
+            return (
+                f'the residual of {name} is {1e3 * residual.max():.1f} mm; legal: at most '
+                f'{limit:g} mm'
+            )
         cost = self._fit.cost_per_residual(fit)
         # the fit may have found wrong postures that are similar to the true ones
         if not cost <= LARGEST_COST:
             problem = 'no offsets explain the lengths and tensions'
-            return f'{problem}: cost {cost:.2f}, limit {LARGEST_COST:g}'
+            return f'{problem}: the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
         return ''
 
 
@@ -184,4 +187,4 @@ def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
         return
     limits = zip(robot.units, robot.lower, robot.upper, strict=True)
     legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
-    raise MusculoskeletalError(f'stated posture {list(posture)}; legal: an empty list, or {legal}')
+    raise MusculoskeletalError(f'zero_posture is {list(posture)}; legal: an empty list, or {legal}')

@@ -27,7 +27,7 @@ class Detection:
     )
     on_anomaly: str = settable(
         'stop',
-        'stop: the arm stops until estimator/reset; isolate: the suspect is verified, isolated if '
-        'it is faulty, and the arm resumes',
+        'stop: the arm stops until estimator/reset is called; isolate: the suspect muscle is '
+        'verified and, if it is faulty, isolated; then the arm resumes',
         legal=ON_ANOMALY,
     )

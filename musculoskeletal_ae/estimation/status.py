@@ -48,10 +48,10 @@ def report(core: Estimator, now: float) -> Report:
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:
         changes = (
-            f'{core.robot.muscles[muscle]}: its module {change}'
+            f'the module of {core.robot.muscles[muscle]} {change}'
             for muscle, change in core.heat.changed.items()
         )
-        text = f'thermal drift of a cool module: {"; ".join(changes)}'
+        text = f'thermal drift: {"; ".join(changes)}'
         return Report('warn', text, {**values, 'state': 'thermal_drift'})
     if core.body.isolated:
         isolated = core.robot.names(core.body.isolated)

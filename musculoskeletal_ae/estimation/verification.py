@@ -88,7 +88,7 @@ _TEXTS = {
     Outcome.RUPTURED: 'ruptured',
     Outcome.JAMMED: 'jammed',
     Outcome.LENGTH_SENSOR_FROZEN: 'its length sensor is frozen',
-    Outcome.LENGTH_SENSOR_OFFSET: 'its length sensor is off',
+    Outcome.LENGTH_SENSOR_OFFSET: 'its length sensor has an offset',
     Outcome.TENSION_SENSOR_FROZEN: 'its tension sensor is frozen',
     Outcome.NOT_WOUND_IN: 'not verified, because it was not wound in',
     Outcome.TENSION_UNKNOWN: 'not verified, because its tension is unknown (tension_source: none)',

@@ -350,7 +350,9 @@ def _around_table(readme: Path) -> tuple[str, str]:
     head, _, rest = text.partition(BEGIN)
     rest = rest.partition(END)[2]
     if text.count(BEGIN) != 1 or text.count(END) != 1 or END in head:
-        raise MusculoskeletalError(f'{readme}: expected one {BEGIN} and then one {END}')
+        raise MusculoskeletalError(
+            f'{readme}: expected the lines {BEGIN} and {END}, once each and in this order'
+        )
     return head, rest
 
 

@@ -53,25 +53,27 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
     if limits:
         known = [name for name in limits if source.model.existJointName(name)]
         source.note(
-            'chosen', f'limits in {limits_file.name}: of joints {", ".join(known) or "none"}'
+            'chosen', f'limits of joints from {limits_file.name}: {", ".join(known) or "none"}'
         )
         if unknown := [name for name in limits if name not in known]:
             source.note(
-                'dropped', f'limits in {limits_file.name} of no joint: {", ".join(unknown)}'
+                'dropped', f'limits of unknown joints in {limits_file.name}: {", ".join(unknown)}'
             )
     centres.setdefault('world', np.zeros(3))
     for muscle in root.iter('myoMuscle'):
         fallback = f'muscle_{len(source.routes)}'
         kinds = [via.get('type') for via in muscle.findall('link/viaPoint')]
         if sum(kind not in ROUND for kind in kinds) < 2:
-            problem = f'muscle {muscle.get("name") or fallback}: fewer than 2 points'
+            problem = f'muscle {muscle.get("name") or fallback}: it has fewer than 2 points'
             source.note('dropped', problem)
             continue
         name = source.rename('muscle', muscle.get('name'), fallback, source.routes)
         route: list[RoutePoint | Wrap] = []
         for part in muscle.findall('link'):
             if (link := part.get('name', '')) not in centres:
-                raise refuse(file, f'muscle {name}: no link {link!r}; links: {", ".join(centres)}')
+                raise refuse(
+                    file, f'muscle {name}: unknown link {link!r}; links: {", ".join(centres)}'
+                )
             body = link if link in source.links else source.links[0]
             for via in part.findall('viaPoint'):
                 where, kind = f'muscle {name}: viaPoint', via.get('type', 'FIXPOINT')
@@ -82,7 +84,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                     if not route or isinstance(route[-1], Wrap):
                         source.note(
                             'dropped',
-                            f'muscle {name}: a {kind} via point without a point before it',
+                            f'muscle {name}: a {kind} via point, because no point is before it',
                         )
                         continue
                     radius = float(numbers(via.get('radius'), 1, f'{where} radius')[0])
@@ -98,7 +100,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                 route.append(RoutePoint(body, at))
         if route and isinstance(route[-1], Wrap):
             route.pop()
-            source.note('dropped', f'muscle {name}: a wrap without a point after it')
+            source.note('dropped', f'muscle {name}: a wrap, because no point is after it')
         source.routes[name] = tuple(route)
     if model == 'model.urdf':
         _measure(source)
@@ -148,7 +150,10 @@ def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
     for i, name in enumerate(names, 1):
         ends = carried[source.model.parents[i]], carried[i]
         source.routes[name] = tuple(RoutePoint(n, np.zeros(3)) for n in ends)
-        source.note('chosen', f'{name}, origin to origin: replace it')
+        source.note(
+            'chosen',
+            f'muscle {name} connects the origins of two links: replace its route by the real one',
+        )
     return source
 
 
@@ -180,7 +185,7 @@ def _read_urdf(
     model = source.model
     source.links = [str(frame.name) for frame in body_frames(model)]
     if shaped := [link for link in root.findall('link') if link.find('visual') is not None]:
-        source.note('dropped', f'meshes and other shapes: of {len(shaped)} links')
+        source.note('dropped', f'meshes and other shapes of {len(shaped)} links')
     for joint in root.findall('joint'):
         parent, child = joint.find('parent'), joint.find('child')
         if parent is not None and child is not None:
@@ -194,7 +199,7 @@ def _read_urdf(
     source.couplings = read_mimics(root)
     names = {joint.get('name') for joint in root.findall('joint')}
     if lost := [c.master for c in source.couplings.values() if c.master not in names]:
-        raise refuse(file, f'there is no joint {lost[0]!r}, which a joint mimics')
+        raise refuse(file, f'a joint mimics {lost[0]!r}, but there is no such joint')
     origins = {e.get('name', ''): e.find('inertial/origin') for e in root.findall('link')}
     centres = {n: '0 0 0' if e is None else e.get('xyz', '0 0 0') for n, e in origins.items()}
     return source, {name: numbers(xyz, 3, f'link {name}') for name, xyz in centres.items()}
@@ -206,7 +211,7 @@ def _read_sdf(
     """Return the first model of an SDF as `_read_urdf` does."""
     model = root.find('.//model')
     if root.tag != 'sdf' or model is None:
-        raise refuse(file, 'expected an sdf with a model')
+        raise refuse(file, 'expected an <sdf> element with a <model>')
     if len([*root.iter('model')]) > 1 or model.find('include') is not None:
         raise refuse(file, 'expected a single model without <include>; merge them into one')
     version = [int(part) for part in root.get('version', '1.6').split('.')]
@@ -252,7 +257,7 @@ def _read_sdf(
         if not stands and name in carried_by:
             if (kind := carried_by[name].get('type', '')) != 'fixed':
                 label = carried_by[name].get('name', '')
-                source.note('held fixed', f'joint {label}: it is {kind}, and carries the root link')
+                source.note('held fixed', f'joint {label} ({kind}), which carries the root link')
         elif stands:
             joint = carried_by[name]
             label, kind = joint.get('name', ''), joint.get('type', '')

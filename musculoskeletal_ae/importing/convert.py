@@ -76,10 +76,10 @@ def read_source(file: Path) -> Source:
             raise
         root = ET.Element('mujoco')
     if root.tag not in READERS:
-        problem = f'{root.tag[:60]!r} is none of the formats read: {", ".join(READERS)}'
+        problem = f'the root element {root.tag[:60]!r} is unknown; legal: {", ".join(READERS)}'
         raise refuse(file, f'{problem}; an SDF is read beside its cardsflow.xml')
     if any('/xacro}' in element.tag for element in root.iter()):
-        raise refuse(file, 'this is a xacro, not a URDF: expand it first, by xacro FILE > arm.urdf')
+        raise refuse(file, 'this is a xacro, not a URDF; expand it first:  xacro FILE > arm.urdf')
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)
@@ -163,7 +163,10 @@ def play(robot: Robot, file: Path) -> int:
         print(f'{message}, which is fast enough for real time')
         return 0
     slower = needed / REAL_TIME
-    print(f'{message}, about {slower:.2g} times too slow for real time; the nodes use its clock')
+    print(
+        f'{message}, about {slower:.2g} times too slow for real time; all nodes then use the '
+        "emulator's slower clock"
+    )
     return SLOW
 
 

@@ -64,7 +64,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
     try:
         model = open_mjcf(file).compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise refuse(file, f'MuJoCo does not load it: {" ".join(str(error).split())}') from error
+        raise refuse(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error
     finally:
         mujoco.set_mju_user_warning(lambda _: None)
     source = _Reader(model, file.stem).source
@@ -202,7 +202,7 @@ class _Reader:
             stiffness, damping = m.jnt_stiffness[j], float(m.dof_damping[m.jnt_dofadr[j]])
             if m.jnt_type[j] not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 for effect in ('springs',) * bool(stiffness) + ('damping',) * bool(damping):
-                    source.note('dropped', f'{effect}: joint {name}, no hinge or slide')
+                    source.note('dropped', f'{effect}: joint {name} is neither a hinge nor a slide')
                 continue
             if stiffness:
                 rest = float(m.qpos_spring[m.jnt_qposadr[j]])
@@ -250,7 +250,9 @@ class _Reader:
             turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
             for j in range(m.body_jntadr[i], m.body_jntadr[i] + m.body_jntnum[i]):
                 if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE:
-                    problem = f'free joint {self.names["joint"][j]}, where the file puts it'
+                    problem = (
+                        f'free joint {self.names["joint"][j]}, at the pose that the file gives'
+                    )
                     self.source.note('held fixed', problem)
                     continue
                 before, stand = stand, pin.SE3(turn, data.xanchor[j].copy())
@@ -271,7 +273,10 @@ class _Reader:
         kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
         axes, names, slides = [m.jnt_axis[j].copy()], [name], kind == types.mjJNT_SLIDE
         if kind == types.mjJNT_BALL:
-            source.note('approximated', f'ball joint {name}: three hinges, x then y then z')
+            source.note(
+                'approximated',
+                f'ball joint {name}: replaced by three hinges, about x, y and z in this order',
+            )
             axes, rest, low = list(np.eye(3)), 0.0, -high
             names = distinct((f'{name}_{c}' for c in 'xyz'), self.names['joint'])
             self.balls[j] = names
@@ -286,7 +291,9 @@ class _Reader:
         m, source = self.model, self.source
         for e in np.flatnonzero(m.eq_active0).tolist():
             if m.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT:
-                source.note('dropped', f'equality {self.names["equality"][e]}: not of joints')
+                source.note(
+                    'dropped', f'equality {self.names["equality"][e]}: it does not couple joints'
+                )
                 continue
             slave, master, terms = int(m.eq_obj1id[e]), int(m.eq_obj2id[e]), m.eq_data[e][4::-1]
             name, leader = self.names['joint'][slave], master
@@ -318,7 +325,7 @@ class _Reader:
         for t in range(m.ntendon):
             name, first = self.names['tendon'][t], m.tendon_adr[t]
             if m.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT:
-                source.note('dropped', f'tendon {name}: it is fixed, so that it has no route')
+                source.note('dropped', f'tendon {name}: it is a fixed tendon, which has no route')
             elif driven and t not in driven:
                 source.note('dropped', f'tendon {name}: no actuator pulls it')
             else:
@@ -402,9 +409,12 @@ class _Reader:
         """Make objects thinner whose rim carries a site of a tendon that wraps around them."""
         for tendon, geom in tie_rims(self.model):
             body = self.names['body'][self.model.geom_bodyid[geom]]
-            tied = f'muscle {self.names["tendon"][tendon]}: a site on the rim of an object'
+            site = (
+                f'muscle {self.names["tendon"][tendon]}: a site on the rim of an object on {body}'
+            )
             self.source.note(
-                'chosen', f'{tied} on {body} is attached to it; MuJoCo lets rounding decide'
+                'chosen',
+                f'{site} counts as outside the object; in MuJoCo, rounding errors decide this',
             )
 
     def _points(self) -> None:

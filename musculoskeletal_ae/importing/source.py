@@ -108,7 +108,7 @@ class Source:
         end = UNLIMITED[slides]
         range_text = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
         remedy = self.limits_file or 'the source'
-        chosen = f'joint {joint}: limits ±{end:.4g}, the source has {range_text}'
+        chosen = f'joint {joint}: limits ±{end:.4g}, because the source has {range_text}'
         self.note('chosen', f'{chosen}; give it a range in {remedy}')
         return -end, end
 
@@ -274,15 +274,17 @@ def cut(
     """
     model, links = source.model, source.links
     if base and base not in links:
-        raise SourceError(f'--base {base}: no such link; links: {listed(links)}')
+        raise SourceError(f'--base: unknown link {base!r}; links: {listed(links)}')
     if end and end not in {*links, *source.points}:
         legal = f'links: {listed(links)}; points: {listed([*source.points])}'
-        raise SourceError(f'--end {end}: no such link or point; {legal}')
+        raise SourceError(f'--end: unknown link or point {end!r}; {legal}')
     is_chosen, end = not end, source.point_link(end)
     root = source.place(base)[0] if base else 0
     inside = [i for i, above in enumerate(model.supports) if root in list(above)]
     if end and source.place(end)[0] not in inside:
-        raise SourceError(f'--end {end}: it does not hang on --base {base}')
+        raise SourceError(
+            f'--end {end!r} is not in the chain that begins at --base {base!r}; choose another link'
+        )
     source.links = [name for name in links if source.place(name)[0] in inside]
     source.links.sort(key=lambda name: name != base)
     inner = [model.names[i] for i in inside if i not in (0, root)]
@@ -312,7 +314,7 @@ def cut(
     for option, names in (('--muscles', muscles), ('--without', without)):
         if unknown := [name for name in names if name not in source.routes]:
             legal = ', '.join(source.routes)
-            raise SourceError(f'{option} {unknown[0]}: no such muscle; muscles: {legal}')
+            raise SourceError(f'{option}: unknown muscle {unknown[0]!r}; muscles: {legal}')
     for name, route in list(source.routes.items()):
         lost = [item.link for item in route if item.link not in source.links]
         if lost:
@@ -325,7 +327,9 @@ def cut(
     if any(source.strength.values()):
         source.note('chosen', STRENGTH)
     if count := sum(not source.strength.get(name) for name in source.routes):
-        source.note('chosen', f'tension of {count} muscles: the default, the source has none')
+        source.note(
+            'chosen', f'tension of {count} muscles: the defaults, because the source has none'
+        )
     if is_chosen:
         _choose_end(source)
     else:
@@ -345,7 +349,7 @@ def _choose_end(source: Source) -> None:
     legal = [each for each in dict.fromkeys(others) if each in {*source.links, *source.points}]
     legal.remove(name)
     more = f'; others: {listed(legal)}' if legal else ''
-    source.note('chosen', f'end effector {name} (--end is another{more})')
+    source.note('chosen', f'end effector {name} (choose another with --end{more})')
     source.end_effector = source.point_link(name)
 
 
@@ -363,7 +367,7 @@ def urdf(source: Source) -> str:
         down = pin.Quaternion.FromTwoVectors(model.gravity.linear / size, -np.eye(3)[2])
         upright = pin.SE3(down.matrix(), np.zeros(3)) * upright
         if abs(size - EARTH) > 0.02:
-            source.note('chosen', f'gravity: {EARTH} m/s², the source has {size:.4g}')
+            source.note('chosen', f'gravity: {EARTH} m/s², although the source has {size:.4g} m/s²')
     carriers = {0: root}  # link of each joint
     if not upright.isIdentity(1e-9):
         (carriers[0],) = distinct([f'{root}_upright'], source.links)
@@ -443,7 +447,10 @@ def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]
             else:
                 rest -= factor * source.rest.get(name, 0.0)
         if bent:
-            source.note('dropped', f'spring {spring.name}: {bent[0]} follows another by a curve')
+            source.note(
+                'dropped',
+                f'spring {spring.name}: its joint {bent[0]} follows another joint nonlinearly',
+            )
             continue
         stiffness += spring.stiffness * np.outer(share, share)
         preload += spring.stiffness * rest * share

@@ -240,7 +240,11 @@ def _parse(arguments: list[str]) -> Namespace:
     add('--posture', type=numbers, metavar='θ,…', help=text)
     text = 'for winches without absolute encoders: do not check the length offsets'
     add('--unzeroed', action='store_true', help=text)
-    add('--move', action='store_true', help='then wind each muscle in slightly, one at a time')
+    add(
+        '--move',
+        action='store_true',
+        help='after listening, wind in each muscle slightly, one at a time',
+    )
     add('--muscles', type=names, metavar='NAME,…', help='with --move: wind only these muscles in')
     text = (
         'with --move: highest commanded tension [N] (default: T_bias + 40 N; for K above '

@@ -138,7 +138,10 @@ class Controller(Shell):
         check_method(self.robot, replace(self.core.settings, method=value))
         if value in BY_TENSION and self.motor_commands is not None:
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
-            problem = f'{value!r}: the motors on {self.motors.command_topic} follow lengths only'
+            problem = (
+                f'{value!r} commands tensions, but the motors on {self.motors.command_topic} '
+                'follow lengths only'
+            )
             raise MusculoskeletalError(f'{problem}; legal: {legal}')
         followed = {
             kind: publisher.get_subscription_count()
@@ -150,9 +153,12 @@ class Controller(Shell):
         if by_tension and followed[LENGTH] and not followed[TENSION]:
             # Refuse the method, because a driver that gets no commands pays the muscles out.
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
-            problem = f'{value!r}: the driver follows muscle_length_command only'
+            problem = (
+                f'{value!r} commands tensions, but the driver subscribes to muscle_length_command '
+                'only'
+            )
             raise MusculoskeletalError(
-                f'{problem}; legal: {legal}; or let it follow muscle_tension_command, too'
+                f'{problem}; legal: {legal}; or let the driver subscribe to muscle_tension_command'
             )
         return value
 

@@ -177,7 +177,10 @@ def make_executor(context: Context | None = None) -> Executor:
     installed = f'rclpy {_dotted(version) or "of unknown version"}'
     if choice == 'events' and version < EVENTS_SINCE:
         needed = _dotted(EVENTS_SINCE)
-        raise MusculoskeletalError(f'{VARIABLE}=events needs rclpy {needed}; this is {installed}')
+        raise MusculoskeletalError(
+            f'{VARIABLE}=events needs rclpy {needed} or later; installed: {installed}; unset '
+            f'{VARIABLE}'
+        )
     if choice == 'lean' or (not choice and TESTED[0] <= version <= TESTED[1]):
         executor = LeanExecutor(context=context)
         missing = [name for name in PRIVATE_NAMES if not hasattr(executor, name)]

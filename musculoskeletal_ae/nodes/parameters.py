@@ -46,8 +46,8 @@ NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
 STATE_DIRECTORY = Parameter(
     'auto',
-    'where the learner saves samples and network, and the controller its stop (auto: below '
-    'XDG_STATE_HOME; empty: nowhere)',
+    'directory in which the learner saves its samples and network, and the controller its latched '
+    'stop (auto: below XDG_STATE_HOME; empty: nothing is saved)',
 )
 
 ALL_NODES = '/**'  # name of the section for all nodes in a parameter file
@@ -90,8 +90,8 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'publish_tf': Parameter(
             'none',
-            'source of the joint angles for link poses on /tf; needs tf2_msgs, which a sourced '
-            'Jazzy has',
+            'source of the joint angles for link poses on /tf; requires tf2_msgs, which is part of '
+            'an installed ROS 2 Jazzy',
             legal=('none', 'estimate', 'sensor'),
         ),
     },
@@ -110,8 +110,8 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'clock': Parameter(
             False,
-            'publish /clock; simulated time slows down on a computer that is too slow; all nodes '
-            'need use_sim_time',
+            'publish /clock, which runs slower if the computer is too slow for real time; all '
+            'nodes then need use_sim_time',
         ),
         'ruptured_muscles': Parameter(
             ('',), 'names of ruptured muscles ([""]: none)', settable=True
@@ -119,7 +119,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
         'length_offset': Parameter(
             (0.0,),
-            'offset of the length sensors, one for all or one each',
+            'offset of the length sensors; one value for all muscles, or one for each',
             'm',
             (-1.0, 1.0),
             settable=True,
@@ -137,7 +137,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'imu_link': Parameter('', 'link that carries an accelerometer (empty: none)'),
         'command_timeout': Parameter(
             0.5,
-            'time without a command after which the modules go safe',
+            'time without a command after which the muscle modules enter their safe state',
             's',
             (0.01, 60),
             settable=True,
@@ -166,7 +166,9 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             settable=True,
         ),
         'fresh': Parameter(
-            False, 'drop the saved state and start from `checkpoint`', settable=True
+            False,
+            'start from `checkpoint` instead of the saved samples and network',
+            settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
         **parameters_of(LearningSettings),
@@ -284,8 +286,9 @@ def _unreadable(file: Path, problem: str) -> MusculoskeletalError:
 
 
 HELP_TAIL = """\
-Set them by  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE; those marked * may be
-set while the node runs. Remap names by  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER"""
+Set parameters with  --ros-args -p NAME:=VALUE  or  --ros-args --params-file FILE. Parameters
+marked * can also be set while the node runs.
+Remap names with  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER"""
 
 
 def help_text(executable: str) -> str:

@@ -41,7 +41,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
         spinner.spin_until(lambda: topics[0] in drawn, options.timeout)
     if not drawn:
         problem = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
-        remedy = 'is the node running, and in this namespace (--ros-args -r __ns:=/NAME)?'
+        remedy = 'check that the node runs, and state its namespace (--ros-args -r __ns:=/NAME)'
         raise MusculoskeletalError(f'{problem}; {remedy}')
     topic = topics[0] if topics[0] in drawn else topics[-1]
     save_picture(drawn[topic], options.out)

@@ -24,7 +24,9 @@ from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-ROS_HELP = 'ROS options follow --ros-args: -r __ns:=/left_arm, -r TOPIC:=OTHER.'
+ROS_HELP = (
+    'Options of ROS follow --ros-args, such as  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER.'
+)
 LONGEST_WAIT = 0.1  # longest time between checks of a condition and of the stop signals [s]
 
 

@@ -282,10 +282,13 @@ class Situation:
         if len(silent) > 1:  # one cause is more likely than several nodes that end together
             names = ', '.join(silent)
             since = f'no report for {max(silent.values()):.0f} s'
-            advice = f'is the computer overloaded (load {load_text()})? Otherwise see their logs'
-            return [f'{names}: {since}: {advice}, then restart them or bringup.sh']
+            advice = f'perhaps the computer is overloaded (load {load_text()})'
+            return [
+                f'{names}: {since}; {advice}; if it lasts, see their logs and restart bringup.sh'
+            ]
         return [
-            f'{name}: no report for {silence:.0f} s; see its log, then restart it or bringup.sh'
+            f'{name}: no report for {silence:.0f} s; see its log, then restart the node or '
+            'bringup.sh'
             for name, silence in silent.items()
         ]
 

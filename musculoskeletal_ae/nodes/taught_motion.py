@@ -114,7 +114,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
     if not publisher.get_subscription_count():
         listeners = ', '.join(sorted(answers.listeners))
         raise MusculoskeletalError(
-            f'no connection to {listeners} within {wait:g} s: try again, or with a longer --wait'
+            f'no connection to {listeners} within {wait:g} s: try again with a longer --wait'
             if listeners
             else f'{topic} has no subscriber: start the controller first'
         )
@@ -130,15 +130,16 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
             REPORT_TIME if has_reported else 0.0,
         )
         if answers.refusal:
-            raise MusculoskeletalError(
-                f'the controller did not take the trajectory: {answers.refusal}'
-            )
+            raise MusculoskeletalError(f'the controller refused the trajectory: {answers.refusal}')
         if answers.is_taken:
             return
         if is_acknowledged and not answers.reports:
-            print(f'{topic}: received; no node has reported whether it uses it', file=sys.stderr)
+            print(
+                f'{topic} was received, but no node has reported whether it follows the trajectory',
+                file=sys.stderr,
+            )
             return
     raise MusculoskeletalError(
-        f'{topic} was sent {SENDINGS} times, and no node has used it; try again when this machine '
-        'is less busy'
+        f'the trajectory was sent {SENDINGS} times on {topic}, but no node has used it; try again '
+        'when this machine is less busy'
     )

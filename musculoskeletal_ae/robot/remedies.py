@@ -72,7 +72,7 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
     if share >= REQUIRED_SHARE:
         return [*texts, f'together: {text}']
     if share > max(alone)[0]:
-        texts.append(f'not enough even together: {text}')
+        texts.append(f'even all of these together are not enough: {text}')
     texts = texts or [f'none of these helps: {", ".join(CHANGES)}']
     return [*texts, 'other routes may help: see --suggest']
 

@@ -8,7 +8,7 @@ from musculoskeletal_ae.parameters import Parameter
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 
-_EACH = 'one for all muscles or one for each'
+_EACH = 'one value for all muscles, or one for each'
 
 
 @dataclass(frozen=True)
@@ -34,18 +34,20 @@ class MotorSettings:
     ).field()
     spool_radius: tuple[float, ...] = Parameter(
         (1.0,),
-        f'tendon per unit of position: radius of the spool for angles, 1 for lengths in m, {_EACH}',
+        'length of tendon per unit of motor position: radius of the spool for angles, 1 for '
+        f'lengths in m; {_EACH}',
         'm',
         (1e-4, 10.0),
     ).field()
     motor_direction: tuple[float, ...] = Parameter(
         (1.0,),
-        f'1 if the position rises as the motor pays out, -1 if it rises as it winds in, {_EACH}',
+        '1 if the motor position rises as the motor pays out, -1 if it rises as the motor winds '
+        f'in; {_EACH}',
         '',
         (-1.0, 1.0),
     ).field()
     motor_zero: tuple[float, ...] = Parameter(
-        (0.0,), f'position at which l is 0, {_EACH}', '', (-1e6, 1e6)
+        (0.0,), f'motor position at which l is 0; {_EACH}', '', (-1e6, 1e6)
     ).field()
     tension_per_effort: tuple[float, ...] = Parameter(
         (1.0,),
@@ -55,5 +57,5 @@ class MotorSettings:
         (-1e6, 1e6),
     ).field()
     effort_zero: tuple[float, ...] = Parameter(
-        (0.0,), f'effort at which T is 0, {_EACH}', '', (-1e6, 1e6)
+        (0.0,), f'effort at which T is 0; {_EACH}', '', (-1e6, 1e6)
     ).field()

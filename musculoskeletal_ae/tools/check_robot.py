@@ -21,7 +21,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_seed('of the postures')
     parser.add_plot('moment arms and stiffness')
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
-    text = 'search for the smallest change of via points that makes it sound (takes minutes)'
+    text = 'search for the smallest change of via points that makes the robot sound (takes minutes)'
     parser.add_argument('--suggest', action='store_true', help=text)
     text = 'new directory for the arm that --suggest finds, and a picture of before and after'
     parser.add_argument('--out', type=Path, metavar='DIR', help=text)

@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     text = (
         f'{", ".join(NAMES)}; several, separated by commas; all; '
-        'or paper, which is those that repeat the paper'
+        'or paper, for all that repeat the paper'
     )
     parser.add_argument('names', metavar='NAME', type=_names, help=text)
     parser.add_robot()
@@ -37,8 +37,8 @@ def main(argv: list[str] | None = None) -> int:
     cores = len(os.sched_getaffinity(0))
     parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='processes')
     text = (
-        'keep networks, recordings and measured parts there; a later run with the same options '
-        'measures only the parts that are missing (use only folders of your own runs)'
+        'folder that keeps networks, recordings and measured parts; a later run with the same '
+        'options measures only the parts that are missing (use only folders of your own runs)'
     )
     parser.add_argument('--keep', type=Path, metavar='DIR', help=text)
     text = 'also write the results table between the markers of this page'

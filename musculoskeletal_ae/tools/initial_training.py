@@ -58,7 +58,7 @@ def train(args: Namespace) -> None:
     """Train according to the options, print the errors and write the checkpoint."""
     for file in filter(None, (args.out, args.plot)):
         if not file.parent.is_dir() or file.is_dir():
-            raise MusculoskeletalError(f'{file}: is a directory, or its directory does not exist')
+            raise MusculoskeletalError(f'{file}: expected a file in an existing directory')
         try:  # check this before the training, which takes minutes
             NamedTemporaryFile(dir=file.parent, prefix=f'.{file.name}.').close()
         except OSError as error:
@@ -103,7 +103,7 @@ def train(args: Namespace) -> None:
     print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
     if (most > limit).any():
         overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
-        print(table(overload, f'the same, T in [{shown(limit)}, {shown(most)}] N (overload)'))
+        print(table(overload, f'overload: T in [{shown(limit)}, {shown(most)}] N'))
     print(joint_table(robot, planned))
     print(f'checkpoint: {args.out}')
     save_plot(args.plot, lambda: plot(robot, trained, planned))
@@ -120,7 +120,7 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
     if args.checkpoint:
         mae = checkpoint.load(args.checkpoint, robot)
     else:
-        print(f'training the network of {robot.description.directory.name} to start from')
+        print(f'training the initial network of {robot.description.directory.name}')
         mae = initial_mae(robot, args.preset, args.seed, steps=steps).mae
     learner = Learner(robot, mae, args.preset, args.seed)
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
@@ -196,7 +196,7 @@ def read(
     for note in streams.notes:
         print(f'warning: {path}: {note}', file=sys.stderr)
     for part, count in streams.ignored.items():
-        print(f'warning: {path}: {count} messages used in part, {part}', file=sys.stderr)
+        print(f'warning: {path}: {count} messages were used only in part: {part}', file=sys.stderr)
     pairs = streams.pairs()
     if not len(pairs.time):
         problem = 'has no simultaneous joint_states and muscle_states'
@@ -289,7 +289,7 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
     width = max(len(name) for name in robot.joints) + 2
     rows = zip(robot.joints, estimates['theta'], robot.units)
     lines = [f'{name:<{width}}{error:.4f} {unit.theta}' for name, error, unit in rows]
-    return '\n'.join(['', '② → θ, mean |error| of each joint', *lines, ''])
+    return '\n'.join(['', 'mean error of each joint angle, estimated from T and l (②)', *lines, ''])
 
 
 def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:

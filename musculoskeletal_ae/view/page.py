@@ -338,7 +338,9 @@ class Page:
             button(RESET, 'reset', color='gray')
             button(CALIBRATE, 'estimator/zero', color='gray')
             self._restore = button(RESTORE, 'estimator/restore')
-            gizmo = gui.add_checkbox('drag the hand', False, hint='by arrows at the hand')
+            gizmo = gui.add_checkbox(
+                'drag the hand', False, hint='shows arrows at the hand that you can drag'
+            )
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', chosen(event)))
             # Steps of at most a hundredth of the range keep the ends near the limits.
             spans = np.minimum(robot.upper - robot.lower, 100.0)
@@ -350,7 +352,9 @@ class Page:
                 for joint, low, high, step in zip(robot.joints, *limits, steps)
             ]
         with gui.add_folder('Faults of the emulated arm') as faults:
-            self._muscle = gui.add_dropdown('muscle', robot.muscles, hint='or click on a muscle')
+            self._muscle = gui.add_dropdown(
+                'muscle', robot.muscles, hint='choose a muscle here, or click on it'
+            )
             self._muscle.on_update(lambda event: self._pick(chosen(event)))
             button(RUPTURE, 'rupture', lambda _: self._muscle.value, 'orange')
             button(REPAIR, 'repair', lambda _: self._muscle.value, 'gray')

@@ -93,7 +93,7 @@ def test_what_is_recorded_of_another_robot_is_refused_with_the_motors_that_are_m
         BagError, match=r'missing motor: deltoid_anterior, .* the message contains '
     ):
         read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=other)
-    with pytest.raises(BagError, match='/states of the parameter motor_state_topic is not in the'):
+    with pytest.raises(BagError, match='/states, which motor_state_topic names, is not in the'):
         interface_topics(Bag.open(tmp_path / 'bag'), motors=settings('/states'))
     assert not check_bag(tmp_path / 'bag', 'arm26', motors=settings()).faults
     assert check_bag(tmp_path / 'bag', 'arm26', motors=other).faults

@@ -122,7 +122,7 @@ def test_an_effort_is_exerted_by_proposed_and_reported_as_ignored_by_first():
     assert np.abs(bench.step(200)[-1].value - plain).max() > 1e-4
     bench.configure(method='first')
     bench.step()
-    assert 'exerts no effort' in bench.report().message
+    assert 'ignores the effort of the target' in bench.report().message
 
 
 def test_a_target_beyond_the_limits_is_clamped_and_joints_not_named_keep_theirs():

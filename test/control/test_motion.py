@@ -368,7 +368,7 @@ def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(be
     bench.configure(unreachable='nearest')
     bench.core.pose(far, False, bench.now)
     bench.step()
-    assert 'going to the nearest posture' in bench.report().message
+    assert 'the arm goes to the nearest posture' in bench.report().message
 
 
 def test_a_hand_pose_that_the_muscles_cannot_hold_is_refused(bench, monkeypatch):

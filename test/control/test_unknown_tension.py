@@ -123,12 +123,12 @@ def test_a_stop_pays_out_the_stated_length(loop):
 def test_lengths_are_calibrated_in_a_stated_posture_only_and_nothing_explores_before(trained):
     core = Estimator(ROBOT)
     core.use(trained['default'])
-    with pytest.raises(MusculoskeletalError, match='stated_posture'):
+    with pytest.raises(MusculoskeletalError, match='zero_posture'):
         core.calibrate_lengths()
     assert core.calibration is None
     control = Controller(ROBOT)
     control.use_body(control.stream.body.with_offsets(LengthOffsets.unknown(COUNT)))
-    assert 'stated posture' in control.explore(True)
+    assert 'zero_posture' in control.explore(True)
 
 
 def test_the_estimator_estimates_from_lengths_and_names_what_is_unknown(trained):

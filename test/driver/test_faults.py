@@ -257,7 +257,7 @@ def test_slow_repeated_and_frozen_messages_are_found():
     assert verdict.allows_motion
     repeating, rows = Driver(ROBOT), []
     repeating.publish = lambda now: rows.append(now) or rows[len(rows) // 2]
-    assert 'repeat the one before' in str(repeating.listen())
+    assert 'repeat the previous message' in str(repeating.listen())
     frozen = Driver(ROBOT)
     first = []
 

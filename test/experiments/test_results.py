@@ -91,7 +91,7 @@ def test_a_page_without_a_place_for_the_table_is_refused_before_the_work(
     assert experiment.main(options) == 1
     readme.write_text('no markers')
     assert experiment.main(options) == 1
-    assert 'expected one <!-- results -->' in capsys.readouterr().err
+    assert 'expected the lines <!-- results -->' in capsys.readouterr().err
 
 
 def fails(_study, seed):

@@ -47,7 +47,7 @@ def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
     assert len(result.robot.routes.wrapping) == 4
     assert result.robot.description.couplings['curl'].ratio == pytest.approx(0.5)
     assert result.robot.tension.limit[0] == pytest.approx(180.0)
-    assert 'dropped: tendon none: it is fixed, so that it has no route' in result.notes
+    assert 'dropped: tendon none: it is a fixed tendon, which has no route' in result.notes
     assert 'dropped: actuator not: it does not act on a tendon' in result.notes
 
 
@@ -112,12 +112,12 @@ def test_the_hand_is_the_tip_of_the_last_geometry_or_a_site(mjcf, tmp_path, caps
     np.testing.assert_allclose(pose.actInv(tip.translation), [0.0, 0.0, -0.06], atol=1e-9)
     (chosen,) = [note for note in result.notes if 'end effector' in note]
     assert chosen.startswith(
-        'chosen: end effector finger_tip (--end is another; others: finger, f2, hole, f1)'
+        'chosen: end effector finger_tip (choose another with --end; others: finger, f2, hole, f1)'
     )
     assert main([str(mjcf), '--out', str(tmp_path / 'site'), '--end', 'f1']) == 0
     assert Robot.load(tmp_path / 'site').description.end_effector == 'f1'
     assert main([str(mjcf), '--out', str(tmp_path / 'none'), '--end', 'thumb']) == 1
-    assert 'no such link or point; links: world, base' in capsys.readouterr().err
+    assert '--end: unknown link or point' in capsys.readouterr().err
 
 
 def test_muscles_are_left_out_by_name(mjcf, tmp_path):
@@ -293,8 +293,11 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
     cardsflow.write_text(text.replace('</viaPoint></link></myo', f'</viaPoint>{wrap}</link></myo'))
     result = import_robot(cardsflow, tmp_path / 'out')
     assert (result.robot.muscles, result.comparison) == (('front', 'back'), ({}, {}, {}))
-    assert 'dropped: muscle front: a wrap without a point after it' in result.notes
-    assert 'dropped: muscle front: a SPHERICAL via point without a point before it' in result.notes
+    assert 'dropped: muscle front: a wrap, because no point is after it' in result.notes
+    assert (
+        'dropped: muscle front: a SPHERICAL via point, because no point is before it'
+        in result.notes
+    )
     cardsflow.write_text('<cardsflow/>')
     with pytest.raises(SourceError, match=r'it has no muscle with a route$'):
         read_source(cardsflow)
@@ -358,7 +361,7 @@ def test_a_limit_with_one_end_is_none_and_a_joint_of_the_root_link_is_reported(c
     put(tmp_path, 'model.sdf', text)
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.lower == pytest.approx(-np.pi)
-    assert 'held fixed: joint t: it is revolute, and carries the root link' in result.notes
+    assert 'held fixed: joint t (revolute), which carries the root link' in result.notes
 
 
 LIMITS = 'shoulder: [0.3, -0.2, -0.7, 0.9]\nwrist: [[0.1, -0.1], [0.0, 0.2]]\nneck: [-1, 1]\n'
@@ -369,8 +372,8 @@ def test_cardsflow_limits_beside_the_model_are_read(cardsflow, tmp_path):
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.lower == pytest.approx([-0.7, -0.1])
     assert result.robot.upper == pytest.approx([0.9, 0.2])
-    assert 'chosen: limits in joint_limits.yaml: of joints shoulder, wrist' in result.notes
-    assert 'dropped: limits in joint_limits.yaml of no joint: neck' in result.notes
+    assert 'chosen: limits of joints from joint_limits.yaml: shoulder, wrist' in result.notes
+    assert 'dropped: limits of unknown joints in joint_limits.yaml: neck' in result.notes
 
 
 @pytest.mark.parametrize(

@@ -179,5 +179,7 @@ class JointDisagreement(Detector):
             return Finding(muscle, Kind.LENGTHS_DISAGREE, evidence)
         j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
         offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
-        cause = f'as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
+        cause = (
+            f'the lengths look as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
+        )
         return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f'{cause}: {evidence}')

@@ -188,7 +188,7 @@ class ResidualDistance(Detector):
         if self._beyond < IN_A_ROW:
             return ''
         reached, most = distinct(value, limit)
-        return f'{name} = {reached} above {most}{where} in {IN_A_ROW} consecutive messages'
+        return f'{name} = {reached} exceeded {most}{where} in {IN_A_ROW} consecutive messages'
 
     def _least_likely(self, bone_tension: Array, length: Array, candidates: Bools) -> int:
         """Return the muscle without which the remaining residual is most likely."""
