@@ -73,7 +73,7 @@ def test_all_quantities_that_mujoco_uses_are_imported(mjcf, tmp_path, old, new):
     assert not any(flips.values())
 
 
-def test_a_point_on_the_rim_of_a_wrapped_object_is_attached_to_it(mjcf, tmp_path):
+def test_a_point_on_the_rim_of_a_wrapped_object_counts_as_outside_it(mjcf, tmp_path):
     """MuJoCo's choice would depend on rounding, and vary with the posture."""
     drum = (
         '<geom name="pulley" type="cylinder" size="0.03" fromto="0 -0.02 0 0 0.02 0" mass="0.01"/>'
@@ -85,8 +85,8 @@ def test_a_point_on_the_rim_of_a_wrapped_object_is_attached_to_it(mjcf, tmp_path
     assert 'pulley' in text
     mjcf.write_text(text)
     result = import_robot(mjcf, tmp_path / 'out')
-    tied = 'muscle bend: a site on the rim of an object on lower is attached to it'
-    assert f'chosen: {tied}; MuJoCo lets rounding decide' in result.notes
+    site = 'muscle bend: a site on the rim of an object on lower counts as outside the object'
+    assert f'chosen: {site}; in MuJoCo, rounding errors decide this' in result.notes
     assert max(result.comparison.lengths.values()) < 1e-6
     m, robot = result.robot.muscles.index('bend'), result.robot
     theta = np.zeros((400, 3))
