@@ -7,7 +7,8 @@
 While a controller commands the arm, the file names the stop cause `restarted`. A latched stop
 replaces it by its own cause. A controller that ends properly while nothing stops it deletes the
 file. The file therefore remains after a stop, and after a controller that was killed or has
-crashed. The controller that finds it begins stopped, and moves only after `controller/reset`.
+crashed. A controller that finds the file when it starts is stopped from the beginning, and moves
+only after `controller/reset`.
 """
 
 import fcntl

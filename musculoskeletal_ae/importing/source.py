@@ -293,8 +293,8 @@ def cut(
     free = [name for name in movable if name not in {*couplings, *source.fixed}]
     wanted = set(joints or free)
     if missing := sorted(wanted - set(free)):
-        problem = 'coupled' if missing[0] in couplings else 'no such joint'
-        raise SourceError(f'--joints {missing[0]}: {problem}; joints: {", ".join(free)}')
+        kind = 'coupled' if missing[0] in couplings else 'unknown'
+        raise SourceError(f'--joints: {kind} joint {missing[0]!r}; joints: {", ".join(free)}')
     if end:
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
         # Masters of coupled joints in the chain move the chain as well.

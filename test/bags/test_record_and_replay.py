@@ -335,7 +335,7 @@ def test_the_result_of_a_replayed_demonstration_is_reported(tool, graph, tmp_pat
     graph.wait(lambda: replay.process.poll() is not None, 'its end')
     output = replay.output()
     assert replay.process.returncode == (0 if takes else 1), output
-    why = 'the controller did not take the trajectory: joint_trajectory: no posture yet'
+    why = 'the controller refused the trajectory: joint_trajectory: no posture yet'
     assert ('joint_trajectory: 31 points' if takes else why) in output
 
 

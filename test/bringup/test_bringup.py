@@ -236,7 +236,7 @@ def test_a_ruptured_muscle_is_detected_and_a_dead_node_named(environment):
         (['--robot', 'no_such_robot'], 'musashi_left_arm'),
         (['--duration', 'soon'], 'soon'),
         (['--read-only'], 'requires --view'),
-        (['--explore', '--no-controller'], 'exclude each other'),
+        (['--explore', '--no-controller'], 'cannot be used together'),
         (['-p', 'arm:rate:=50.0'], 'hardware_emulator'),
         (['-p', 'estimator:on_anomly:=stop'], 'nearest: on_anomaly'),
         (['--params-file', 'no_such_file.yaml'], 'no_such_file.yaml'),

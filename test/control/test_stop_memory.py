@@ -90,7 +90,7 @@ def test_a_stop_that_cannot_be_written_is_reported(tmp_path):
     memory = StopMemory(arm)
     shutil.rmtree(arm)
     memory.note(STOP)
-    assert 'will not know this stop' in memory.problem
+    assert 'a restarted controller will not know it' in memory.problem
 
 
 def test_without_a_directory_nothing_is_kept():

@@ -211,7 +211,7 @@ def test_the_motors_of_ros2_control_are_judged_as_muscles():
     [
         ({'motor_direction': (1.0,)}, 'sign', 'by the parameters spool_radius, motor_direction'),
         ({'spool_radius': (0.036,)}, 'unit', 'times the change that the route predicts'),
-        ({'motor_zero': (8.0,)}, 'zero', 'from the length that the route predicts'),
+        ({'motor_zero': (8.0,)}, 'zero', 'from the length that the route predicts in this posture'),
         ({'tension_per_effort': (0.224,)}, 'unit', 'tensions look like'),
         ({'motor_names': tuple('abcdef')}, 'order', 'correct the parameter motor_names'),
     ],
@@ -428,7 +428,7 @@ WOUND = {
     'no max': ({'in_tension': spring}, 'law', 'max(0, …)'),
     'command read as mm': ({'take': lambda t: t / 1000.0}, 'law', 'command is in m'),
     'dead motor': ({'take': only_first}, 'law', 'does not respond'),
-    'late': ({'late': 0.15}, 'latency', 'from command to the first change'),
+    'late': ({'late': 0.15}, 'latency', 'the first change came'),
     'tension in kgf': ({'publish': scaled(1, 1 / 9.81, 1)}, 'law', 'check the unit of T'),
     'rows 2 and 3 exchanged': ({'publish': rows_in([0, 2, 1])}, 'order', 'row 3 responds'),
 }
@@ -564,7 +564,7 @@ def test_clipping_at_the_maximum_is_checked_where_it_is_reachable(clip):
         ('drop:0.4', {'rate'}, 'rate of all muscles'),
         ('delay:0.2', {'latency'}, 'latency of biceps_long'),
         ('duplicate:0.5', {'rate'}, 'rate'),
-        ('freeze:biceps_long', {'rate', 'law'}, 'the same reading in every message'),
+        ('freeze:biceps_long', {'rate', 'law'}, 'its reading is the same in every message'),
         ('dead_sensor:biceps_long', {'rate', 'law'}, 'biceps_long'),
         ('bias:biceps_long:0.1', {'zero'}, 'zero of biceps_long'),
         ('bias:tension:biceps_long:40', {'law'}, 'biceps_long'),

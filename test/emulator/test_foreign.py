@@ -278,7 +278,7 @@ def test_a_model_with_other_joint_limits_is_reported(imported, tmp_path, given, 
     [
         ('name="swing"', 'name="swung"', "joint 'swing'"),
         ('name="front"', 'name="ahead"', "tendon 'front'"),
-        ('<mujoco', '<mujoko', 'MuJoCo does not load it'),
+        ('<mujoco', '<mujoko', 'MuJoCo cannot load it'),
         ('name="lift"', 'type="slide" name="lift"', "joint 'lift' is a slide, .* a hinge"),
         (
             '<spatial name="out"><site site="o3"/><site site="u3"/></spatial>',

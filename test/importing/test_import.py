@@ -389,7 +389,9 @@ def test_missing_limits_are_named_with_the_remedy(cardsflow, tmp_path):
     text = (tmp_path / 'model.urdf').read_text().replace('lower="-1" upper="1"', '', 1)
     put(tmp_path, 'model.urdf', text)
     notes = import_robot(cardsflow, tmp_path / 'out').notes
-    expected = 'chosen: joint shoulder: limits ±3.142, the source has none; give it a range in'
+    expected = (
+        'chosen: joint shoulder: limits ±3.142, because the source has none; give it a range in'
+    )
     assert f'{expected} joint_limits.yaml' in notes
 
 
@@ -472,9 +474,9 @@ def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_pa
 @pytest.mark.parametrize(
     ('options', 'expected'),
     [
-        ({'joints': ['knee']}, '--joints knee: no such joint; joints: swing, lift, elbow'),
-        ({'muscles': ['psoas']}, '--muscles psoas: no such muscle'),
-        ({'base': 'lower', 'end': 'upper'}, 'does not hang on --base lower'),
+        ({'joints': ['knee']}, "--joints: unknown joint 'knee'; joints: swing, lift, elbow"),
+        ({'muscles': ['psoas']}, "--muscles: unknown muscle 'psoas'"),
+        ({'base': 'lower', 'end': 'upper'}, "is not in the chain that begins at --base 'lower'"),
     ],
 )
 def test_a_wrong_option_names_what_is_legal(mjcf, options, expected):
@@ -489,10 +491,10 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
     assert capsys.readouterr().err.count('expected a new or empty directory') == 2
     other = put(tmp_path, 'other.xml', '<html/>')
     assert main([str(other), '--out', str(tmp_path / 'out')]) == 1
-    assert 'none of the formats read: mujoco, cardsflow' in capsys.readouterr().err
+    assert 'is unknown; legal: mujoco, cardsflow' in capsys.readouterr().err
     xacro = '<robot xmlns:x="http://www.ros.org/wiki/xacro"><x:arg name="side"/></robot>'
     assert main([str(put(tmp_path, 'arm.xacro', xacro)), '--out', str(tmp_path / 'out')]) == 1
-    assert 'expand it first, by xacro FILE' in capsys.readouterr().err
+    assert 'expand it first:  xacro FILE' in capsys.readouterr().err
     bomb = '<!DOCTYPE x [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><mujoco>&b;</mujoco>'
     assert main([str(put(tmp_path, 'bomb.xml', bomb)), '--out', str(tmp_path / 'out')]) == 1
     assert 'no DOCTYPE is allowed' in capsys.readouterr().err

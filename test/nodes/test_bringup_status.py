@@ -171,7 +171,7 @@ def test_several_silent_nodes_are_put_down_to_the_computer():
         now += 1.0
         situation.tick()
     assert situation.trouble().startswith(
-        '/left/sim, /left/learner: no report for 4 s: is the computer overloaded (load '
+        '/left/sim, /left/learner: no report for 4 s; perhaps the computer is overloaded (load '
     )
 
 

@@ -45,7 +45,9 @@ def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(gra
     graph.listen(Float64MultiArray, 'muscle_length_command')
     graph.wait(lambda: not graph.set_parameter('controller', 'method', 'float')[0], 'a refusal')
     done, reason = graph.set_parameter('controller', 'method', 'tension')
-    assert not done and 'follows muscle_length_command only; legal: geometric, first' in reason
+    assert (
+        not done and 'subscribes to muscle_length_command only; legal: geometric, first' in reason
+    )
     # Float if set before the subscription was discovered.
     assert core.settings.method in ('proposed', 'float')
     graph.listen(Float64MultiArray, 'muscle_tension_command')

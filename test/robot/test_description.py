@@ -240,7 +240,7 @@ def test_a_urdf_that_is_still_to_be_expanded_is_refused(tmp_path, old, new):
     if 'xmlns' in new:
         text = text.replace('</robot>', '<x:macro name="tool" params="parent"/></robot>')
     file.write_text(text)
-    refused(tmp_path, str(file), 'expand it first, by xacro FILE')
+    refused(tmp_path, str(file), 'expand it first:  xacro FILE')
 
 
 # -- malicious or strange URDFs -------------------------------------------------------------------
