@@ -45,8 +45,8 @@ KINDS = {
     'spike': Kind('sensors have spikes of this size', *SIZES['length'], of_quantity=True),
     'bias': Kind('sensors have this offset', *SIZES['length'], of_quantity=True),
     'stuck_motor': Kind('motors are jammed'),
-    'winch_speed': Kind('motors have this lower speed limit', 0.009, SPEED_LIMIT, 'm/s'),
-    'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this', 0.13, 1.0, 'm'),
+    'winch_speed': Kind('motors are limited to this speed', 0.009, SPEED_LIMIT, 'm/s'),
+    'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
     'slack': Kind('tendons are longer', 0.05, 1.0, 'm'),
     'overheat': Kind('modules have at least this temperature', 90.0, 1e3, '°C'),
 }

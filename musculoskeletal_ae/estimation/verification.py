@@ -92,7 +92,7 @@ _TEXTS = {
     Outcome.TENSION_SENSOR_FROZEN: 'its tension sensor is frozen',
     Outcome.NOT_WOUND_IN: 'not verified, because it was not wound in',
     Outcome.TENSION_UNKNOWN: 'not verified, because its tension is unknown (tension_source: none)',
-    Outcome.VALUES_MISSING: 'a sensor does not report a number',
+    Outcome.VALUES_MISSING: 'a sensor reports NaN instead of a number',
 }
 
 

@@ -124,7 +124,7 @@ def simulation_errors(_: Study, rows: Rows) -> Plot:
     figure.suptitle(f'individual {seed}', x=0.01, ha='left')
     return figure, (
         'Distance of the simulator from the arm under the same commands (0.25 s running mean). '
-        'Dotted: the mean after learning that the paper prints.'
+        "Dotted: the paper's mean after learning."
     )
 
 

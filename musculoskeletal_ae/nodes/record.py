@@ -180,7 +180,7 @@ def parse(arguments: list[str]) -> Namespace:
     directory_help = 'new directory (default: DATE-TIME_bag)'
     add('directory', nargs='?', type=Path, metavar='DIR', help=directory_help)
     add('-o', '--out', type=Path, metavar='DIR', help='same as DIR')
-    add('--topics', type=names, metavar='LIST', help='names separated by commas (default: all)')
+    add('--topics', type=names, metavar='LIST', help='topics, separated by commas (default: all)')
     parser.add_motors()
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
     add('--compression', choices=COMPRESSIONS, default='zstd', help='compression of the messages')

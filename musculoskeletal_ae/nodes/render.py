@@ -62,7 +62,13 @@ def _parse(arguments: list[str]) -> Namespace:
     add = parser.add_argument
     topic_help = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} if it has no publisher)'
     add('--topic', help=topic_help)
-    add('--timeout', type=positive, default=10.0, metavar='S', help='how long to wait [s]')
+    add(
+        '--timeout',
+        type=positive,
+        default=10.0,
+        metavar='S',
+        help='longest wait for the markers [s]',
+    )
     return parser.parse_args(arguments)
 
 

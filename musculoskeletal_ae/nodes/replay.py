@@ -242,7 +242,7 @@ def parse(arguments: list[str]) -> Namespace:
     add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
     topics = (
         f'{DEFAULT}: topics of hardware, vision, user and controller; {ALL}: also those that '
-        'nodes compute; or names separated by commas'
+        'nodes compute; or names of topics, separated by commas'
     )
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
     parser.add_motors()

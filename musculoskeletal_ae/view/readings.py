@@ -48,7 +48,7 @@ def curves(unit: str) -> tuple[Curve, ...]:
         Curve(f'error of the estimate [{unit}]', (GREEN,), (0,)),
         Curve('A: mismatch between T and l', (BLUE,), (1,)),
         # There is no dashed line until the detector is calibrated.
-        Curve('d: A relative to a healthy arm (dashed: anomaly)', (BLUE, DASHED), (2, 3)),
+        Curve('d: A relative to its healthy spread (dashed: limit)', (BLUE, DASHED), (2, 3)),
     )
 
 

@@ -57,7 +57,7 @@ def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
     graph.wait(lambda: arm.controller.core.robot.isolated == (2,), 'the controller')
     verified = arm.estimator.core.suspects.last_verification
-    assert verified == f'{name}: a sensor does not report a number'
+    assert verified == f'{name}: a sensor reports NaN instead of a number'
     graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
     arm.target(THERE)
     arm.goes_to(THERE)

@@ -34,4 +34,4 @@ class MissingValues(Detector):
         self._muscle, self._last = muscle, now
         if muscle is None or now - self._since < SILENT:
             return None
-        return Finding(muscle, Kind.VALUES_MISSING, 'a sensor does not report a number')
+        return Finding(muscle, Kind.VALUES_MISSING, 'a sensor reports NaN instead of a number')
