@@ -63,7 +63,7 @@ def test_a_clone_may_be_a_working_tree_or_a_git_directory(tmp_path):
         np.testing.assert_allclose(rest.theta, [[0.1, -0.2]])
         np.testing.assert_allclose(rest.length, [[-0.0093, 0.0093, 0.0]])
         np.testing.assert_allclose(rest.effort, [[7.0, 8.0, 9.0]])
-        with pytest.raises(MusculoskeletalError, match=r'it lacks .*other\.csv; clone'):
+        with pytest.raises(MusculoskeletalError, match=r'clone .* lacks .*other\.csv; clone'):
             Files(path).text('other.csv')
     with pytest.raises(MusculoskeletalError, match='expected a clone'):
         Files(tmp_path / 'nothing')

@@ -209,7 +209,7 @@ def test_the_motors_of_ros2_control_are_judged_as_muscles():
 @pytest.mark.parametrize(
     ('wrong', 'check', 'reported'),
     [
-        ({'motor_direction': (1.0,)}, 'sign', 'by the parameters spool_radius, motor_direction'),
+        ({'motor_direction': (1.0,)}, 'sign', 'set the parameters spool_radius, motor_direction'),
         ({'spool_radius': (0.036,)}, 'unit', 'times the change that the route predicts'),
         ({'motor_zero': (8.0,)}, 'zero', 'from the length that the route predicts in this posture'),
         ({'tension_per_effort': (0.224,)}, 'unit', 'tensions look like'),
@@ -366,7 +366,7 @@ def test_additional_joints_and_joints_in_several_messages_are_no_fault():
             listening.muscles(array(rows), driver.now)
     verdict = listening.verdict(driver.now)
     assert not verdict.faults, str(verdict)
-    assert 'missing joint' in str(verdict) and 'not checked without' not in str(verdict)
+    assert 'missing joint' in str(verdict) and 'were not checked, because' not in str(verdict)
 
 
 def test_unknown_joint_names_are_found():
@@ -381,7 +381,7 @@ def test_missing_joint_sensors_are_no_fault():
     driver.names = 'other', ROBOT.joints[1]
     verdict = driver.listen()
     assert not verdict.faults
-    assert f'without θ of {ROBOT.joints[0]}:' in str(verdict)
+    assert f'the angles of {ROBOT.joints[0]} are unknown' in str(verdict)
 
 
 def test_modules_without_thermometers_are_no_fault():
@@ -518,7 +518,7 @@ def test_a_sound_driver_is_found_sound_above_the_tension_limit():
 @pytest.mark.parametrize(
     ('robot', 'highest', 'reported'),
     [
-        (ROBOT, 35.0, 'needs at least 50 N, not 35 N'),
+        (ROBOT, 35.0, 'needs at least 50 N, but it may command 35 N at most'),
         (with_tension(35.0, 45.0), None, 'tension.max is 45 N; this muscle cannot be checked'),
         (with_tension(35.0, 45.0), 60.0, 'tension.max is 45 N; this muscle cannot be checked'),
     ],

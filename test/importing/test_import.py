@@ -241,7 +241,7 @@ COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="cu
         (
             '<worldbody>',
             '<option gravity="0 0 -1.6"/><worldbody>',
-            'gravity: 9.81 m/s², the source',
+            'gravity: 9.81 m/s², although the source',
         ),
         ('<site name="o1"', '<site user="nan" name="o1"', 'MuJoCo warns: XML contains a'),
         ('force="150"', 'force="0"', 'tension of 1 muscles: the default'),
@@ -306,7 +306,7 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
 def test_a_model_without_routes_is_refused_with_the_dropped_muscles(tmp_path):
     text = re.sub('<spatial .*?</spatial>', '', bodies.MJCF, flags=re.DOTALL)
     file = put(tmp_path, 'own.xml', re.sub('<muscle [^>]*>', '', text))
-    with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: it is fixed'):
+    with pytest.raises(SourceError, match=r'no muscle with a route; .*tendon none: it is a fixed'):
         read_source(file)
 
 
@@ -431,7 +431,7 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1, ())
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
     put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
-    with pytest.raises(SourceError, match="there is no joint 'moon'"):
+    with pytest.raises(SourceError, match="a joint mimics 'moon', but there is no such joint"):
         read_source(file)
 
 
