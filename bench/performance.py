@@ -64,35 +64,45 @@ On two idle cores, for `{arm}` unless another robot is named.
 
 ## One call of the core
 
-CPU time of `bench timings` for `{arm}`. Torch eager: the same algorithm with the network in torch,
-or entirely in torch where the row says so. Bound: the network's multiply-adds at the rate of matrix
-products of that size on this machine. An estimate in torch took {torch_before:.0f} µs in the
-earlier measurement, and took {slower:.1f} times as long on this machine. Therefore compare ratios
-to torch and to "messages alone", not times of different days.
+CPU time, measured by `bench timings` for `{arm}`:
+
+- *torch eager*: the same algorithm with the network in torch, or entirely in torch where the row
+  says so
+- *bound*: the time of the network's multiply-adds alone, at the speed of matrix products of that
+  size on this machine
+
+"Before" was measured on another machine. There, an estimate in torch took {torch_before:.0f} µs;
+on this machine it takes {slower:.1f} times as long. Therefore compare ratios to torch and to
+"messages alone", not times of different days.
 
 {core}
 
 ## At the wire
 
-Measured by `bench wire`. Latency: from the publishing of `muscle_states` to that of the next
-command. Late: after more than two periods. Missed: messages that did not arrive. CPU: all nodes,
-including the training process of the learner. "Combined": estimator and controller in one process
-(`bringup.sh --combined`). "Plain node": one simple rclpy node with eager torch, without safety and
-control. "Messages alone": five nodes that exchange the same messages without any computation.
+Measured by `bench wire`:
+
+- *latency*: time from the publishing of `muscle_states` to that of the next command
+- *late*: commands that came after more than two periods
+- *missed*: messages that did not arrive
+- *CPU*: of all nodes, including the training process of the learner
+- *combined*: estimator and controller in one process (`bringup.sh --combined`)
+- *plain node*: one simple rclpy node with eager torch, without safety and control
+- *messages alone*: five nodes that exchange the same messages without any computation
 
 {wire}
 
 ## Starting, and memory
 
-CPU time until the first command or response, with compiled code. Resident memory; {shared:.0f} MB
-of the estimator's are shared libraries, which all processes share. Messages alone: a node with
-numpy and pinocchio loaded that computes nothing: the minimum for a Python node that uses them.
+The table shows the CPU time until the first command or response, with compiled code, and the
+resident memory. {shared:.0f} MB of the estimator's memory are shared libraries, which all processes
+share. "Messages alone" is a node that has loaded numpy and pinocchio and computes nothing: the
+minimum for a Python node that uses them.
 
 {start}
 
 ## Learning
 
-On one core; an update uses a full store.
+Measured on one core. The update uses a full store of samples.
 
 | | before | now |
 |---|---|---|
@@ -100,7 +110,7 @@ On one core; an update uses a full store.
 | one update [CPU s] | 0.5–1 | {update:.2f} |
 | `{large}`, one update [CPU s] | | {large_update:.2f} |
 {flames}"""
-FLAMES = '\n## Where a node’s time goes\n\nBy py-spy at 200 Hz: {}.\n'
+FLAMES = '\n## Where a node’s time goes\n\nFlame graphs, recorded by py-spy at 200 Hz: {}.\n'
 
 
 def rows(head: str, lines: Iterable[Iterable[object]]) -> str:
