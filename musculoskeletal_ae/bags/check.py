@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
@@ -148,8 +149,9 @@ def _fit(
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'cannot check the fit to {name}: the bag has no joint_states or muscle_states'
         return [problem], left_out
+    pairs = streams.pairs()
     misplaced = [
         f'muscles are not in the order of {name}: {muscle} behaves like {like}'
-        for muscle, like in misplaced_muscles(streams.pairs(), robot)
+        for muscle, like in misplaced_muscles(pairs, robot)
     ]
-    return misplaced, left_out
+    return misplaced or wrong_joint_sensors(robot, pairs), left_out

@@ -35,6 +35,8 @@ MOST_SAMPLES = 600  # messages that are used, evenly distributed
 LEAST_SAMPLES = 20
 STUCK_TIME = 5.0  # shortest time for which a stuck sensor repeats its reading [s]
 STUCK_MOTION = 0.2  # motion of the joint according to the lengths meanwhile [rad]
+#: distance of the joint from a stuck reading, according to lengths of an arm that rests [rad]
+STUCK_OFFSET = 0.5
 STUCK_EXPLAINED = 0.5  # fraction of the misfit of l that this motion must explain
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 
@@ -110,7 +112,10 @@ def stuck_sensors(
     tension: Array,
     used: Bools | None = None,
 ) -> list[JointFault]:
-    """Return the joint sensors that repeat one reading while the lengths show a motion.
+    """Return the joint sensors that repeat one reading where the lengths show another angle.
+
+    Either the lengths show a motion meanwhile, or they differ from the model by more than in the
+    rest of the recording, as if the joint were elsewhere.
 
     Args:
         robot: The geometric model.
@@ -130,11 +135,17 @@ def stuck_sensors(
             if len(rows) < LEAST_SAMPLES:
                 continue
             constant = np.flatnonzero(np.ptp(theta[rows], axis=0) == 0.0)
-            error = length[rows] - robot.muscle_lengths(theta[rows], tension[rows])
             jacobian = robot.routes.muscle_jacobian(theta[rows])[:, used][:, :, constant]
-            hidden = _hidden_motion((error - error.mean(axis=0))[:, used], jacobian)
-            motion = hidden[:, constant == j] / robot.kinematics.radian[j]
-            if np.ptp(np.percentile(motion, [5, 95])) > STUCK_MOTION:
+            error = (length[rows] - robot.muscle_lengths(theta[rows], tension[rows]))[:, used]
+            radian = robot.kinematics.radian[j]
+            motion = _hidden_motion(error - error.mean(axis=0), jacobian)[:, constant == j]
+            away = np.zeros(1)
+            if len(outside := _rows_outside(theta, begin, end)) >= LEAST_SAMPLES:
+                usual = length[outside] - robot.muscle_lengths(theta[outside], tension[outside])
+                error -= np.median(usual[:, used], axis=0)
+                away = _hidden_motion(error, jacobian)[:, constant == j]
+            is_moving = np.ptp(np.percentile(motion, [5, 95])) > STUCK_MOTION * radian
+            if is_moving or abs(np.median(away)) > STUCK_OFFSET * radian:
                 faults.append(JointFault(STUCK, (j,), float(time[begin]), float(time[end])))
     return faults
 
@@ -276,6 +287,13 @@ def _repeats(time: Array, values: Array) -> Iterator[tuple[int, int]]:
     for begin, end in zip(begins.tolist(), ends.tolist()):
         if end > begin and time[end] - time[begin] >= STUCK_TIME:
             yield begin, end
+
+
+def _rows_outside(theta: Array, begin: int, end: int) -> Ints:
+    """Return evenly distributed rows of θ (N, D) before `begin` and after `end`."""
+    rows = np.flatnonzero(np.isfinite(theta).all(axis=1))
+    rows = rows[(rows < begin) | (rows > end)]
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).astype(int)]
 
 
 def _hidden_motion(error: Array, jacobian: Array) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.bags.topics import NO_MOTORS
@@ -74,6 +75,25 @@ def train(args: Namespace) -> None:
         _learn_recordings(robot, args, steps)
         return
     start = time.perf_counter()
+    trained = _train_on_model(robot, args, steps)
+    checkpoint.save(trained.mae, args.out)  # first, so that no later error loses the training
+    print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
+    # This random stream differs from that of the training, so all states are held out.
+    rng = np.random.default_rng([args.seed, 2])
+    limit, most = robot.tension.limit, robot.tension.max
+    planned = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, limit))
+    print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
+    if (most > limit).any():
+        overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
+        print(table(overload, f'overload: T in [{shown(limit)}, {shown(most)}] N'))
+    print(joint_table(robot, planned))
+    print(f'checkpoint: {args.out}')
+    save_plot(args.plot, lambda: plot(robot, trained, planned))
+
+
+def _train_on_model(robot: Robot, args: Namespace, steps: int) -> Trained:
+    """Train a network on the geometric model, and show the progress."""
+    start = time.perf_counter()
     with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
         reported, begun = start, 0.0
         if bar.disable:
@@ -93,20 +113,7 @@ def train(args: Namespace) -> None:
                 print(f'training: {share:.0f} %, loss {loss:.4f}, about {left:.0f} s left')
                 sys.stdout.flush()
 
-        trained = initial_mae(robot, args.preset, args.seed, progress, steps)
-    checkpoint.save(trained.mae, args.out)  # first, so that no later error loses the training
-    print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
-    # This random stream differs from that of the training, so all states are held out.
-    rng = np.random.default_rng([args.seed, 2])
-    limit, most = robot.tension.limit, robot.tension.max
-    planned = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, limit))
-    print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
-    if (most > limit).any():
-        overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
-        print(table(overload, f'overload: T in [{shown(limit)}, {shown(most)}] N'))
-    print(joint_table(robot, planned))
-    print(f'checkpoint: {args.out}')
-    save_plot(args.plot, lambda: plot(robot, trained, planned))
+        return initial_mae(robot, args.preset, args.seed, progress, steps)
 
 
 def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
@@ -120,15 +127,23 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
     if args.checkpoint:
         mae = checkpoint.load(args.checkpoint, robot)
     else:
-        print(f'training the initial network of {robot.description.directory.name}')
-        mae = initial_mae(robot, args.preset, args.seed, steps=steps).mae
+        name = robot.description.directory.name
+        print(f'training the initial network of {name}; --checkpoint FILE skips this')
+        mae = _train_on_model(robot, args, steps).mae
+    warnings = [
+        f'{path}: {text}'
+        for path, pairs in recordings.items()
+        for text in wrong_joint_sensors(robot, pairs)
+    ]
+    _warn(warnings)  # before the training as well, because the user may want to end it
     learner = Learner(robot, mae, args.preset, args.seed)
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
     for path, pairs in recordings.items():
         if path not in args.hold_out:
             total = round(pairs.time[-1] - pairs.time[0], 1)
             with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
-                learn(learner, pairs, bar.update)
+                if stop := learn(learner, pairs, bar.update):
+                    warnings.append(f'{path}: {stop}')
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
     for path, pairs in recordings.items():
@@ -139,8 +154,15 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
         if path not in args.hold_out:
             continue
         if warning := anomaly_in(robot, pairs, learner.mae, args.preset):
-            print(f'warning: {path} (held out): {warning}', file=sys.stderr)
+            warnings.append(f'{path} (held out): {warning}')
     print(f'checkpoint: {args.out}')
+    sys.stdout.flush()
+    _warn(warnings)
+
+
+def _warn(warnings: list[str]) -> None:
+    for warning in warnings:
+        print(f'warning: {warning}', file=sys.stderr)
 
 
 def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
@@ -206,15 +228,18 @@ def read(
 
 def learn(
     learner: Learner, recording: Pairs, progress: Callable[[float], None] | None = None
-) -> None:
+) -> str:
     """Pass a recording to a learner, message by message, as on a running arm.
 
-    As in the estimator, the health monitor decides when learning has to pause. `progress` is called
+    As in the estimator, the health monitor decides when learning has to stop. `progress` is called
     with the recorded seconds since its last call.
+
+    Returns:
+        A warning if learning stopped before the end of the recording, or ''.
     """
     stream = MuscleStream(learner.robot, learner.body)
     health = HealthMonitor(learner.robot, learner.trainer.preset.name)
-    newest = None
+    newest, stop = None, ''
     learner.reset()
     learner.anomaly(False)
     steps = np.diff(recording.time, prepend=recording.time[:1])
@@ -232,12 +257,18 @@ def learn(
             health.use(mae)
         states = np.array([length, tension, np.full(len(length), np.nan)])
         learner.joints(at, theta)
-        if _finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD)) is not None:
+        finding = _finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD))
+        if finding is not None:
             learner.anomaly(True)
+            stop = stop or (
+                f'learning stopped {at:.1f} s into it: an anomaly begins there '
+                f'({learner.robot.muscles[finding.muscle]}: {finding.kind.value})'
+            )
         learner.muscles(states, at)
         learner.poll(at)
         if progress is not None:
             progress(dt)
+    return stop
 
 
 def _finding(

@@ -2,10 +2,12 @@
 """Learning from the shipped recordings, and `train --from-bag`."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -100,6 +102,47 @@ def test_wrong_bags_and_options_end_with_one_clear_error(
     assert not out.exists()
 
 
+def test_progress_and_wrong_joint_sensors_are_reported(
+    arm26, initial, monkeypatch, tmp_path, capsys
+):
+    time = 0.02 * np.arange(1000)
+    waves = np.sin(np.outer(time, [1.7, 2.3]))  # without rests, so nothing is learned
+    theta = 0.5 * (arm26.lower + arm26.upper) + 0.3 * (arm26.upper - arm26.lower) * waves
+    tension = np.full((1000, arm26.muscle_count), 60.0)
+    length = arm26.muscle_lengths(theta, tension)
+    unknown = np.full(tension.shape, -1)
+    recording = Pairs(time, theta * [-1.0, 1.0], length, tension, unknown)
+
+    def trained(_robot, _preset, _seed, progress, steps):
+        for step in range(steps):
+            progress(step, 0.5)
+        return SimpleNamespace(mae=initial)
+
+    monkeypatch.setattr(initial_training, 'REPORT_INTERVAL', 0.0)
+    monkeypatch.setattr(initial_training, 'initial_mae', trained)
+    monkeypatch.setattr(initial_training, 'read', lambda *_: recording)
+    out = str(tmp_path / 'out.safetensors')
+    assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 0
+    printed = capsys.readouterr()
+    assert 'training: 50 %, loss 0.5' in printed.out
+    warning = printed.err.splitlines()[-1]
+    assert warning.startswith('warning: BAG: ')
+    assert f'sign of these joint sensors is reversed: {arm26.joints[0]}. Publish θ' in warning
+
+
+@pytest.mark.parametrize('name', ['exploration', 'faults', 'foreign', 'isolation', 'teaching'])
+def test_the_joint_sensors_of_the_shipped_recordings_are_correct(robot, name):
+    assert not wrong_joint_sensors(robot, read(BAGS / name, robot))
+
+
+def test_a_joint_sensor_that_fails_during_a_recording_is_named_with_the_times(robot):
+    recording = read(BAGS / 'exploration', robot)
+    theta, fails = recording.theta.copy(), (recording.time > 100.0) & (recording.time < 150.0)
+    theta[fails, 3] = 0.0
+    (warning,) = wrong_joint_sensors(robot, recording._replace(theta=theta))
+    assert f'joint sensor {robot.joints[3]} repeats one reading from 100.' in warning
+
+
 def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it(
     arm26, initial, monkeypatch
 ):
@@ -119,6 +162,8 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
     assert anomaly_in(arm26, recording, initial, 'default') == ''
     monkeypatch.setattr(initial_training, 'HealthMonitor', Monitor)
+    learner = Learner(arm26, initial)
+    assert 'learning stopped 3.0 s into it: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')
     assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s into it' in text
     assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text

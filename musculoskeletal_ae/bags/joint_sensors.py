@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warnings about the joint sensors of a recording, for `train --from-bag` and `replay --check`."""
+
+from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.joint_sensors import (
+    DEGREES,
+    ORDER,
+    SIGN,
+    STUCK,
+    judge,
+    stuck_sensors,
+)
+
+#: duration of the parts of a recording in which drifting lengths count as constant [s]
+SEGMENT = 30.0
+#: by kind of fault, what was observed and what to do
+TEXTS = {
+    SIGN: (
+        'the lengths fit only if the sign of these joint sensors is reversed: {names}. '
+        'Publish θ with the sign that the axis in robot.urdf defines, and record again'
+    ),
+    ORDER: (
+        'the lengths fit only if these joint sensors are exchanged: {names}. '
+        'Publish each position under the name of its joint, and record again'
+    ),
+    DEGREES: (
+        'the readings of these joint sensors look like degrees: {names}. '
+        'Publish joint_states in rad, and record again'
+    ),
+    STUCK: (
+        'joint sensor {names} repeats one reading from {begin:.1f} s to {end:.1f} s, where the '
+        'lengths show another angle. Check the sensor, and record again, or leave the joint out '
+        'of joint_states'
+    ),
+}
+
+
+def wrong_joint_sensors(robot: Robot, recording: Pairs) -> list[str]:
+    """Return a warning for each fault of the joint sensors of a moving arm.
+
+    Muscles that are isolated at any time are not used.
+    """
+    if not len(recording.time):
+        return []
+    time, theta, length, tension, isolated = recording
+    used = ~(isolated == 1).any(axis=0)
+    segments = ((time - time[0]) // SEGMENT).astype(int)
+    faults = judge(robot, theta, length, tension, used, segments).faults
+    faults += stuck_sensors(robot, time, theta, length, tension, used)
+    warnings = []
+    for fault in faults:
+        names = ', '.join(robot.joints[j] for j in fault.joints)
+        warnings.append(TEXTS[fault.kind].format(names=names, begin=fault.begin, end=fault.end))
+    return warnings
