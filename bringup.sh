@@ -294,6 +294,9 @@ stop() {
     done
   done
   wait
+  # What the recorder says at its end: the number of messages, and those that were lost.
+  [ -z "$record" ] || sed -n -e 's/^[0-9]* messages recorded/-- record: &/p' \
+    -e 's/^warning: /-- record: &/p' "$logs/record.log" 2>/dev/null
 }
 trap stop EXIT
 trap 'exit 130' INT

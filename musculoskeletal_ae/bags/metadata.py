@@ -77,6 +77,7 @@ def write_metadata(
     topics: Iterable[tuple[BagTopic, str]],
     times: tuple[int, int] | None,
     finished: bool,
+    custom: Mapping[str, str] | None = None,
 ) -> None:
     """Write metadata.yaml atomically.
 
@@ -87,6 +88,7 @@ def write_metadata(
         times: The earliest and the latest log time [ns]; None without messages.
         finished: Whether the recording has ended; the file is then synchronised to disk, to
             survive a power failure.
+        custom: Further entries, under `custom_data`.
     """
     start, end = times or (_NO_TIME, _NO_TIME)
     duration = {'nanoseconds': end - start}
@@ -110,7 +112,7 @@ def write_metadata(
         'compression_mode': '',
         'relative_file_paths': [name],
         'files': [file],
-        'custom_data': None,
+        'custom_data': dict(custom) if custom else None,
         'ros_distro': 'jazzy',
     }
     new = directory / f'{FILE}.new'

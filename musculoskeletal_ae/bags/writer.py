@@ -41,6 +41,8 @@ class BagWriter:
         except UnicodeEncodeError as error:  # Python represents other bytes by surrogates
             problem = 'the name is not UTF-8'
             raise BagError(self.directory, problem, 'choose another name') from error
+        #: further entries of metadata.yaml, which are written when the bag is completed
+        self.custom: dict[str, str] = {}
         self._hashes: dict[str, str] = {}  # of types, by topic
         self._channels: dict[str, int] = {}  # by topic
         self._schemas: dict[str, int] = {}  # by type
@@ -144,7 +146,9 @@ class BagWriter:
     def _write_metadata(self, finished: bool) -> None:
         topics = [(topic, self._hashes[name]) for name, topic in self.topics.items()]
         with self._writing():
-            metadata.write_metadata(self.directory, self._name, topics, self._times, finished)
+            metadata.write_metadata(
+                self.directory, self._name, topics, self._times, finished, self.custom
+            )
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

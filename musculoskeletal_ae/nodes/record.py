@@ -18,6 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos
 
+from musculoskeletal_ae.bags.losses import Losses
 from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import Topic, topics_with
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
@@ -25,6 +26,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
+from musculoskeletal_ae.report import load_text
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 #: time between writes to disk [s]; a killed recorder loses the messages of at most this time
@@ -44,6 +46,7 @@ class Record(Node):
         super().__init__('record')
         self.writer = writer
         self.received = 0
+        self.losses = Losses()
         #: latched messages that arrived before the first /clock, by topic
         self._early: dict[str, tuple[Topic, bytes, dict[str, int]]] = {}
         self.timeless = 0  # number of messages lost because they arrived before the first /clock
@@ -77,6 +80,7 @@ class Record(Node):
     def _look_after(self) -> None:
         """Write to disk; resubscribe with the QoS of publishers that offer less than requested."""
         self.writer.flush()
+        self.count_losses()
         incompatible, self._incompatible = self._incompatible, {}
         for name, policy in incompatible.items():
             before = self._subscriptions_of[name]
@@ -89,6 +93,14 @@ class Record(Node):
                 continue
             self.destroy_subscription(before)
             self._subscribe(name, qos)
+
+    def count_losses(self) -> None:
+        """Count the messages lost since the last call, and warn of the first ones."""
+        had_lost = self.losses.lost.total()
+        self.losses.settle(self.count_publishers)
+        if self.losses.lost and not had_lost:
+            text = 'messages are being lost before they are recorded; end other programs'
+            print(f'warning: {text}', file=sys.stderr, flush=True)
 
     @property
     def is_connected(self) -> bool:
@@ -113,6 +125,7 @@ class Record(Node):
     def _receive(self, name: str, topic: Topic, data: bytes, info: dict[str, int]) -> None:
         now = self.get_clock().now().nanoseconds if self._sim_time else info['received_timestamp']
         self.received += 1
+        self.losses.note(name, info['publication_sequence_number'])
         if now == 0:  # no /clock message has arrived yet
             self.timeless += not topic.latched
             if topic.latched:
@@ -158,11 +171,26 @@ def _record(options: Namespace, arguments: list[str]) -> int:
                 before = node.received
                 spinner.spin_once(0.05)
         missing = node.missing()
+        node.count_losses()
+        lost = node.losses.lost
+        writer.custom = {f'lost messages of {topic}': str(count) for topic, count in lost.items()}
         node.destroy_node()
     if node.timeless:
         problem = 'messages came before the first /clock and were not recorded'
         print(f'warning: {node.timeless} {problem}', file=sys.stderr)
-    print(f'{writer.message_count} messages recorded to {out}', file=sys.stderr)
+    count = writer.message_count
+    print(f'{count} messages recorded to {out}, {lost.total()} lost', file=sys.stderr)
+    if lost:
+        each = ', '.join(
+            f'{topic} {number} of {number + writer.topics[topic].message_count}'
+            for topic, number in lost.most_common()
+            if topic in writer.topics
+        )
+        busy = f'this computer or the network was busy (load {load_text()})'
+        print(
+            f'warning: messages were lost before they were recorded: {each}; {busy}',
+            file=sys.stderr,
+        )
     if options.are_chosen and missing:
         print(f'warning: nothing was recorded of {"; ".join(missing)}', file=sys.stderr)
         return 1

@@ -11,6 +11,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -116,7 +117,7 @@ def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp
     graph.publisher(Float64MultiArray, 'muscle_states')  # waits for the recorder
     graph.spin(1.0)
     output, ns = recorder.end(signal.SIGINT), graph.namespace
-    assert '0 messages recorded' in output
+    assert re.search('^0 messages recorded to .*, 0 lost$', output, re.MULTILINE)
     silent = f'{ns}/anomaly, which has no publisher; {ns}/muscle_states, which sent nothing'
     assert f'nothing was recorded of {silent}' in output
     assert recorder.process.returncode == 1
@@ -158,6 +159,41 @@ def test_a_publisher_that_offers_less_than_usual_is_recorded(tool, graph, tmp_pa
     graph.wait(is_recorded, 'messages of both in the bag')
     recorder.end(signal.SIGINT)
     assert recorder.process.returncode == 0
+
+
+def test_messages_that_a_recorder_misses_are_counted(tool, graph, tmp_path):
+    recorder = record(tool, graph, tmp_path / 'bag', '--topics', 'muscle_states')
+    publisher = graph.publisher(Float64MultiArray, 'muscle_states', QoSProfile(depth=1))
+    topic, count = f'{graph.namespace}/muscle_states', 0
+    large = Float64MultiArray(data=array('d', bytes(8 * 6000)))  # no socket holds 200 of these
+
+    def publish():
+        nonlocal count
+        count += 1
+        publisher.publish(large)
+        graph.spin(0.01)
+
+    def recorded():
+        topics = Bag.open(tmp_path / 'bag').topics
+        return topics[topic].message_count if topic in topics else 0
+
+    graph.wait(lambda: publish() or recorded(), 'the first message')
+    recorder.process.send_signal(signal.SIGSTOP)
+    for _ in range(200):
+        publish()
+    recorder.process.send_signal(signal.SIGCONT)
+    before = recorded()
+    graph.wait(lambda: publish() or recorded() > before + 20, 'messages after the pause')
+    output = recorder.end(signal.SIGINT)
+    match = re.search(rf'warning: messages were lost .*: {topic} (\d+) of (\d+);', output)
+    assert match, output
+    lost, kept = int(match[1]), recorded()
+    assert int(match[2]) == lost + kept <= count
+    assert f', {lost} lost' in output
+    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
+    assert f"lost messages of {topic}: '{lost}'" in text
+    with AnyReader([tmp_path / 'bag']) as reader:  # a reader that others wrote
+        assert reader.message_count == kept
 
 
 def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path):

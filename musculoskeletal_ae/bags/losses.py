@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Counts the messages that a recorder has missed, by the sequence numbers of their publishers."""
+
+from collections import Counter
+from collections.abc import Callable
+
+#: sequence numbers of middleware that does not number messages
+UNNUMBERED = 0, (1 << 64) - 1
+
+
+class Losses:
+    """Counts the messages of each topic that were published, but not received.
+
+    A message does not name its publisher. Gaps in the numbers are therefore only counted while a
+    topic has a single publisher.
+    """
+
+    def __init__(self) -> None:
+        self.lost: Counter[str] = Counter()  # messages by topic, without topics that lost none
+        self._last: dict[str, int] = {}  # newest sequence number by topic
+        self._gaps: Counter[str] = Counter()  # missing numbers since the last `settle`
+
+    def note(self, topic: str, number: int) -> None:
+        """Record the sequence number of a received message."""
+        if number in UNNUMBERED:
+            return
+        # The numbers of a restarted publisher begin again.
+        gap = number - self._last.get(topic, number) - 1
+        if gap > 0:
+            self._gaps[topic] += gap
+        self._last[topic] = number
+
+    def settle(self, publishers: Callable[[str], int]) -> None:
+        """Count the gaps since the last call; `publishers` returns a topic's current number."""
+        for topic, gap in self._gaps.items():
+            if publishers(topic) <= 1:
+                self.lost[topic] += gap
+        self._gaps.clear()
