@@ -124,18 +124,18 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
         path: read(path, robot, args.from_namespace, motors)
         for path in (*args.from_bag, *args.hold_out)
     }
-    if args.checkpoint:
-        mae = checkpoint.load(args.checkpoint, robot)
-    else:
-        name = robot.description.directory.name
-        print(f'training the initial network of {name}; --checkpoint FILE skips this')
-        mae = _train_on_model(robot, args, steps).mae
     warnings = [
         f'{path}: {text}'
         for path, pairs in recordings.items()
         for text in wrong_joint_sensors(robot, pairs)
     ]
     _warn(warnings)  # before the training as well, because the user may want to end it
+    if args.checkpoint:
+        mae = checkpoint.load(args.checkpoint, robot)
+    else:
+        name = robot.description.directory.name
+        print(f'training the initial network of {name}; --checkpoint FILE skips this')
+        mae = _train_on_model(robot, args, steps).mae
     learner = Learner(robot, mae, args.preset, args.seed)
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
     for path, pairs in recordings.items():
