@@ -249,12 +249,12 @@ def evaluate(attack: 'Attack') -> list[Row]:
         Row(
             'no node reports OK for 2 s or longer while something is wrong',
             tried['status'],
-            take('status OK while wrong', []),
+            take('no OK while something is wrong', []),
         ),
         Row(
             'the remedy in /diagnostics recovers the arm',
             tried['attacks'],
-            take('the advice helps', []),
+            take('the remedy helps', []),
         ),
         Row('no sample is lost', tried['kills'], take('samples survive', [])),
         Row('memory does not grow', len(attack.processes), fat),

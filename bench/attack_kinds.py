@@ -67,7 +67,9 @@ class Scene:
         self.attack.tried['status'] += 1
         if silent:
             late = max(silent) - begin
-            self.attack.found('status OK while wrong', f'{self.what}: OK after {late:.1f} s')
+            self.attack.found(
+                'no OK while something is wrong', f'{self.what}: OK after {late:.1f} s'
+            )
 
     def bring(self, moment: str) -> bool:
         """Make a healthy arm hold a posture or explore; return whether it does."""
@@ -94,7 +96,7 @@ class Scene:
                 return
             self.follow_advice()
         attack.found(
-            'the advice helps', f'{self.what}: no recovery in {PATIENCE:g} s; status: {trouble}'
+            'the remedy helps', f'{self.what}: no recovery in {PATIENCE:g} s; status: {trouble}'
         )
         attack.end_strangers()
         for name in NODES:
@@ -115,7 +117,7 @@ class Scene:
             node = name.rpartition('/')[2]
             attack.processes[node].kill()
             attack.start(node)
-            attack.wait(lambda node=node: node in attack.levels, 'the advice helps', node)
+            attack.wait(lambda node=node: node in attack.levels, 'the remedy helps', node)
         for identifier in attack.situation.steps():
             self._take(STEPS[identifier])
 

@@ -93,7 +93,11 @@ def commands(page: Path) -> list[Command]:
     """Return the commands of a page in their order."""
     commands = []
     for mark, block in _blocks(page):
-        reason = 'only without a ros2 command' if mark == ROS2 else mark.removeprefix('skip ')
+        reason = (
+            'needed only if there is no ros2 command'
+            if mark == ROS2
+            else mark.removeprefix('skip ')
+        )
         for command in _joined(block.splitlines()):
             line = re.sub(r'\s+#.*', '', command)
             if line:

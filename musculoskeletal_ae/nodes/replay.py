@@ -254,7 +254,7 @@ def parse(arguments: list[str]) -> Namespace:
     add('--loop', action='store_true', help='start again at the end')
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
-    add('--duration', type=positive, metavar='S', help='play this much of the bag [s]')
+    add('--duration', type=positive, metavar='S', help='duration of the part to play [s]')
     teach = f'send the motion of {TAUGHT_TOPIC} as one smooth joint_trajectory, then exit'
     add('--as-trajectory', action='store_true', help=teach)
     paused = 'start paused: wait for replay/resume or replay/step'

@@ -318,7 +318,7 @@ def _read_couplings(
             source = 'couplings' if slave in listed else 'its <mimic> in robot.urdf'
             raise fail(
                 f'$.joints: joint {slave!r} follows {coupling.master!r} by {source}; '
-                'list only joints that follow none under joints'
+                'under joints, list only joints that follow no other joint'
             )
 
     def refused(slave: str, problem: str) -> RobotDescriptionError:
@@ -357,7 +357,7 @@ def _read_joint_elasticity(
             return joints.index(name)
         followed = ' (it follows another joint: state the spring there)' * (name in couplings)
         legal = ', '.join(joints)
-        raise fail(f'{place}: unknown joint {name!r}{followed}; legal: those under joints, {legal}')
+        raise fail(f'{place}: unknown joint {name!r}{followed}; legal: {legal}')
 
     for k, entry in enumerate(content.joint_elasticity):
         place = f'$.joint_elasticity[{k}]'

@@ -203,7 +203,7 @@ class MuscleFile(Strict, frozen=True):
                 )
         elif self.drive is not None or owners:
             raise ValueError(
-                f'drive needs tension_source: current, and it is {self.tension_source!r}; remove '
+                f'drive needs tension_source: current, but it is {self.tension_source!r}; remove '
                 'drive, or set tension_source: current'
             )
 
@@ -212,7 +212,7 @@ class MuscleFile(Strict, frozen=True):
         is_position = self.actuation == 'position'
         if self.tension_source != 'sensor' and not is_position:
             raise ValueError(
-                f'tension_source {self.tension_source!r} needs actuation: position, and actuation '
+                f'tension_source {self.tension_source!r} needs actuation: position, but actuation '
                 "is 'stiffness'; publish the tension that the modules regulate "
                 '(tension_source: sensor), or set actuation: position'
             )
@@ -226,7 +226,7 @@ class MuscleFile(Strict, frozen=True):
                 owners.insert(0, 'the robot')
             if owners:
                 raise ValueError(
-                    f'{key} of {owners[0]} needs {needed}, and actuation is {self.actuation!r}; '
+                    f'{key} of {owners[0]} needs {needed}, but actuation is {self.actuation!r}; '
                     f'remove {key}, or set {needed}'
                 )
 

@@ -180,7 +180,7 @@ def test_springs_are_not_felt_as_a_contact(springy):
 @pytest.mark.parametrize(
     ('entry', 'problem'),
     [
-        ({'joint': 'knee'}, "unknown joint 'knee'; legal: those under joints, bend, lift, swing"),
+        ({'joint': 'knee'}, "unknown joint 'knee'; legal: bend, lift, swing"),
         ({'joint': 'bend', 'stiffness': -1.0}, 'stiffness'),
         ({'joint': 'bend', 'stiffness': float('nan')}, 'stiffness'),
         ({'joint': 'bend', 'damping': -0.1}, 'damping'),
