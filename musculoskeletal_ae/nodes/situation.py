@@ -10,7 +10,7 @@ import contextlib
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -46,7 +46,7 @@ FINDING_STEPS = {
     Kind.JOINT_SENSORS_DISAGREE.value: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
     **{kind.value: (Step.CALIBRATE_LENGTHS,) for kind in REVOKING},
 }
-ANOMALY_STEPS = tuple(step.identifier for step in StopCause.ANOMALY.steps)
+REPAIR_STEPS = {step.identifier for step in REPAIR}
 EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value
 
 
@@ -183,8 +183,12 @@ class Situation:
         return ', '.join(trouble.text for trouble in self._troubles())
 
     def steps(self) -> list[str]:
-        """Return the identifiers of the steps that `trouble` advises (`control.remedy.Step`)."""
-        return [step for trouble in self._troubles() for step in trouble.steps]
+        """Return the identifiers of the steps that `trouble` advises, each once.
+
+        They are those of `control.remedy.Step`.
+        """
+        steps = (step for trouble in self._troubles() for step in trouble.steps)
+        return list(dict.fromkeys(steps))
 
     def _troubles(self) -> list[Trouble]:
         others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
@@ -236,25 +240,25 @@ class Situation:
         )
         is_stopped = mode in (STOPPED, VERIFYING)
         is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
+        stop_steps = remedy.parse(control.get(remedy.REMEDY_STEPS, '')) if is_stopped else ()
+        # The remedy of the stop is shown once if the anomaly is one of its causes.
+        is_in_stop = is_stopped_by_anomaly or set(stop_steps) >= REPAIR_STEPS
         evidence = f': {self.evidence}' if self.evidence else ''
         of_finding = FINDING_STEPS.get(self._finding, REPAIR) if self.detected else ()
         troubles = []
         if self.detected and is_verifying:
             troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified{evidence}'))
-        elif self.detected and is_stopped_by_anomaly:
+        elif self.detected and is_in_stop:
             troubles.append(Trouble(f'ANOMALY: {self.suspect}{evidence}'))
         elif self.detected:
             troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
         if is_stopped and not (is_verifying and is_stopped_by_anomaly):
-            text, steps = (
-                control.get('remedy', ''),
-                remedy.parse(control.get(remedy.REMEDY_STEPS, '')),
-            )
-            if steps == ANOMALY_STEPS and self._finding:
+            text, steps = control.get('remedy', ''), stop_steps
+            if self._finding and set(steps) >= REPAIR_STEPS:
                 # The estimator knows the kind of the finding, and whether it is over.
-                known = *of_finding, Step.RESET_CONTROLLER
+                known = _with_steps_of_finding(steps, of_finding)
                 text, steps = remedy.sentence(known), tuple(step.identifier for step in known)
-            if self._has_explored:
+            if self._has_explored and Step.EXPLORE_GENTLY.identifier not in steps:
                 text, steps = f'{text}; {Step.EXPLORE.text}', (*steps, Step.EXPLORE.identifier)
             stop = control.get('stop', cause)
             troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
@@ -334,6 +338,14 @@ def _is_needed(name: str) -> bool:
 def _is_own(name: str) -> bool:
     """Return whether a node only summarizes the reports of other nodes."""
     return name.rpartition('/')[2] == 'bringup_status'
+
+
+def _with_steps_of_finding(steps: Iterable[str], of_finding: Iterable[Step]) -> list[Step]:
+    """Return the steps of a remedy with those of `REPAIR` replaced by those of the finding."""
+    by_identifier, known = {step.identifier: step for step in Step}, list[Step]()
+    for identifier in steps:
+        known += of_finding if identifier in REPAIR_STEPS else [by_identifier[identifier]]
+    return list(dict.fromkeys(known))
 
 
 def _with_remedy(text: str, *steps: Step) -> Trouble:

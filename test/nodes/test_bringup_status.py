@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.control.remedy import identifiers
-from musculoskeletal_ae.control.stops import Condition, StopCause
+from musculoskeletal_ae.control.stops import Condition, StopCause, remedy_of
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.situation import Situation, figures
@@ -153,6 +153,24 @@ def test_the_remedy_of_an_anomaly_is_that_of_its_kind(kind, first):
     _, _, remedy = situation.trouble().partition('STOPPED: anomaly detected (to go on: ')
     assert remedy.startswith(first) and 'call controller/reset' in remedy
     assert (kind == 'slack_tendon') == ('repair' in situation.trouble())
+
+
+def test_the_remedy_of_several_causes_repairs_nothing_if_only_lengths_are_off():
+    causes = (
+        StopCause.IMPLAUSIBLE_MUSCLE_STATES, StopCause.ANOMALY, StopCause.LENGTH_OFFSETS_REVOKED
+    )  # fmt: skip
+    steps = remedy_of(causes)
+    situation = Situation('/left')
+    situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
+    lengths = {'finding': 'lengths_jumped', 'unknown_length_offsets': 'biceps'}
+    situation.diagnosed(diagnostics('/left/estimator', **lengths))
+    situation.diagnosed(
+        diagnostics('/left/controller', mode='stopped', remedy_steps=identifiers(steps))
+    )
+    assert situation.steps() == [
+        'check_sensor', 'calibrate_lengths', 'reset_controller', 'explore_gently'
+    ]  # fmt: skip
+    assert 'repair' not in situation.trouble()
 
 
 def test_a_calibration_that_runs_is_not_to_be_started():
