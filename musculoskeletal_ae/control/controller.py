@@ -19,7 +19,8 @@ wound in slightly to verify the fault; the arm resumes when the anomaly is over.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,13 +49,15 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
-from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 WINDOW = 3  # number of messages in the median filter against outliers
 RESTORE = 'call estimator/restore to use isolated muscles again'
 #: longest time in which the estimator isolates the suspect of an anomaly, or reacts to a length
 #: jump [s]
 REACTION_TIME = 1.0
+#: time in which a length calibration provides its first estimate [s]; at 10 Hz it takes 3.5 s
+FIRST_ESTIMATE = 5.0
 APPROACHES = 3  # number of further attempts to reach a target if an arm with isolated muscles falls
 
 
@@ -185,6 +188,7 @@ class Controller:
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
+        self.rejected_pull: Array | None = None  # `RejectionError.pull` since the last sample
         self.estimate: Array | None = None  # θ [rad], (D,)
         self.target_state = Target(np.zeros(robot.joint_count))
         self.supervisor = Supervisor()
@@ -195,6 +199,8 @@ class Controller:
         self.stopping = SafeStop(robot, self.settings, self.limiter)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
+        #: whether a length calibration has begun and there is no estimate yet
+        self._awaits_estimate = False
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
         if self.settings.method == 'float':
@@ -239,7 +245,8 @@ class Controller:
         Raises:
             RejectionError: If the message cannot be used.
         """
-        self._use_sample(self.stream.take(message, now), now)
+        with self._relieving(now):
+            self._use_sample(self.stream.take(message, now), now)
 
     def muscles(self, states: Array, now: float) -> None:
         """Process raw l [m], T [N] and temperature [°C], (3, M), as `take` does with a message.
@@ -247,10 +254,22 @@ class Controller:
         Raises:
             RejectionError: If the values are implausible for this arm.
         """
-        self._use_sample(self.stream.take_states(np.asarray(states), now), now)
+        with self._relieving(now):
+            self._use_sample(self.stream.take_states(np.asarray(states), now), now)
+
+    @contextmanager
+    def _relieving(self, now: float) -> Iterator[None]:
+        """Relieve muscles whose tension is too high, even if their message is rejected."""
+        try:
+            yield
+        except RejectionError as error:
+            if error.pull is not None:
+                self.rejected_pull = error.pull
+                self.watchdog.take_rejected(error.pull[1], self.stream.body.used, now)
+            raise
 
     def _use_sample(self, sample: MuscleSample, now: float) -> None:
-        self.sample = sample
+        self.sample, self.rejected_pull = sample, None
         if sample.jumped:
             self._jumped_at = now
         self.watchdog.take_sample(sample, now)
@@ -274,7 +293,7 @@ class Controller:
         self._estimate_problem.note('', now)
         if is_new:
             self.watchdog.take_estimate(now)
-        self.estimate = theta
+        self.estimate, self._awaits_estimate = theta, False
 
     def use_body(self, body: BodyState) -> None:
         """Apply a body state: isolated muscles and length offsets."""
@@ -301,6 +320,11 @@ class Controller:
         is_known = body.offsets.known
         if is_known != before.known or (body.offsets.offset != before.offset).any():
             self.activities.leave()
+        if not is_known and not body.offsets.is_suspect:
+            # A length calibration begins or continues. Until its first estimate, the arm waits.
+            age = self.watchdog.age
+            age.expect_later(StopCause.STALE_ESTIMATE, age.stepped_at, FIRST_ESTIMATE)
+            self._awaits_estimate = True
         self.limiter.offsets_known = is_known
         self.supervisor.on_offsets(is_known)
 
@@ -512,6 +536,9 @@ class Controller:
 
     def _desired(self, dt: float) -> Command | None:
         """Return the activity's command; any exception stops the arm."""
+        if self._awaits_estimate:
+            self.activities.leave()
+            return self.limiter.command
         control = self.activities.of(self.supervisor.activity, self.settings)
         known = self.stream.body.offsets.known
         if control is None or not (known or control is self.activities.calibrating):
@@ -604,7 +631,7 @@ class Controller:
             limit = np.minimum(limit, gentle_limit(self.robot))
         is_winding = self.is_following and self.supervisor.is_running
         lead = self.activities.follower.winches.lead if is_winding else 0.0
-        return self.limiter.limit(desired, self.sample, limit, dt, lead)
+        return self.limiter.limit(desired, self.sample, limit, dt, lead, self.rejected_pull)
 
     # -- requests -------------------------------------------------------------------------------
 

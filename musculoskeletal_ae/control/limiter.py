@@ -17,7 +17,8 @@ winding in, or as soon as the measured tension is above the limit.
 
 If the measured tension exceeds the limit nevertheless, for example because K_stiff or a sensor is
 wrong, the feedback r pays the muscle out further. A muscle whose measured tension is above
-`tension.limit` is paid out faster than the rate limit. No muscle is wound in faster.
+`tension.limit` is paid out faster than the rate limit. No muscle is wound in faster. This also
+holds for tensions in messages that are rejected because their lengths jumped.
 
 Position-controlled modules turn a command into tension by stretching the series elastic elements:
 
@@ -157,6 +158,7 @@ class CommandLimiter:
         tension_limit: Array,
         dt: float,
         lead: Array | float = 0.0,
+        rejected: Array | None = None,
     ) -> Command | None:
         """Limit a command and record the result as published.
 
@@ -166,6 +168,8 @@ class CommandLimiter:
             tension_limit: Tension limit of each muscle in addition to `tension.limit` [N], (M,).
             dt: Time since the last command [s].
             lead: λ max(0, −dl/dt) of each muscle [m], (M,).
+            rejected: l [m] and T [N] (2, M) of messages that were rejected after the sample, or
+                None; see `RejectionError.pull`.
 
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
@@ -189,6 +193,8 @@ class CommandLimiter:
             is_relaxed = sample.motor_tension * sample.usable <= limit
             shortest -= actuation.usable_lead(lead) * is_relaxed
             value = np.maximum(value, shortest)
+            if rejected is not None:
+                value = np.maximum(value, self._relieved(rejected, sample, limit))
         if not np.isfinite(value).all():
             return None
         self.command = Command(kind, value)
@@ -206,6 +212,27 @@ class CommandLimiter:
         bias = self._robot.description.tension.bias
         spread = np.nan_to_num(sample.tension_spread)
         return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
+
+    def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
+        """Return the shortest length commands [m] (M,) that the rejected messages allow.
+
+        A module compares l_target with its own reading of l. If this reading jumps, the module
+        winds in, and its tension rises beyond the limit. Therefore l_target follows the jump where
+        the tension is too high. Elsewhere, −∞ is returned.
+
+        Args:
+            rejected: l [m] and T [N], (2, M); −∞ where they are implausible.
+            sample: The last accepted muscle states.
+            limit: Tension limit [N], (M,).
+        """
+        length, tension = rejected
+        tension = np.where(sample.usable, tension, -np.inf)
+        too_tense = tension > self._robot.description.tension.limit
+        depth = self._robot.actuation.depth(
+            np.where(too_tense, tension, 0.0), np.zeros_like(tension), limit
+        )
+        relieved: Array = np.where(too_tense, length - depth, -np.inf)
+        return relieved
 
     def _tension_rate(self, time: float, tension: Array) -> Array:
         """Return dT/dt [N/s] (M,) between the last two messages."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import Condition, StopCause
@@ -65,7 +65,11 @@ class DataAge:
         """
         awake, before = self.awake(now), self._came_at[cause]
         self._came_at[cause] = awake
-        return awake - before if before > -math.inf else 0.0
+        return max(awake - before, 0.0) if before > -math.inf else 0.0
+
+    def expect_later(self, cause: StopCause, now: float, within: float) -> None:
+        """Do not count data as old before `within` [s] have passed, because it begins anew."""
+        self._came_at[cause] = self.awake(now) + within
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
         """Return the causes of data older than `max_age` [s]."""
@@ -109,8 +113,12 @@ class Overload:
         self._since: Array = np.full(robot.muscle_count, math.inf)
 
     def take(self, tension: Array, awake: float) -> None:
-        """Record which filtered tensions T [N], (M,), exceed the level at the time `awake` [s]."""
-        self._since = np.where(tension > self._level, np.minimum(self._since, awake), math.inf)
+        """Record which filtered tensions T [N], (M,), exceed the level at the time `awake` [s].
+
+        Where T is not finite, nothing changes.
+        """
+        since = np.where(tension > self._level, np.minimum(self._since, awake), math.inf)
+        self._since = np.where(np.isfinite(tension), since, self._since)
 
     @property
     def tense(self) -> list[str]:
@@ -193,6 +201,16 @@ class Watchdog:
         """Record that plausible muscle states were received; check them for overload and heat."""
         self.heat.take(self._robot, sample, self.age.received(MUSCLE_STATES, now))
         self.overload.take(sample.motor_tension * sample.usable, self.age.awake(now))
+
+    def take_rejected(self, tension: Array, used: Bools, now: float) -> None:
+        """Check the filtered tensions [N] (M,) of a rejected message for overload.
+
+        Args:
+            tension: T; −∞ where it is implausible.
+            used: Which muscles are not isolated, (M,).
+            now: Time of the steady clock [s].
+        """
+        self.overload.take(np.where(used, tension, 0.0), self.age.awake(now))
 
     def take_estimate(self, now: float) -> None:
         """Record that a plausible estimate was received."""

@@ -23,6 +23,10 @@ ENOUGH = 38.0  # required duration of gentle motion without measured joint angle
 STANDING = 1.0  # required duration of standing in a stated posture [s]
 FIRST_FIT = 0.5  # time until the first fit [s]
 FIT_INTERVAL = 2.0  # time between two later fits [s]
+#: Time for each of the short pieces of work of a fit [s], so that a fit takes equally long at any
+#: rate of the messages. A piece takes 1 to 2 ms.
+PIECE_TIME = 0.005
+MOST_PIECES = 4  # largest number of pieces of work for one message
 #: median residual of a length above which a fit is rejected [m]; correct offsets have 0.0003 m
 LARGEST_RESIDUAL = 0.02
 #: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
@@ -106,7 +110,9 @@ class LengthCalibration:
         self._collector.step(tension, length, dt, theta)
         self._since += dt
         if self._work is not None:
-            self._continue_fit(*self._work)
+            for _ in range(min(max(1, round(dt / PIECE_TIME)), MOST_PIECES)):
+                if self._work is not None:
+                    self._continue_fit(*self._work)
         elif self._since >= self._pause and len(self._collector):
             self._since = 0.0
             self._begin_fit(self._collector.moments())

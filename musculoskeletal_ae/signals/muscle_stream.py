@@ -6,7 +6,8 @@
 
 A message that fails a check raises a `RejectionError`, which names the reason, the value and the
 legal range. Nodes, bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits.
-Values of isolated muscles are not checked.
+Values of isolated muscles are not checked. A rejected message may contain valid tensions, for
+example if only a length jumped. `RejectionError.pull` contains them, for the limiter.
 """
 
 from __future__ import annotations
@@ -43,11 +44,16 @@ class RejectionError(MessageError):
     Attributes:
         reason: Short text under which the message is counted.
         states: The raw l, T and temperature, (3, M); None if the message had another shape.
+        pull: l [m] with the length offset removed, and T_read [N], (2, M): medians of the last
+            messages, including rejected ones; −∞ where they are implausible. None if there are not
+            enough messages.
     """
 
-    def __init__(self, reason: str, detail: str, states: Array | None = None) -> None:
+    def __init__(
+        self, reason: str, detail: str, states: Array | None = None, pull: Array | None = None
+    ) -> None:
         super().__init__(reason, detail)
-        self.states = states
+        self.states, self.pull = states, pull
 
 
 @dataclass(frozen=True)
@@ -119,6 +125,18 @@ class LevelCheck:
         self._high = np.array([longest, most, LIMITS.highest_temperature * ones])
         self._slack = LIMITS.slack_share * robot.description.tension.bias
 
+    def plausible_pull(self, states: Array, offset: Array) -> Array:
+        """Return l [m] with `offset` [m] (M,) removed and T [N], (2, M); −∞ where implausible.
+
+        A length may be as far beyond any posture as that of a module that lost its length offset.
+        """
+        pull = states[:2].copy()
+        pull[0] -= offset
+        margin = np.array([[LIMITS.slack_length_margin], [0.0]])
+        legal = (pull >= self._low[:2] - margin) & (pull <= self._high[:2] + margin)
+        plausible: Array = np.where(legal, pull, -np.inf)
+        return plausible
+
     def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
         """Return reason and detail of the first implausible value, or None.
 
@@ -145,22 +163,35 @@ class LevelCheck:
 class StepCheck:
     """Checks that no length changes faster than a muscle can; accepts a new level that lasts.
 
+    The changes between messages that are too large are added up for each muscle. The sum shows
+    whether a length is still at another level. Its present value does not: a module whose length
+    jumped winds in or pays out, which can bring the length back to the previous value.
+
     It uses lengths as measured, so that new length offsets do not look like jumps.
 
     A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, its length
     appears to jump as well. One slack tendon that has become shorter while the others pull is
-    therefore accepted without being named, and left to the detectors of ruptures.
+    therefore accepted without being named, and left to the detectors of ruptures. This requires
+    that the motor can have wound in so much since the last message. If the tendon pulls again, it
+    has not ruptured: its module may have lost its length offset, so the muscle is named then.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._slack = LIMITS.slack_share * robot.description.tension.bias
-        self._accepted: Array | None = None  # the last accepted lengths [m], (M,)
-        #: the last lengths, accepted or not [m], (M,)
-        self._last: Array = np.zeros(robot.muscle_count)
-        self._last_at, self._settled_since = -math.inf, math.inf
-        self._far: Bools = np.zeros(robot.muscle_count, dtype=bool)  # which lengths jumped
-        self._after_pause = False  # whether they jumped during a pause of the messages
+        self._last: Array | None = None  # the last lengths, accepted or not [m], (M,)
+        self._last_at = math.inf  # time of the last message [s]
+        #: sum of the jumps since the last accepted message [m], (M,)
+        self._jump: Array = np.zeros(robot.muscle_count)
+        #: the largest change that was legal at any of these jumps [m], (M,)
+        self._allowed: Array = np.zeros(robot.muscle_count)
+        self._winding: Array = np.zeros(robot.muscle_count)  # what motors can have wound in [m]
+        #: which muscles have a jump that is not named because a rupture explains it, (M,)
+        self._unnamed: Bools = np.zeros(robot.muscle_count, dtype=bool)
+        #: time since when each of these pulls again [s]; ∞ if it does not, (M,)
+        self._taut_since: Array = np.full(robot.muscle_count, math.inf)
+        self._settled_since = math.inf  # time of the last jump [s]; ∞ if there is none
+        self._after_pause = False  # whether the first jump followed a pause of the messages
         self.jumped: tuple[int, ...] = ()  # muscles whose new level was just accepted
         self.jumped_in_pause = False
 
@@ -178,46 +209,62 @@ class StepCheck:
             now: Time of reception by a steady clock [s].
         """
         self.jumped = ()
-        pause = max(now - self._last_at, 0.0)
+        last, pause = self._last, max(now - self._last_at, 0.0)
+        self._last, self._last_at = length, now
+        if last is None:
+            return None
         allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
-        last, self._last, self._last_at = self._last, length, now
-        if self._accepted is None:
-            self._accept(length)
-            return None
-        change = np.abs(length - self._accepted) * used
-        if change.max() <= allowed:
-            self._accept(length)
-            return None
-        if self._settled_since == math.inf:
-            self._far[:] = False
-            self._after_pause = pause > LIMITS.pause
-        jumps = (np.abs(length - last) > allowed) & used
+        change = length - last
+        jumps = (np.abs(change) > allowed) & used
         if jumps.any():
-            self._far |= jumps
+            if self._settled_since == math.inf:
+                self._after_pause = pause > LIMITS.pause
             self._settled_since = now
-        self._settled_since = min(self._settled_since, now)
-        if now - self._settled_since > LIMITS.settled:
-            # Some lengths may have returned meanwhile, and others may have changed as much by
-            # moving.
-            far = np.flatnonzero(self._far & (change > allowed))
-            if not self._is_rupture(far, length, tension, used):
-                self.jumped = tuple(far.tolist())
-            self.jumped_in_pause = self._after_pause
-            self._accept(length)
+            self._jump[jumps] += change[jumps]
+            self._allowed[jumps] = np.maximum(self._allowed[jumps], allowed)
+            self._winding[jumps] += LIMITS.step + LIMITS.speed * pause
+        far = (np.abs(self._jump) > self._allowed) & used
+        if not far.any():
+            self._accept()
+            self.jumped = self._taut_again(tension, used, now)
             return None
-        muscle = int(change.argmax())
-        by = 1e3 * (length - self._accepted)[muscle]
+        if now - self._settled_since > LIMITS.settled:
+            muscles = np.flatnonzero(far)
+            if self._is_rupture(muscles, tension, used):
+                self._unnamed[muscles] = True
+            else:
+                self.jumped = tuple(muscles.tolist())
+            self.jumped_in_pause = self._after_pause
+            self._accept()
+            return None
+        muscle = int(np.abs(self._jump * used).argmax())
+        by = 1e3 * self._jump[muscle]
         return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {by:.0f} mm'
 
-    def _is_rupture(self, far: Ints, length: Array, tension: Array, used: Bools) -> bool:
+    def _is_rupture(self, far: Ints, tension: Array, used: Bools) -> bool:
         """Return whether one tendon alone is slack and wound in, as after a rupture."""
         slack = np.flatnonzero((tension < self._slack) & used)
-        if self._accepted is None or not np.array_equal(slack, far) or len(far) != 1:
+        if not np.array_equal(slack, far) or len(far) != 1:
             return False
-        return bool(length[far[0]] < self._accepted[far[0]])
+        return bool(-self._winding[far[0]] <= self._jump[far[0]] < 0.0)
 
-    def _accept(self, length: Array) -> None:
-        self._accepted, self._settled_since = length, math.inf
+    def _taut_again(self, tension: Array, used: Bools, now: float) -> tuple[int, ...]:
+        """Return muscles that pull although a rupture seemed to explain their jump."""
+        if not self._unnamed.any():
+            return ()
+        is_taut = self._unnamed & used & (tension >= self._slack)
+        self._taut_since = np.where(is_taut, np.minimum(self._taut_since, now), math.inf)
+        named = now - self._taut_since > LIMITS.settled
+        self._unnamed &= ~named
+        return tuple(np.flatnonzero(named).tolist())
+
+    def forget_jumps(self) -> None:
+        """Forget unnamed jumps, because the length offsets have been calibrated."""
+        self._unnamed[:] = False
+
+    def _accept(self) -> None:
+        self._jump[:] = self._allowed[:] = self._winding[:] = 0.0
+        self._settled_since = math.inf
 
 
 class TemperatureCheck:
@@ -284,6 +331,8 @@ class MuscleStream:
         self._levels = LevelCheck(robot)
         #: the last messages as measured, (3, M) each
         self._readings: deque[Array] = deque(maxlen=window)
+        #: the last messages, including rejected ones, (3, M) each
+        self._all_readings: deque[Array] = deque(maxlen=window)
         self._implausible = Persistence()
         self.displaced: frozenset[int] = frozenset()
         self.has_displaced_unseen = False
@@ -296,6 +345,7 @@ class MuscleStream:
         self._steps = StepCheck(self._robot)
         self._direction = FrictionDirection()
         self._readings.clear()
+        self._all_readings.clear()
         self._time = math.inf
 
     def use_transmission(self, transmission: Transmission) -> None:
@@ -311,6 +361,7 @@ class MuscleStream:
             self._direction = FrictionDirection()
             if not body.offsets.is_suspect:
                 self.displaced = frozenset()
+                self._steps.forget_jumps()
         self.displaced -= set(body.isolated)
         self.body = body
 
@@ -341,7 +392,8 @@ class MuscleStream:
             raw = None
             if len(message.data) == len(QUANTITIES) * muscle_count:
                 raw = np.reshape(np.array(message.data, dtype=float), (len(QUANTITIES), -1))
-            raise RejectionError(error.reason, str(error).partition(': ')[2], raw) from error
+            pull = None if raw is None else self._pull(raw)
+            raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
         return self.take_states(states, time, now)
 
     def take_states(self, states: Array, time: float, now: float | None = None) -> MuscleSample:
@@ -361,7 +413,8 @@ class MuscleStream:
         problem = self._problem(states, newest, now)
         self._implausible.note('' if problem is None else ': '.join(problem), now)
         if problem is not None:
-            raise RejectionError(*problem, states)
+            raise RejectionError(*problem, states, self._pull(states))
+        self._all_readings.append(states)
         if not 0.0 <= time - self._time <= LIMITS.pause:
             self._direction.reset()
         self._time = time
@@ -385,6 +438,15 @@ class MuscleStream:
             jumped=self._steps.jumped,
             tension_spread=self._transmission.spread(read[1], sliding),
         )
+
+    def _pull(self, states: Array) -> Array | None:
+        """Record the raw values of a rejected message; return `RejectionError.pull`."""
+        self._all_readings.append(states)
+        if len(self._all_readings) < (self._all_readings.maxlen or 1):
+            return None
+        offset = self.body.offsets.offset
+        each = [self._levels.plausible_pull(one, offset) for one in self._all_readings]
+        return median_of_rows(np.array(each))
 
     def _problem(self, read: Array, states: Array, now: float) -> tuple[str, str] | None:
         known, steps = self.body.offsets.known, self._steps

@@ -10,6 +10,7 @@ import pytest
 
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -30,7 +31,7 @@ class Loop:
         self.controller = Controller(ROBOT, Settings(first_duration=2.0))
         self.estimator.use(mae)
         self.controller.use(mae)
-        self.now, self.commands, self.pulls = 0.0, [], []
+        self.now, self.commands, self.pulls, self.has_joint_sensors = 0.0, [], [], True
         middle = 0.5 * (ROBOT.lower + ROBOT.upper)
         self.run(0.5)
         self.controller.target({n: (a, 0.0) for n, a in zip(ROBOT.joints, middle)})
@@ -51,8 +52,8 @@ class Loop:
                 self.read(reading)
             command = self.controller.step(self.now)
             if command is not None:
-                self.arm.command_length(command.value)
-                self.commands.append(command.value)
+                self.commands.append(command.value + self.estimator.body.offsets.offset)
+                self.arm.command_length(self.commands[-1])
                 self.pulls.append(self.arm.tension)
 
     def read(self, reading):
@@ -60,7 +61,8 @@ class Loop:
         message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
         with suppress(MessageError):
             states = read_muscle_states(message, ROBOT.muscle_count)
-            self.estimator.joints(reading.theta, self.now)
+            if self.has_joint_sensors:
+                self.estimator.joints(reading.theta, self.now)
             # Each node has its own stream.
             for take in (self.control, self.estimate):
                 with suppress(MessageError):
@@ -144,6 +146,47 @@ def test_under_each_fault_no_command_jumps_and_the_arm_resumes_after_the_repair(
     assert loop.mend() is None
     assert loop.cause == ''
     assert np.linalg.norm(loop.arm.theta - held) < 0.35
+
+
+def longest_overload(loop):
+    """Return the longest time for which a muscle pulled more than 1.1 times its limit [s]."""
+    longest, time = 0.0, np.zeros(ROBOT.muscle_count)
+    for tension in loop.pulls:
+        time = np.where(tension > 1.1 * ROBOT.tension.limit, time + DT, 0.0)
+        longest = max(longest, time.max())
+    return longest
+
+
+@pytest.mark.parametrize('offset', [0.05, 0.1, 0.3, -0.1])
+@pytest.mark.parametrize('muscles', [[3], range(6)], ids=['one muscle', 'all muscles'])
+def test_modules_that_lose_their_length_offsets_do_not_overload_the_arm(loop, offset, muscles):
+    lost = np.where(np.isin(range(6), muscles), offset, 0.0)
+    loop.arm.set_length_offset(lost * np.where(np.arange(6) % 2, 1.0, -1.0))
+    loop.run(4.0)
+    assert loop.cause
+    assert longest_overload(loop) <= 0.1
+
+
+@pytest.mark.parametrize('moves', [True, False])
+def test_the_services_of_a_length_calibration_may_follow_each_other_at_once(loop, moves):
+    loop.has_joint_sensors = False
+    if moves:
+        loop.controller.explore(True)
+    else:
+        loop.controller.stop(StopCause.LENGTH_OFFSETS_REVOKED)
+    loop.run(1.0)
+    loop.estimator.calibrate_lengths()
+    loop.controller.use_body(loop.estimator.body)
+    assert loop.controller.reset(loop.now) is None
+    assert loop.controller.explore(True) == ''
+    loop.run(4.0)
+    assert loop.cause == ''
+    assert np.ptp(loop.commands[-200:], axis=0).max() > 0.005
+    loop.estimator.calibrate_lengths()
+    loop.controller.use_body(loop.estimator.body)
+    loop.estimate = lambda _: None  # the estimator hangs
+    loop.run(7.0)
+    assert 'estimated_joint_states are too old' in loop.cause
 
 
 def test_every_kind_of_fault_has_a_promise():

@@ -188,3 +188,13 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert re.search('calibrating the lengths: [1-4] of', str(estimator.report(8.0)))
     estimator.isolate((3,))
     assert 'calibrating the lengths: 0 of' in str(estimator.report(8.0))
+
+
+@pytest.mark.parametrize('dt', [0.005, 0.02, 0.05])
+def test_the_first_estimate_takes_about_as_long_at_any_rate_of_the_messages(robot, mae, moment, dt):
+    calibration, count = LengthCalibration(robot, mae), 0
+    _, tension, length = moment(0.0)
+    while calibration.offsets is None and count * dt < 5.0:
+        calibration.step(tension, length + OFFSET, dt)
+        count += 1
+    assert 0.5 <= count * dt < 2.5

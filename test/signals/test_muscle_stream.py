@@ -102,6 +102,40 @@ def test_a_jump_of_one_length_is_rejected_until_it_has_lasted_and_names_its_musc
     assert rejected * PERIOD == pytest.approx(LIMITS.settled, abs=0.05)
 
 
+def test_a_jump_is_named_even_if_the_module_winds_the_length_back():
+    stream, jumped = MuscleStream(ROBOT), []
+    for n in range(300):
+        length = max(0.08 - 0.25 * PERIOD * (n - 20), 0.0) if n >= 20 else 0.0
+        with suppress(RejectionError):
+            jumped += stream.take_states(resting(length=(1, length)), n * PERIOD).jumped
+    assert jumped == [1]
+
+
+def test_a_length_that_jumps_back_is_accepted_at_once_although_the_arm_has_moved():
+    stream, rejected = MuscleStream(ROBOT), []
+    for n in range(150):
+        states = resting(length=(1, 0.08 * (20 <= n < 60)))
+        states[0, 2:] += 0.001 * n
+        try:
+            assert stream.take_states(states, n * PERIOD).jumped == ()
+        except RejectionError:
+            rejected.append(n)
+    assert rejected == [*range(20, 60)]
+
+
+def test_a_rejected_message_contains_the_tensions_that_last():
+    stream = MuscleStream(ROBOT, window=3)
+    for n in range(30):
+        states = resting(length=(1, 0.1 * (n >= 20)), tension=(1, 300.0))
+        states[1, 2] = 400.0 * (n == 25)  # a glitch
+        try:
+            stream.take_states(states, n * PERIOD)
+        except RejectionError as rejection:
+            pull = rejection.pull
+    assert pull[1, 1] == 300.0 and pull[0, 1] == 0.1
+    assert pull[1, 2] == 0.0
+
+
 def jump_together(stream, size=0.05, pause=0.0):
     """Make several lengths of a stream jump; return the muscles that the samples name."""
     jumped, stream_time = [], 0.0
@@ -146,6 +180,34 @@ def test_a_tendon_that_ruptures_while_messages_are_late_is_not_reported_as_a_jum
     assert jumps_of_a_winding_tendon(-0.1, 0.0) == []
     assert jumps_of_a_winding_tendon(0.1, 0.0) == [1]
     assert jumps_of_a_winding_tendon(-0.1, ROBOT.tension.bias[1]) == [1]
+
+
+def jumps_of_a_restarting_module(pause, boots=0.5):
+    """Return the muscles named if module 1 restarts and reads l = 0, at first with T = 0.
+
+    Args:
+        pause: Time without messages [s].
+        boots: Time until it pulls again [s].
+    """
+    stream, jumped = MuscleStream(ROBOT), []
+    for n in range(700):
+        time = n * PERIOD
+        states = resting(length=(1, 0.09))
+        if time >= 1.0:
+            states[0, 1] = 0.0
+            states[1, 1] *= time > 1.0 + pause + boots
+        if not 1.0 <= time < 1.0 + pause:
+            with suppress(RejectionError):
+                jumped += stream.take_states(states, time).jumped
+    return jumped
+
+
+@pytest.mark.parametrize('pause', [0.0, 0.2, 1.0])
+@pytest.mark.parametrize('boots', [0.0, 0.5, 3.0])
+def test_one_module_that_restarts_alone_is_reported_as_a_jump_and_not_taken_for_a_rupture(
+    pause, boots
+):
+    assert jumps_of_a_restarting_module(pause, boots) == [1]
 
 
 def test_an_isolated_muscle_is_no_longer_displaced():
