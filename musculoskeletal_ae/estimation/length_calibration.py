@@ -90,10 +90,14 @@ class LengthCalibration:
         """Progress of the calibration and any problem, as a text for users."""
         how = 'of standing still' if self.is_standing else 'of gentle motion'
         progress = f'{self.time:.0f} of {self.enough:.0f} s {how}'
-        problem = self._problem
+        return f'{progress}; {self.problem}' if self.problem else progress
+
+    @property
+    def problem(self) -> str:
+        """Why the calibration does not end although it has enough data, or ''."""
         if self._collector.has_moved_away:
-            problem = 'the arm moved away; let it stand and call estimator/zero again'
-        return f'{progress}; {problem}' if problem else progress
+            return 'the arm moved away; let it stand and call estimator/zero again'
+        return self._problem
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
         """Record the readings of one message, and continue or begin a fit if one is due.

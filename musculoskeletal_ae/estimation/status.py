@@ -44,6 +44,8 @@ def report(core: Estimator, now: float) -> Report:
     if core.calibration is not None:
         progress = core.calibration.progress
         text = f'calibrating the lengths: {progress}'
+        if core.calibration.problem:
+            values['calibration problem'] = core.calibration.problem
         return Report('warn', text, {**values, 'state': 'calibrating'})
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:

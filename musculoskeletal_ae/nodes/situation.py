@@ -46,6 +46,8 @@ FINDING_STEPS = {
     Kind.JOINT_SENSORS_DISAGREE.value: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
     **{kind.value: (Step.CALIBRATE_LENGTHS,) for kind in REVOKING},
 }
+#: steps that help against a length calibration that does not end
+CALIBRATION_STEPS = Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS
 REPAIR_STEPS = {step.identifier for step in REPAIR}
 EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value
 
@@ -308,8 +310,9 @@ class Situation:
         key = 'unknown length offsets'
         if unknown := values.get(key) or self._values('controller').get(key):
             text = f'length offsets unknown: {unknown}'
-            is_calibrating = values.get('state') == 'calibrating'
-            steps = () if is_calibrating else (Step.CALIBRATE_LENGTHS,)
+            steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
+            if values.get('state') == 'calibrating':
+                steps = CALIBRATION_STEPS if values.get('calibration problem') else ()
             troubles.append(_with_remedy(text, *steps) if steps else Trouble(text))
         return troubles
 

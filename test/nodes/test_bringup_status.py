@@ -180,6 +180,15 @@ def test_a_calibration_that_runs_is_not_to_be_started():
     assert situation.trouble() == 'length offsets unknown: biceps'
 
 
+def test_a_calibration_that_cannot_end_is_shown_with_its_remedy():
+    situation = Situation('/left')
+    lengths = {'state': 'calibrating', 'unknown_length_offsets': 'biceps'}
+    problem = 'biceps has a residual of 55 mm, limit 20 mm'
+    situation.diagnosed(diagnostics('/left/estimator', **lengths, calibration_problem=problem))
+    assert situation.steps() == ['check_sensor', 'calibrate_lengths']
+    assert 'check the named sensor' in situation.trouble()
+
+
 def test_several_silent_nodes_are_put_down_to_the_computer():
     now = 100.0
     situation = Situation('/left', lambda: now)
