@@ -10,6 +10,7 @@ from scipy.special import gammaincinv
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.learning.priors import INDEPENDENT_SAMPLES, PRIOR
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.synthetic import UNKNOWN_FRICTION
 from musculoskeletal_ae.mae.mae import Mae
@@ -74,21 +75,29 @@ def estimate_covariance(
 def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
     """Return the posterior covariances of γ, b and F of motor currents, (M, 3, 3).
 
+    What the samples say counts as INDEPENDENT_SAMPLES samples if there are more of them, because
+    errors of the body model are common to all samples.
+
     Returns:
         The covariances, in [N] for b and F; None for tension sensors.
     """
     if body.drive is None:
         return None
     covariance = np.empty((len(body.layouts), 3, 3))
+    share = min(1.0, INDEPENDENT_SAMPLES / len(fit.theta))
     for muscles, root in fit.root:
         end = 0
         for m in muscles.tolist():
             layout = body.layouts[m]
             places = end + np.arange(layout.size)[layout.drive]
             unit = np.zeros((len(root), 3))
-            unit[places, range(3)] = body.drive_units[:, m]
+            unit[places, range(3)] = 1.0
             half = solve_triangular(root, unit, trans='T')
-            covariance[m] = half.T @ half
+            prior = np.diag(1.0 / np.square(PRIOR.drive))
+            observed = np.linalg.inv(half.T @ half) - prior
+            widened = np.linalg.inv(prior + share * observed)
+            scale = body.drive_units[:, m]
+            covariance[m] = scale[:, None] * (0.5 * (widened + widened.T)) * scale
             end += layout.size
     return covariance
 
