@@ -57,7 +57,7 @@ ABLATED = {
     'delays': ('delay', 'jitter', 'dropouts'),
 }
 QUICK = ('friction',)
-ABLATION_INDIVIDUALS = 3
+ABLATION_INDIVIDUALS = 2
 #: nothing is removed: another exploration shows the difference between runs
 REPEATED = 'nothing: another run'
 OTHER_RUN = 1000  # added to the seed of exploration and training for the other run
