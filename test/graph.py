@@ -118,6 +118,7 @@ class Graph:
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.processes: list[Process] = []
+        self.tools: list[Process] = []  # unlike `processes`, these may end by themselves
         self.hosted: list[Node] = []
         self.networks: dict[str, Any] = {}  # their publishers, by topic
 
@@ -131,6 +132,12 @@ class Graph:
         process = Process(name, [*executable(name), *arguments])
         self.processes.append(process)
         return process
+
+    def run(self, name: str, *options: str) -> Process:
+        """Run a tool, which ends by itself or with the test, in this graph's namespace."""
+        remap = ['--ros-args', '-r', f'__ns:={self.namespace}']
+        self.tools.append(Process(name, [*executable(name), *options, *remap]))
+        return self.tools[-1]
 
     def host(self, kind: type[Node], **parameters: Any) -> Any:
         """Run a node with parameters in this process."""
@@ -238,7 +245,7 @@ class Graph:
 
     def close(self) -> None:
         """Leave the graph, and end all processes that were started."""
-        for process in self.processes:
+        for process in (*self.processes, *self.tools):
             process.end()
         self.executor.shutdown()  # before nodes are destroyed
         for node in (*self.hosted, self.node):

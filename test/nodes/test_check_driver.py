@@ -4,7 +4,7 @@
 import signal
 
 import pytest
-from graph import PATIENCE, Process, executable
+from graph import PATIENCE
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
 from musculoskeletal_ae.nodes import check_driver
@@ -12,9 +12,7 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 
 
 def check(graph, *options):
-    command = [*executable('check_driver'), '--robot', 'arm26', *options]
-    command += ['--ros-args', '-r', f'__ns:={graph.namespace}']
-    return Process('check_driver', command)
+    return graph.run('check_driver', '--robot', 'arm26', *options)
 
 
 def start_driver(graph, **parameters):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Point
-from graph import Process, executable
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
@@ -58,8 +57,7 @@ def test_markers_of_estimate_and_hardware_differ_and_have_names_and_prefixed_fra
 def test_render_writes_a_picture_and_refuses_an_unknown_file_type(graph, tmp_path, file, status):
     graph.host(HardwareEmulator, robot='arm26')
     out = tmp_path / file
-    arguments = ['--out', str(out), '--ros-args', '-r', f'__ns:={graph.namespace}']
-    tool = Process('render', [*executable('render'), *arguments])
+    tool = graph.run('render', '--out', str(out))
     graph.wait(lambda: not tool.alive(), 'its end')
     ended, output = tool.ended()
     assert ended == status and out.exists() is (status == 0)
@@ -71,8 +69,7 @@ def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
     publisher = graph.node.create_publisher(MarkerArray, 'estimated/markers', 10)
     bone = Marker(type=Marker.LINE_STRIP, points=[Point(), Point(z=0.3)])
     out = tmp_path / 'arm.png'
-    arguments = ['--out', str(out), '--ros-args', '-r', f'__ns:={graph.namespace}']
-    tool = Process('render', [*executable('render'), *arguments])
+    tool = graph.run('render', '--out', str(out))
 
     def ended():
         for markers in ([], [bone]):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from graph import Process, executable
+from graph import Process
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
@@ -88,9 +88,8 @@ def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained
 
 def test_check_driver_passes_the_robot_and_moves_it(graph):
     start_fake_robot(graph)
-    command = [*executable('check_driver'), '--robot', 'arm26', '--params-file', str(NODES)]
-    command += ['--seconds', '2', '--wait', '--move', '--muscles', 'brachialis']
-    process = Process('check_driver', [*command, '--ros-args', '-r', f'__ns:={graph.namespace}'])
+    options = ['--seconds', '2', '--wait', '--move', '--muscles', 'brachialis']
+    process = graph.run('check_driver', '--robot', 'arm26', '--params-file', str(NODES), *options)
     commands = graph.listen(Float64MultiArray, COMMANDS)
     graph.wait(lambda: not process.alive(), 'its end')
     status, output = process.ended()
