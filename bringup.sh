@@ -176,6 +176,8 @@ done
 robot_directory=$repository/config/$robot
 [ -z "$mujoco" ] || robot_directory=$repository # until it is imported
 [ -n "$mujoco" ] || [ -f "$robot_directory/muscles.yaml" ] || robot_directory=$robot
+[ ! -f "$robot_directory" ] ||
+  refuse "--robot '$robot' is a file: name a directory, or pass --mujoco for a MuJoCo model"
 [ -d "$robot_directory" ] || refuse "--robot '$robot' is neither a directory nor one of: $(
   cd "$repository/config" && dirname -- */muscles.yaml | paste -sd ' '
 )"

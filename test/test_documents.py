@@ -150,6 +150,18 @@ def test_no_two_commands_of_the_documents_write_to_the_same_place():
     assert {place: pages for place, pages in makers.items() if len(pages) > 1} == {}
 
 
+def test_commands_that_play_a_recording_with_an_isolation_do_not_stop_at_the_anomaly():
+    pages = [*PAGES, 'bags/README.md']
+    played = [
+        command.line
+        for page in dict.fromkeys(pages)
+        for command in commands(ROOT / page)
+        if 'bags/isolation' in command.line and 'bringup.sh' in command.line
+    ]
+    assert played
+    assert all('-p estimator:on_anomaly:=isolate' in line for line in played)
+
+
 def test_every_symbol_that_the_audit_of_the_paper_names_exists():
     text = (ROOT / 'notes' / 'paper_audit.md').read_text('utf-8')
     rows = re.findall(r'^\| (\d+) \|.*\| (exact|open|deviation) \| \w* ?\|$', text, re.M)

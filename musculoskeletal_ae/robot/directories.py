@@ -34,12 +34,19 @@ def find_robot(robot: str | Path) -> Path:
     shipped = shipped_robots()
     if str(robot) in shipped:
         return shipped[str(robot)]
+    is_file = False
     try:
         directory = Path(robot).expanduser()
+        is_file = directory.is_file()
         if str(robot) and directory.is_dir():
             return directory.resolve()
     except (RuntimeError, ValueError, OSError):  # unknown home directory, NUL or too long a name
         pass
+    if is_file:
+        raise RobotDescriptionError(
+            f'robot {str(robot)!r} is a file; name the directory that has robot.urdf and '
+            'muscles.yaml. `import_robot FILE --out DIR` makes one from a MuJoCo or CARDSflow model'
+        )
     raise RobotDescriptionError(
         f'robot {str(robot)!r} is neither a directory nor a shipped robot '
         f'({", ".join(sorted(shipped))}); use one of these names, or a directory with '

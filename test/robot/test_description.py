@@ -286,3 +286,10 @@ def test_a_malicious_or_strange_urdf_is_refused(case, tmp_path):
 def test_the_longest_chain_that_is_read_can_be_read(tmp_path):
     file = copy_robot('arm26', tmp_path) / 'robot.urdf'
     assert read_urdf(file, chain(MOST_PARTS // 2 - 1)).nframes > MOST_PARTS // 2
+
+
+def test_a_model_file_in_place_of_a_robot_directory_gets_the_way_to_import_it(tmp_path):
+    model = tmp_path / 'own.xml'
+    model.write_text('<mujoco/>', encoding='utf-8')
+    with pytest.raises(RobotDescriptionError, match=r'is a file; .* `import_robot FILE --out DIR`'):
+        Robot.load(model)
