@@ -580,7 +580,7 @@ class Controller:
         state, follower = self.target_state, self.activities.follower
         if follower.trajectory is None and state.theta is not None:
             self._approach(self.settings.first_duration)
-        elif follower.has_fallen and state.approaches_left:
+        elif follower.has_lost_path and state.approaches_left:
             state.approaches_left -= 1
             follower.leave()
             self._approach(self.settings.target_duration or self.settings.first_duration)
@@ -657,7 +657,8 @@ class Controller:
         state = self.target_state
         assert state.theta is not None
         start, mae = self._ready()
-        plan = self.planner.to_posture(mae, start, state.theta, duration)
+        lag = self.activities.follower.winches.lag
+        plan = self.planner.to_posture(mae, start, state.theta, duration, lag)
         self._begin(plan, 0.0, state.effort)
 
     def _follow(self, plan: Plan, delay: float = 0.0) -> None:
@@ -705,7 +706,7 @@ class Controller:
         if not self.stream.body.offsets.known:
             raise MessageError('length offsets are unknown', 'call estimator/zero')
         follower = self.activities.follower
-        if follower.trajectory is not None:
+        if follower.trajectory is not None and not follower.has_lost_path:
             return follower.ahead(delay), self.mae
         inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
         return Setpoint.resting(inside), self.mae

@@ -61,6 +61,9 @@ BLENDING = 0.3  # time in which the previous command is blended into the new pla
 #: divided by RACK counts
 FALLEN = 0.2
 FALLING = 2.0  # time after the end of a trajectory from which on the arm can count as fallen [s]
+#: error on the way above which, for the time FALLING, an arm with isolated muscles no longer
+#: follows its trajectory [rad]; for prismatic joints, the error divided by RACK counts
+LOST = 0.4
 SETTLING = 0.8  # time after the end for which the feedback of the motion continues [s]
 TURNING = 0.005  # speed of a tendon above which its sliding direction is certain [m/s]
 AHEAD = 0.2  # T_K is computed for this time ahead, and at this interval [s]
@@ -119,6 +122,7 @@ class Follower(ActivityControl):
         effort: Torque in addition to inverse dynamics [N·m], (D,).
         time: Time since the start of the trajectory [s].
         over: Time since the end of the trajectory [s].
+        lost_time: Time for which the error has exceeded LOST [s].
         desired: The present setpoint.
         error: Desired − estimated θ [rad], (D,).
         missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
@@ -130,7 +134,7 @@ class Follower(ActivityControl):
         self.trajectory: Trajectory | None = None
         self.next: tuple[Trajectory, float] | None = None
         self.effort: Array = np.zeros(robot.joint_count)
-        self.time = self.over = 0.0
+        self.time = self.over = self.lost_time = 0.0
         self.desired = Setpoint.resting(np.zeros(robot.joint_count))
         self.error: Array = np.zeros(robot.joint_count)
         self.missing_torque: Array = np.zeros(robot.joint_count)
@@ -158,9 +162,7 @@ class Follower(ActivityControl):
 
     def use_network(self, mae: Mae) -> None:
         """Use another network; the command changes without a jump."""
-        touch = getattr(mae, 'touch', None)
-        default = np.full(self._robot.muscle_count, FRICTION)
-        self._friction = default if touch is None else touch.friction
+        self._friction = tendon_friction(self._robot, mae)
         self.plan_anew()
 
     # -- requests -------------------------------------------------------------------------------
@@ -200,9 +202,15 @@ class Follower(ActivityControl):
         return bool(np.abs(self.error / self._robot.kinematics.radian).max() > FALLEN)
 
     @property
+    def has_lost_path(self) -> bool:
+        """Whether an arm with isolated muscles has fallen, at the end or on the way."""
+        is_lost = self.lost_time > FALLING and not self._robot.used.all()
+        return self.has_fallen or (is_lost and self.next is None)
+
+    @property
     def needs_trajectory(self) -> bool:
-        """Whether it has no trajectory, as after a stop, or the arm has fallen on the way."""
-        return self.trajectory is None or self.has_fallen
+        """Whether it has no trajectory, as after a stop, or the arm has fallen."""
+        return self.trajectory is None or self.has_lost_path
 
     @property
     def has_arrived(self) -> bool:
@@ -256,6 +264,8 @@ class Follower(ActivityControl):
         if self._resting is None:
             self.desired = trajectory.sample(self.time)
         self.error = self.desired.theta - inputs.theta
+        is_far = np.abs(self.error / self._robot.kinematics.radian).max() > LOST
+        self.lost_time = self.lost_time + dt if is_far else 0.0
         if self.time < trajectory.duration + SETTLING:
             length = self._moving(trajectory, inputs)
         else:
@@ -279,7 +289,7 @@ class Follower(ActivityControl):
 
     def _begin(self, trajectory: Trajectory, time: float) -> None:
         self.trajectory, self.time, self.next = trajectory, time, None
-        self.over = 0.0
+        self.over = self.lost_time = 0.0
         if self._resting is not None:  # in motion, the trajectories join without a new plan
             self.plan_anew()
 
@@ -336,6 +346,13 @@ class Follower(ActivityControl):
         feedback.step(self.error, jacobian, inputs.pull, inputs.limit, gain, inputs.dt)
         self._shift = feedback.correction
         return length + feedback.shift(jacobian)
+
+
+def tendon_friction(robot: Robot, mae: Mae) -> Array:
+    """Return μ of each muscle (M,): as learned, or FRICTION."""
+    touch = getattr(mae, 'touch', None)
+    friction: Array = np.full(robot.muscle_count, FRICTION) if touch is None else touch.friction
+    return friction
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:

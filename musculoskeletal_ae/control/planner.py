@@ -62,13 +62,23 @@ class Planner:
         """Whether the arm goes to the nearest holdable posture if the target is not holdable."""
         return self._settings.unreachable == 'nearest'
 
-    def to_posture(self, mae: Mae, start: Setpoint, theta: Array, duration: float) -> Plan:
+    def to_posture(
+        self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
+    ) -> Plan:
         """Plan a motion to rest at θ [rad] (D,) through holdable postures.
 
-        `duration` is the time for each segment of the path [s].
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the motion starts.
+            theta: Target posture [rad], (D,).
+            duration: Shortest time for each segment of the path [s]; longer without some muscles,
+                if the remaining ones cannot accelerate the arm as fast.
+            lag: Lag λ of the muscle modules [s].
         """
         way = reach.way(self._robot, mae, start.theta, theta)
-        return Plan(self._within_limits(mae, Trajectory.to(start, way, duration)))
+        planned = self._within_limits(mae, Trajectory.to(start, way, duration))
+        slower = reach.exertion_slowness(self._robot, mae, planned, lag)
+        return Plan(planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower)))
 
     def through(self, mae: Mae, start: Setpoint, points: Points, passed: float) -> Plan:
         """Plan a motion through points that started `passed` [s] ago."""

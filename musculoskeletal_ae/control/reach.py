@@ -10,9 +10,13 @@ roadmap of random postures,
 
 Prismatic joints count as if a pinion of radius RACK turned them. Tensions are limited to
 T_bias + USED (T_limit − T_bias), so that the path keeps a reserve if possible; otherwise it
-minimises the missing torque. In some postures of the roadmap, joints that rest at their stops stay
-there. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki
-2000); until then its cost is approximated from the postures at its ends.
+minimises the missing torque. On an edge, tendon friction opposes the motion (`Limits`). In some
+postures of the roadmap, joints that rest at their stops stay there. An edge is evaluated only if
+the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000); until then its cost is
+approximated from the postures at its ends.
+
+The motion along the path must not be faster than the muscles can accelerate the arm
+(`exertion_slowness`).
 """
 
 from itertools import pairwise
@@ -20,6 +24,8 @@ from itertools import pairwise
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.follower import tendon_friction
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -35,6 +41,13 @@ POSTURES = 300  # number of random postures of the roadmap
 NEIGHBOURS = 12  # number of neighbours of each posture to which the roadmap has edges
 LOOKS = 40  # largest number of paths of which all edges are evaluated
 SPACING = 0.15  # distance between the evaluated postures of an edge [rad]
+#: factors by which a motion may be slowed until its tensions suffice, in ascending order
+SLOWER = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
+#: change of a muscle's length per angle above which its sliding direction is certain [m/rad]
+CERTAIN = 0.005
+#: smallest lag λ for which a motion is planned [s]; λ is measured only after the motion has begun
+LEAST_LAG = 0.02
+MOMENT_SPACING = 0.06  # distance between the evaluated moments of a motion [rad]
 AT_STOP = 0.05  # distance from a stop below which a joint rests at it [rad]
 STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
 
@@ -81,28 +94,116 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     return _shortened(path, cost)[1:]
 
 
+def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) -> float:
+    """Return the factor by which a motion has to be slowed for the torque of the muscles.
+
+        τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
+        T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
+
+    The factor s is the smallest of `SLOWER` at which the missing torque of no moment exceeds that
+    of a very slow motion notably. Tensions are limited as on a path (`Limits`). Without isolated
+    muscles, the factor is 1.
+
+    Args:
+        robot: The robot; isolated muscles have no tension.
+        mae: The network in use.
+        trajectory: The motion.
+        lag: λ, time by which the muscle modules lag behind [s].
+    """
+    time, theta = trajectory.path
+    is_still = (theta == theta[0]).all()
+    if robot.used.all() or not robot.actuation.knows_tension or is_still:
+        return 1.0
+    limits, bias, lag = Limits(robot, mae), robot.tension.bias, max(lag, LEAST_LAG)
+    travelled = np.linalg.norm(np.diff(theta, axis=0) / robot.kinematics.radian, axis=1).cumsum()
+    marks = np.arange(0.0, travelled[-1], MOMENT_SPACING)
+    moments = trajectory.sample(time[np.unique(np.searchsorted(travelled, marks)) + 1])
+    jacobians = mae.muscle_jacobian(moments.theta, np.tile(bias, (len(moments.theta), 1)))
+    number = 0
+    for at, jacobian in zip(map(Setpoint._make, zip(*moments)), jacobians):
+        if limits.missing_in_motion(jacobian, at, lag, SLOWER[number]) <= NOTABLE:
+            continue
+        legal = limits.missing_in_motion(jacobian, at, lag, np.inf) + NOTABLE
+        while limits.missing_in_motion(jacobian, at, lag, SLOWER[number]) > legal:
+            number += 1
+            if number == len(SLOWER) - 1:
+                return SLOWER[number]
+    return SLOWER[number]
+
+
+class Limits:
+    """The bone-side tensions that a moving arm may use.
+
+        T_bias/loss ≤ T_end ≤ (T_bias + USED (T_limit − T_bias))/loss,   loss = e^{μ s}
+
+    Tendon friction opposes the motion: it weakens a tendon that is wound in (s = 1), and a tendon
+    that is drawn out (s = −1) resists with more than T_bias.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        limits = robot.tension
+        self._robot, self._radian = robot, robot.kinematics.radian
+        self._low = limits.bias
+        self._high = limits.bias + USED * (limits.limit - limits.bias)
+        self._friction = tendon_friction(robot, mae)
+
+    def of(
+        self, jacobian: Array, direction: Array, resistance: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Return the lowest and highest tensions [N], (M,) each.
+
+        Args:
+            jacobian: G [m/rad], (M, D).
+            direction: Direction in which the joints move, of any length; 0 at rest, (D,).
+            resistance: Additional lowest tension [N], (M,).
+        """
+        length = max(float(np.linalg.norm(direction / self._radian)), 1e-9)
+        loss = np.exp(-self._friction * np.tanh(jacobian @ direction / (length * CERTAIN)))
+        return np.minimum(self._low + resistance, self._high) / loss, self._high / loss
+
+    def missing_in_motion(self, jacobian: Array, at: Setpoint, lag: float, slower: float) -> float:
+        """Return the largest missing torque of a motion [N·m].
+
+        Args:
+            jacobian: G [m/rad], (M, D).
+            at: One moment of the motion.
+            lag: λ of the muscle modules [s].
+            slower: Factor by which the motion is slowed; ∞ for a very slow motion.
+        """
+        robot, radian = self._robot, self._radian
+        velocity, acceleration = at.velocity / slower, at.acceleration / slower**2
+        paid_out = np.maximum(jacobian @ velocity, 0.0)
+        ends = self.of(jacobian, at.velocity, robot.actuation.tension_of_lag(lag, paid_out))
+        torque = radian * robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
+        return float(np.abs(least_tension(radian * jacobian, torque, *ends).missing_torque).max())
+
+
 class PathCost:
     """The cost of straight paths, by the torque that muscles and joint stops do not provide."""
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
         self._robot, self._mae = robot, mae
         self._radian = robot.kinematics.radian
-        limits = robot.tension
-        self._most = limits.bias + USED * (limits.limit - limits.bias)
+        self._limits = Limits(robot, mae)
 
-    def missing(self, postures: Array) -> Array:
-        """Return m of postures [rad] (N, D): the largest missing torque [N·m], (N,)."""
-        robot, low, high = self._robot, self._robot.tension.bias, self._most
-        tensions = np.broadcast_to(low, (len(postures), robot.muscle_count))
-        jacobians = self._radian * self._mae.muscle_jacobian(postures, tensions)
+    def missing(self, postures: Array, direction: Array | None = None) -> Array:
+        """Return m of postures [rad] (N, D): the largest missing torque [N·m], (N,).
+
+        The joints move slowly in a `direction` (D,); without one, they rest.
+        """
+        robot, bias = self._robot, self._robot.tension.bias
+        moved = np.zeros(robot.joint_count) if direction is None else direction
+        tensions = np.broadcast_to(bias, (len(postures), robot.muscle_count))
+        jacobians = self._mae.muscle_jacobian(postures, tensions)
         torques = []
         for theta, jacobian in zip(postures, jacobians):
             # Model a stop as a muscle that pulls the joint away from it.
             stops = self._stops(theta)
             none = np.zeros(len(stops))
+            low, high = self._limits.of(jacobian, moved)
             ends = np.concatenate([low, none]), np.concatenate([high, none + STOP])
             torque = self._radian * robot.kinematics.holding_torque(theta)
-            exertion = least_tension(np.vstack([jacobian, stops]), torque, *ends)
+            exertion = least_tension(np.vstack([self._radian * jacobian, stops]), torque, *ends)
             torques.append(exertion.missing_torque)
         m = np.abs(torques).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
@@ -115,10 +216,10 @@ class PathCost:
         return np.vstack([-joints[is_low], joints[is_high]])
 
     def of_edge(self, one: Array, other: Array) -> float:
-        """Return the cost of the straight path between two postures [rad], (D,) each."""
+        """Return the cost of the straight path from one posture to another [rad], (D,) each."""
         length = float(np.linalg.norm((other - one) / self._radian))
         shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
-        m = self.missing(one + shares * (other - one))
+        m = self.missing(one + shares * (other - one), other - one)
         return length * (1.0 + PRICE * float(m.mean()))
 
     def of_ends(self, postures: Array) -> Array:
@@ -167,8 +268,8 @@ class Roadmap:
         return path[::-1]
 
     def _set_price(self, i: int, j: int, price: float) -> None:
-        self._price[i, j] = self._price[j, i] = price
-        self._evaluated |= {(i, j), (j, i)}
+        self._price[i, j] = price
+        self._evaluated.add((i, j))
 
 
 def _random_postures(robot: Robot, start: Array) -> Array:

@@ -48,7 +48,8 @@ class Settings:
     target_duration: float = settable(
         1.2,
         'duration of a movement to a target with method `proposed` of preset default, or '
-        '`stiffness`; it is extended if the muscle modules are too slow (0: first_duration)',
+        '`stiffness`; it is extended if the muscle modules are too slow, or the muscles that are '
+        'not isolated too weak (0: first_duration)',
         's',
         0.0,
         60.0,

@@ -175,7 +175,7 @@ def slowed(follower: Follower) -> str:
     if share < LEAST_SHARE:
         requested, slowed_duration = last.duration / last.slowed, last.duration
         return (
-            f'of {requested:.3g} s takes {slowed_duration:.3g} s because of the speed limit of '
+            f'of {requested:.3g} s takes {slowed_duration:.3g} s because of the limits of '
             'the muscle modules'
         )
     return f'slowed to {share:.0f} % of its speed for the muscle modules'

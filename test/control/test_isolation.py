@@ -12,16 +12,18 @@ from robots import write_robot
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
+from musculoskeletal_ae.control.follower import FRICTION, TURNING, slowness
+from musculoskeletal_ae.control.planner import Planner
 from musculoskeletal_ae.control.reach import lacking
-from musculoskeletal_ae.control.settings import METHODS
+from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stopping import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.control.stops import StopCause
-from musculoskeletal_ae.control.trajectory import Points
+from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.robot.actuation import DEPTH
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import TensionProgramme
+from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 LOST = 0
@@ -208,6 +210,51 @@ def test_a_path_avoids_postures_that_cannot_be_held():
     assert ((robot.lower <= path) & (path <= robot.upper)).all()
     assert lack(start, path) == 0.0
     np.testing.assert_array_equal(reach.way(whole, mae, start, goal), [goal])
+
+
+def test_a_motion_without_a_muscle_is_slow_enough_for_the_torque_of_the_others():
+    whole = Robot.load('musashi_left_arm')
+    robot = whole.without([whole.muscles.index('pectoralis_major')])
+    mae, limits, lag = ExactMae(robot), robot.tension, 0.02
+
+    def lack(trajectory):
+        """Return the largest missing torque against tendon friction and modules that lag [N·m]."""
+        lacks = []
+        for at in zip(*trajectory.sample(np.linspace(0.0, trajectory.duration, 40))):
+            jacobian = mae.muscle_jacobian(at[0], limits.bias)
+            speed = jacobian @ at[1]
+            loss = np.exp(-FRICTION * np.tanh(speed / TURNING))
+            low = limits.bias + robot.actuation.tension_of_lag(lag, np.maximum(speed, 0.0))
+            torque = robot.kinematics.inverse_dynamics(*at)
+            exertion = least_tension(jacobian, torque, low / loss, limits.limit / loss)
+            lacks.append(np.abs(exertion.missing_torque).max())
+        return max(lacks)
+
+    postures = robot.random_postures(60, np.random.default_rng(0))
+    known = [theta for theta in postures if not lacking(robot, mae, theta)]
+    hard = 0
+    for start, goal in list(pairwise(known))[:32]:
+        rest = Setpoint.resting(start)
+        fast = Trajectory.to(rest, reach.way(robot, mae, start, goal), 1.2)
+        fast = fast.scaled(slowness(robot, mae, fast, Settings()))
+        if lack(fast) > 0.3:
+            hard += 1
+            planned = Planner(robot, Settings()).to_posture(mae, rest, goal, 1.2, lag).trajectory
+            np.testing.assert_array_equal(planned.end, goal)
+            assert lack(planned) < 0.25 * lack(fast)
+    assert hard >= 3
+
+
+def test_an_arm_without_a_muscle_that_falls_on_the_way_starts_again_before_the_end():
+    for lost, starts_again in (([LOST], True), ([], False)):
+        bench = Bench(target_duration=10.0)
+        bench.isolate(lost)
+        bench.theta = REST
+        bench.step()
+        bench.target(THERE)
+        first = bench.core.activities.follower.trajectory
+        bench.step(round(first.duration / 0.01) - 10)
+        assert (bench.core.activities.follower.trajectory is not first) == starts_again
 
 
 @pytest.fixture(scope='module')
