@@ -122,7 +122,7 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     shown = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
     run = bringup(shown, *chosen, '--reality', str(model), '--network')
     reported = f"-- reality {model}: joint 'elbow' moves from -1.5 to 0.2 there"
-    assert 'training the MAE' in read_until(run, reported)
+    assert 'training the initial network' in read_until(run, reported)
     assert set(reaches(run)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET'}
     run.end(signal.SIGKILL)
     assert left_behind(run) == ''
