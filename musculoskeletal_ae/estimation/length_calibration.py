@@ -32,6 +32,8 @@ LARGEST_RESIDUAL = 0.02
 #: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
 #: wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
+#: remedy for users; a network that has not learned the arm can be too inexact for this calibration
+OTHER_WAY = 'provide joint sensors, or hold the arm in zero_posture and call estimator/zero'
 CORRELATED = 10.0  # number of successive moments with the information of one independent moment
 BEYOND_STOP = 0.01  # fraction of its range by which a stated joint angle may exceed a limit
 MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
@@ -173,7 +175,8 @@ class LengthCalibration:
         # the fit may have found wrong postures that are similar to the true ones
         if not cost <= LARGEST_COST:
             problem = 'no offsets explain the lengths and tensions'
-            return f'{problem}: the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
+            excess = f'the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
+            return f'{problem}: {excess}; {OTHER_WAY}'
         return ''
 
 

@@ -190,6 +190,24 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert 'calibrating the lengths: 0 of' in str(estimator.report(8.0))
 
 
+def test_lengths_that_no_posture_explains_call_for_joint_sensors_or_a_known_posture(
+    robot, mae, moment, monkeypatch
+):
+    monkeypatch.setattr(length_calibration, 'ENOUGH', 4.0)
+    monkeypatch.setattr(length_calibration, 'LARGEST_RESIDUAL', 1.0)
+    calibration = LengthCalibration(robot, mae)
+
+    def reversed_signs(t):
+        theta, tension, length = moment(t)
+        return theta, tension, -length
+
+    for begin in range(0, 30, 3):
+        if not calibration.problem:
+            run(calibration, reversed_signs, 3.0, sees=False, begin=float(begin))
+    assert not calibration.is_done
+    assert 'provide joint sensors, or hold the arm in zero_posture' in calibration.progress
+
+
 @pytest.mark.parametrize('dt', [0.005, 0.02, 0.05])
 def test_the_first_estimate_takes_about_as_long_at_any_rate_of_the_messages(robot, mae, moment, dt):
     calibration, count = LengthCalibration(robot, mae), 0
