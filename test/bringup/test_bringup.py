@@ -133,6 +133,7 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     )
     _, output = run.ended()
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
+    assert re.search(r'^-- record: \d+ messages recorded to .*, \d+ lost$', output, re.MULTILINE)
     lines = statuses(output)
     assert lines, output  # on a busy machine, sensor data arrive late
     # Seeds 0 to 4: 0.08 to 0.30 rad. The middle of the joint range would be 0.58 rad off.
