@@ -19,10 +19,10 @@ from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
-from musculoskeletal_ae.control.remedy import Step
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED
+from musculoskeletal_ae.remedy import Step
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 
@@ -101,7 +101,7 @@ def test_the_camera_sees_the_whole_arm_in_every_posture(robot, width, height, tm
     page = Page(robot, '127.0.0.1', free_port(), True, lambda *_: None)
     try:
         is_narrow = width < 900
-        target, eye = page._viewpoint(width, height, is_narrow)
+        target, eye = page.scene.viewpoint(width, height, is_narrow)
         shares = np.random.default_rng(1).uniform(0.0, 1.0, (20, robot.joint_count))
         visible = []
         for theta in robot.lower + shares * (robot.upper - robot.lower):
@@ -259,7 +259,7 @@ def test_sliders_reach_the_limits_of_a_prismatic_joint(tmp_path, limits):
     urdf.write_text(text.replace(before, f'lower="{limits[0]}" upper="{limits[1]}"'))
     page = Page(Robot.load(tmp_path), '127.0.0.1', free_port(), False, lambda *_: None)
     try:
-        slider = page._sliders[-1]
+        slider = page.controls.sliders[-1]
         near = 0.011 * (limits[1] - limits[0])
         np.testing.assert_allclose((slider.min, slider.max), limits, atol=near)
         assert limits[0] - 1e-12 <= slider.min < slider.max <= limits[1] + 1e-12
@@ -299,7 +299,7 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
 def test_a_browser_can_change_only_the_values_of_controls(graph, arm26):
     port, asked = free_port(), []
     page = Page(arm26, '127.0.0.1', port, False, lambda *what: asked.append(what))
-    slider = page._sliders[0]
+    slider = page.controls.sliders[0]
     control = {'type': 'GuiUpdateMessage', 'uuid': slider._impl.uuid}
     try:
         with ThreadPoolExecutor(1) as aside, visit(port, f'http://localhost:{port}') as mine:
@@ -320,13 +320,12 @@ def test_a_push_ends_when_its_visitor_leaves(arm26):
     asked = []
     page = Page(arm26, '127.0.0.1', free_port(), False, lambda *what: asked.append(what))
     try:
-        page._count(1, True)
-        page._count(1, False)
+        visitor = SimpleNamespace(client_id=1)
+        page._on_disconnect(visitor)
         assert asked == []
-        page._count(1, True)
         ends = {'start_position': np.zeros(3), 'end_position': np.ones(3)}
-        assert page._push(SimpleNamespace(phase='update', **ends)).any()
-        page._count(1, False)
+        assert page.controls.push(SimpleNamespace(phase='update', **ends)).any()
+        page._on_disconnect(visitor)
     finally:
         page.close()
     ((what, force),) = asked
