@@ -5,7 +5,6 @@ joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_dete
 isolated_muscles, muscle_length_zeros → mae_checkpoint.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -17,9 +16,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.trainer import TrainerProcess
-from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
+from musculoskeletal_ae.nodes.node_parameters import naming_parameter
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
@@ -51,15 +50,13 @@ class Learner(Shell):
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.sources.watch('mae_checkpoint')
-        self.running = self.troubled = False
+        self.troubled = False
         core = self.core
-        if value('fresh'):
-            core.replace(None)
+        self._begin()
         # These setters replace what was learned and cannot be undone, so they need `prepare`.
-        self.follow_parameter('fresh', self._start, self._afresh)
-        self.follow_parameter('checkpoint', self._start, self._network)
-        self.follow_parameter('relearn_muscles', self._name, self.robot.muscle_indices)
-        self.running = True
+        self.parameters.on_change('fresh', core.replace, self._afresh)
+        self.parameters.on_change('checkpoint', core.replace, self.load_checkpoint)
+        self.parameters.on_change('relearn_muscles', core.relearn, self.robot.muscle_indices)
         if topic := JOINT_TOPICS.get(value('joint_source')):
             self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
@@ -78,25 +75,30 @@ class Learner(Shell):
 
     # -- parameters -----------------------------------------------------------------------------
 
+    def _begin(self) -> None:
+        """Continue from what was saved, or begin with the network of `checkpoint`.
+
+        Nothing is relearned, because a parameter file would cause that at every start.
+        """
+        if self.parameter('fresh'):
+            self.core.replace(None)
+        with naming_parameter('checkpoint'):
+            mae = None
+            if self.core.checkpoint is None:
+                mae = self.load_checkpoint(self.parameter('checkpoint'))
+            if mae is not None:
+                self.core.begin(mae)
+        with naming_parameter('relearn_muscles'):
+            self.robot.muscle_indices(self.parameter('relearn_muscles'))
+
     def _afresh(self, value: bool) -> Mae | None:
-        """Return the network from which to start again; None at the start of the node."""
-        if not (value and self.running):
+        """Return the network from which to start again; None if the value is false."""
+        if not value:
             return None
         path = self.parameter('checkpoint')
         if not path:
             raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
-        return self._network(path)
-
-    def _network(self, path: str) -> Mae | None:
-        wanted = path and (self.running or self.core.checkpoint is None)
-        return checkpoint.load(path, self.robot) if wanted else None
-
-    def _start(self, mae: Mae) -> None:
-        (self.core.replace if self.running else self.core.begin)(mae)
-
-    def _name(self, muscles: Sequence[int]) -> None:
-        if self.running:  # otherwise a parameter file would cause relearning at every start
-            self.core.relearn(muscles)
+        return self.load_checkpoint(path)
 
     # -- messages -------------------------------------------------------------------------------
 

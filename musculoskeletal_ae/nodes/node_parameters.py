@@ -76,10 +76,19 @@ class NodeParameters:
             prepare: Converts the value for `setter`, or returns None if there is nothing to do;
                 raises a MusculoskeletalError to refuse it.
         """
+        self.on_change(name, setter, prepare)
+        self._take({name: self._held(name)})
+
+    def on_change(
+        self,
+        name: str,
+        setter: Callable[[Any], object],
+        prepare: Callable[[Any], object] | None = None,
+    ) -> None:
+        """Call `setter` as `follow` does, but not now."""
         self._setters[name] = setter
         if prepare is not None:
             self._prepare[name] = prepare
-        self._take({name: self._held(name)})
 
     def _held(self, name: str) -> Any:
         value = self._node.get_parameter_or(name, RosParameter(name)).value
