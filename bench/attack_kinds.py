@@ -21,17 +21,16 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from bench.attack_graph import NODES, OWN, PATIENCE, Attack, digest, set_request
-from musculoskeletal_ae.control.remedy import Step
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
+from musculoskeletal_ae.remedy import STEPS, Step
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # duration of an attack [s]
 REPORT_TIME = 2.0  # time after which the status line has to report a problem [s]
 OFFSET = 0.08  # size of false length offsets [m]
-STEPS = {step.identifier: step for step in Step}
 
 
 class Scene:

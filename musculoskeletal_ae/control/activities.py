@@ -55,6 +55,11 @@ class ActivityControl(ABC):
         return False
 
     @property
+    def missing_torque(self) -> Array | None:
+        """Torque that the muscles cannot exert at the target [N·m], (D,); None if it is unknown."""
+        return None
+
+    @property
     def new_target(self) -> Array | None:
         """Posture [rad] (D,) that replaces the target; None: the target is kept."""
         return None

@@ -148,6 +148,11 @@ class Exploring(ActivityControl):
         self._steps = self._theta = None
 
     @property
+    def missing_torque(self) -> Array | None:
+        """Torque that the muscles cannot exert at the present goal [N·m], (D,)."""
+        return self.ramps.missing_torque
+
+    @property
     def theta(self) -> Array | None:
         """The posture to which the arm moves [rad], (D,); None before the first one.
 

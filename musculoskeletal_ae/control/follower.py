@@ -125,7 +125,6 @@ class Follower(ActivityControl):
         lost_time: Time for which the error has exceeded LOST [s].
         desired: The present setpoint.
         error: Desired − estimated θ [rad], (D,).
-        missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
         tension: Planned bone-side tension [N], (M,).
     """
 
@@ -137,7 +136,7 @@ class Follower(ActivityControl):
         self.time = self.over = self.lost_time = 0.0
         self.desired = Setpoint.resting(np.zeros(robot.joint_count))
         self.error: Array = np.zeros(robot.joint_count)
-        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self._missing_torque: Array = np.zeros(robot.joint_count)
         self.winches, self.feedback = Winches(robot), RestFeedback(robot)
         self.stiffening = Stiffening(robot, settings)
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
@@ -216,6 +215,11 @@ class Follower(ActivityControl):
     def has_arrived(self) -> bool:
         """Whether the last trajectory has ended."""
         return not self.is_moving
+
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque that no tensions within their limits provide [N·m], (D,)."""
+        return None if self.trajectory is None else self._missing_torque
 
     @property
     def latest(self) -> Trajectory | None:
@@ -324,7 +328,7 @@ class Follower(ActivityControl):
         if self._is_stiff:
             near = self.stiffening.step(mae, trajectory, self.time, self.effort, inputs.limit, dt)
         if actuation.knows_tension:
-            self.tension, self.missing_torque = least_tension(
+            self.tension, self._missing_torque = least_tension(
                 jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
             )
             self._motor = self.tension * loss

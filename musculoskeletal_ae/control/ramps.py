@@ -101,6 +101,11 @@ class LengthRamps:
         """
         self._robot, self._settings = robot, settings
 
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque that the muscles cannot exert at the present goal [N·m], (D,)."""
+        return None if self.solution is None else self.solution.missing_torque
+
     def is_over_after(self, dt: float) -> bool:
         """Return whether the time of the last goal will have passed in dt [s]."""
         return self._remaining - dt <= 0.0 and not self._goals
@@ -197,6 +202,11 @@ class RampedTarget(ActivityControl):
 
     def leave(self) -> None:
         """End the activity; the target is kept for the next time."""
+
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque that the muscles cannot exert at the present goal [N·m], (D,)."""
+        return self.ramps.missing_torque
 
     def _goals(self) -> list[Goal]:
         chosen, limits = self._settings, self._robot.tension

@@ -5,14 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach, stops
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import Follower
-from musculoskeletal_ae.control.methods import Solution
-from musculoskeletal_ae.control.remedy import REMEDY_STEPS, identifiers, sentence
 from musculoskeletal_ae.control.supervisor import Activity
-from musculoskeletal_ae.control.torque import TorqueControl
+from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
 from musculoskeletal_ae.signals.body_state import KNOWN
@@ -34,8 +31,8 @@ DOING = {
 def report(core: Controller, now: float) -> Report:
     """Return the status for /diagnostics: a stop, else why control waits, else all warnings.
 
-    The values `mode`, `stop cause` and `remedy steps` are stable identifiers for programs. The
-    message and the values `stop` and `remedy` are texts for users.
+    The values `mode`, `stop cause`, `stop causes` and `remedy steps` are stable identifiers for
+    programs. The message and the values `stop` and `remedy` are texts for users.
     """
     supervisor = core.supervisor
     values = {
@@ -48,9 +45,11 @@ def report(core: Controller, now: float) -> Report:
     if condition is not None:
         # Name every cause that is present, with its present details, because each refuses a reset.
         causes = {condition.cause: condition} | {each.cause: each for each in present}
-        text, steps = '; also '.join(map(str, causes.values())), stops.remedy_of(causes)
+        text = '; also '.join(map(str, causes.values()))
+        steps = stops.remedy_of(causes, supervisor.explored)
         values |= {
             'stop cause': condition.cause.identifier,
+            stops.STOP_CAUSES: ', '.join(cause.identifier for cause in causes),
             'stop': text,
             'remedy': sentence(steps),
             REMEDY_STEPS: identifiers(steps),
@@ -82,8 +81,9 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         values['lag of the winches'] = f'{1000.0 * follower.winches.lag:.0f} ms'
         if follower.is_moving and (slow := slowed(follower)):
             warnings.append(f'trajectory {slow}')
-    missing = _missing_torque(core)
-    if np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
+    control = core.activities.of(core.supervisor.activity, core.settings)
+    missing = None if control is None else control.missing_torque
+    if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {m:.2f} {unit.torque}' for n, m, unit in each)
         warnings.append('the target needs more torque than the muscles can exert')
@@ -149,21 +149,6 @@ def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
         if wanted > 0.0 and not low <= wanted <= high:
             text += f', desired {wanted:.2f} clamped'
         values[f'joint stiffness {name}'] = text
-
-
-def _missing_torque(core: Controller) -> Array:
-    """Return the part of the desired torque that the muscles cannot exert [N·m], (D,)."""
-    activities = core.activities
-    source: Follower | TorqueControl | Solution | None
-    if core.is_following:
-        source = activities.follower
-    elif activities.entered is activities.torque:
-        source = activities.torque
-    elif activities.entered is activities.gravity_compensation:
-        source = activities.gravity_compensation
-    else:
-        source = activities.ramps.solution
-    return np.zeros(core.robot.joint_count) if source is None else source.missing_torque
 
 
 def slowed(follower: Follower) -> str:

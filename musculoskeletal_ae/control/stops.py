@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum, IntEnum
+from itertools import chain
 from typing import NamedTuple
 
-from musculoskeletal_ae.control.remedy import REPAIR, Step, sentence
+from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 
 
 class Action(IntEnum):
@@ -216,6 +217,9 @@ class StopCause(Enum):
     )
 
 
+STOP_CAUSES = 'stop causes'  # key of a value in /diagnostics
+
+
 class Condition(NamedTuple):
     """A stop cause that is present, with details such as values and names."""
 
@@ -226,10 +230,26 @@ class Condition(NamedTuple):
         return f'{self.cause.text}: {self.detail}' if self.detail else self.cause.text
 
 
-def remedy_of(causes: Iterable[StopCause]) -> list[Step]:
-    """Return the remedies of all causes in their order; each step once, and the reset last."""
-    steps = dict.fromkeys(step for cause in causes for step in cause.steps)
-    return sorted(steps, key=lambda step: step in LAST)
+def remedy_of(
+    causes: Iterable[StopCause], explored: bool, of_finding: Iterable[Step] = REPAIR
+) -> list[Step]:
+    """Return the remedies of all causes in their order; each step once, and the reset last.
+
+    Args:
+        causes: The causes.
+        explored: Whether the arm explored when it stopped, so that it may explore again.
+        of_finding: Remedy of the estimator's finding, which is part of the remedy of an anomaly.
+    """
+    of_anomaly = *of_finding, Step.RESET_CONTROLLER
+    remedies = (of_anomaly if cause is StopCause.ANOMALY else cause.steps for cause in causes)
+    steps = sorted(dict.fromkeys(chain.from_iterable(remedies)), key=lambda step: step in LAST)
+    return [*steps, Step.EXPLORE] if explored and Step.EXPLORE_GENTLY not in steps else steps
+
+
+def parse(value: str) -> list[StopCause]:
+    """Return the causes in a value `stop causes`; unknown ones are left out."""
+    causes = {cause.identifier: cause for cause in StopCause}
+    return [causes[name] for name in value.split(', ') if name in causes]
 
 
 def table() -> str:

@@ -6,7 +6,8 @@ python -m musculoskeletal_ae.control.stops_page > doc/reference/stops.md
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.control import remedy, stops, supervisor
+from musculoskeletal_ae import remedy
+from musculoskeletal_ae.control import stops, supervisor
 
 INTRODUCTION = """\
 # Why the arm stops, and how to continue
@@ -37,7 +38,7 @@ causes begin together, the first one in this table is reported.
 
 ## Steps of remedies
 
-The value `remedy` of the controller in `/diagnostics` is a sentence for people. The value \
+The value `remedy` in `/diagnostics` is a sentence for people. The value \
 `remedy steps` lists the identifiers of its steps, in order.
 
 {steps}

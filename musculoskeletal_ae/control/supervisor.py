@@ -87,16 +87,17 @@ class Supervisor:
 
     Attributes:
         activity: What the arm does, or will do after a stop.
+        explored: Whether the arm explored when the latched stop began, and no request has replaced
+            the exploration since.
         state: The stop state.
         condition: The reported stop cause; None while running.
     """
 
     def __init__(self) -> None:
-        self.activity = Activity.IDLE
+        self.activity, self.explored = Activity.IDLE, False
         self.state = StopState.RUNNING
         self.condition: Condition | None = None
         self._causes: set[StopCause] = set()  # all latching causes since the stop began
-        self._explored = False  # whether the arm explored when the stop began
         self._clear_for = 0.0  # time without a cause [s]
 
     @property
@@ -140,7 +141,7 @@ class Supervisor:
         """
         if self.is_latched:
             activity = AFTER_A_STOP.get(activity, activity)
-        self.activity, self._explored = activity, False
+        self.activity, self.explored = activity, False
 
     def on_offsets(self, known: bool) -> None:
         """Adapt the activity to whether the length offsets are known.
@@ -200,7 +201,7 @@ class Supervisor:
         """End the stop, or return the first cause that is still present."""
         if present:
             return present[0]
-        self._explored = False
+        self.explored = False
         self._fire(Event.RESET)
         return None
 
@@ -213,23 +214,23 @@ class Supervisor:
             return
         if not self.is_latched:
             self.condition = latching[0]
-            self._explored = self.explores
             self._causes.clear()
         self._causes |= {each.cause for each in latching}
         self._fire(Event.LATCHING_CAUSE)
 
     def _fire(self, event: Event) -> None:
-        before = self.state
+        before, was_latched = self.state, self.is_latched
         self.state = TRANSITIONS.get((before, event), before)
         if self.state is before:
             return
         if self.state is StopState.RUNNING:
-            resumed = before is StopState.RESUMING and self._explored
-            self.condition, self._explored = None, False
+            resumed = before is StopState.RESUMING and self.explored
+            self.condition, self.explored = None, False
             self._causes.clear()
             if resumed:
                 self.activity = Activity.EXPLORING
-        elif self.is_latched:
+        elif self.is_latched and not was_latched:
+            self.explored = self.explores
             self.activity = AFTER_A_STOP.get(self.activity, self.activity)
             if self.condition is not None:  # an auto-recoverable cause has become latched
                 self._causes.add(self.condition.cause)

@@ -32,13 +32,10 @@ class TorqueControl(ActivityControl):
     low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius RACK.
     With both gains zero, only gravity is compensated and `effort` exerted; the arm then does not
     keep its posture.
-
-    Attributes:
-        missing_torque: Torque that the tensions of the last step do not provide [N·m], (D,).
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
-        self.missing_torque: Array = np.zeros(robot.joint_count)
+        self._missing_torque: Array = np.zeros(robot.joint_count)
         self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
         self._command: Array = robot.tension.bias  # last tension command [N], (M,)
         self._smooth: Array | None = None  # low-pass-filtered θ [rad], (D,)
@@ -69,6 +66,11 @@ class TorqueControl(ActivityControl):
     def leave(self) -> None:
         """End the activity; the target is kept for the next time."""
 
+    @property
+    def missing_torque(self) -> Array:
+        """Torque that the tensions of the last step do not provide [N·m], (D,)."""
+        return self._missing_torque
+
     def _command_towards(self, target: Array, effort: Array, inputs: Inputs) -> Command:
         robot, dt = self._robot, inputs.dt
         before = inputs.theta if self._smooth is None else self._smooth
@@ -77,7 +79,7 @@ class TorqueControl(ActivityControl):
         torque = robot.kinematics.holding_torque(smooth) + effort
         torque = torque + self._feedback(smooth, velocity, target)
         jacobian = inputs.mae.muscle_jacobian(smooth, self._command)
-        tension, self.missing_torque = least_tension(
+        tension, self._missing_torque = least_tension(
             jacobian, torque, robot.tension.bias, inputs.limit
         )
         # Scale the changes of all tensions by the same factor. If the old and the new tensions hold

@@ -232,7 +232,7 @@ class Estimator:
         """
         if self.body.offsets.is_suspect:
             if not self.health.joints.agrees:
-                raise MusculoskeletalError(self.cause)
+                raise MusculoskeletalError(f'{self.cause}; {self.suspects.advice}')
             self._use_body(self.body.with_offsets(self._valid_offsets))
         self.health.accept(range(self.robot.muscle_count))
         self._clear(self.suspects.clear(self.body.isolated))

@@ -15,6 +15,7 @@ from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, estimate_of
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.remedy import REPAIR, Step
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
@@ -37,6 +38,13 @@ class Kind(Enum):
 REVOKING = frozenset({Kind.LENGTH_JUMP, Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE})
 
 
+#: remedies of findings that no repair of one muscle removes
+_REMEDIES = {
+    Kind.JOINT_SENSORS_DISAGREE: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
+    **dict.fromkeys(REVOKING, (Step.CALIBRATE_LENGTHS,)),
+}
+
+
 @dataclass(frozen=True)
 class Finding:
     """A fault of one muscle.
@@ -50,6 +58,11 @@ class Finding:
     muscle: int
     kind: Kind
     evidence: str
+
+    @property
+    def remedy(self) -> tuple[Step, ...]:
+        """What ends the anomaly, unless a verification does."""
+        return _REMEDIES.get(self.kind, REPAIR)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.body_state import KNOWN
 
@@ -36,8 +37,7 @@ def report(core: Estimator, now: float) -> Report:
         **_familiarity(core),
     }
     if core.suspects.finding is not None:
-        verifying = '' if core.suspects.verification is None else '; verifying it'
-        text = f'anomaly detected: {core.suspects.cause}{verifying}'
+        text = f'anomaly detected: {core.suspects.cause}; {core.suspects.advice}'
         return Report('error', text, {**values, 'state': 'anomaly'})
     if now - core.stepped_at > SILENCE:
         return Report('warn', 'no muscle_states', {**values, 'state': 'no_muscle_states'})
@@ -80,6 +80,9 @@ def _suspects(core: Estimator) -> dict[str, str]:
     values['finding'] = 'none' if suspects.finding is None else suspects.finding.kind.value
     if suspects.finding is not None:
         values['evidence'] = suspects.finding.evidence
+        if suspects.verification is None:
+            values['remedy'] = sentence(suspects.finding.remedy)
+            values[REMEDY_STEPS] = identifiers(suspects.finding.remedy)
     values['verification'] = 'none' if suspects.verification is None else 'running'
     if suspects.last_verdict is not None:
         values['last verified'] = suspects.last_verification

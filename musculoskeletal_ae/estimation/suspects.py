@@ -37,24 +37,13 @@ from musculoskeletal_ae.estimation.verification import (
     Verdict,
     Verification,
 )
+from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
 #: kinds of findings that no single muscle can cause
 OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
-
-
-CALIBRATE = 'call estimator/zero, which calibrates the lengths again'
-#: remedies for findings about length offsets and joint sensors, for users
-REMEDIES = {
-    Kind.LENGTH_JUMP: CALIBRATE,
-    Kind.LENGTHS_JUMPED: CALIBRATE,
-    Kind.LENGTHS_DISAGREE: CALIBRATE,
-    Kind.JOINT_SENSORS_DISAGREE: (
-        'check the joint sensor and call estimator/reset; if it is correct, call estimator/zero'
-    ),
-}
 
 
 class SuspectHandling:
@@ -80,9 +69,14 @@ class SuspectHandling:
         """The latched finding as a text for users, or ''."""
         if self.finding is None:
             return ''
-        remedy = REMEDIES.get(self.finding.kind, '')
-        what = f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
-        return f'{what}; {remedy}' if remedy else what
+        return f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
+
+    @property
+    def advice(self) -> str:
+        """What ends the anomaly, as a text for users, or ''."""
+        if self.finding is None:
+            return ''
+        return 'verifying it' if self.verification else sentence(self.finding.remedy)
 
     @property
     def last_verification(self) -> str:

@@ -254,7 +254,7 @@ class Estimator(Shell):
             self.published_anomaly = detected
             self.detected.publish(Bool(data=detected))  # first, because it stops the arm
             if detected:
-                text = f'anomaly detected: {self.core.cause}'
+                text = f'anomaly detected: {self.core.cause}; {self.core.suspects.advice}'
             else:
                 text = self.core.suspects.last_verification
             self.get_logger().warning(text)

@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from musculoskeletal_ae.control.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.report import Report
 
 if TYPE_CHECKING:

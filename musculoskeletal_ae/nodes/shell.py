@@ -29,7 +29,6 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import AwakeClock
-from musculoskeletal_ae.control.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
@@ -57,6 +56,7 @@ from musculoskeletal_ae.nodes.sources import (
     Twins,
 )
 from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets

@@ -10,19 +10,19 @@ import contextlib
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
+from musculoskeletal_ae import remedy
 from musculoskeletal_ae.awake_clock import AwakeClock
-from musculoskeletal_ae.control import remedy
-from musculoskeletal_ae.control.remedy import REPAIR, Step
+from musculoskeletal_ae.control import stops
 from musculoskeletal_ae.control.stops import StopCause
-from musculoskeletal_ae.control.supervisor import Activity, StopState
-from musculoskeletal_ae.estimation.finding import REVOKING, Kind
+from musculoskeletal_ae.control.supervisor import StopState
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.sources import SEVERAL
+from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
 from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
 
 LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
@@ -40,16 +40,8 @@ VERSION = 'checkpoint version'  # key of the version in reports
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
-ACTIVITIES = {activity.value for activity in Activity}
-#: steps that help against a kind of finding; `REPAIR` against all others
-FINDING_STEPS = {
-    Kind.JOINT_SENSORS_DISAGREE.value: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
-    **{kind.value: (Step.CALIBRATE_LENGTHS,) for kind in REVOKING},
-}
 #: steps that help against a length calibration that does not end
 CALIBRATION_STEPS = Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS
-REPAIR_STEPS = {step.identifier for step in REPAIR}
-EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value
 
 
 def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
@@ -71,7 +63,7 @@ class Trouble(NamedTuple):
     """One part of the status line: a problem with its remedy."""
 
     text: str
-    steps: tuple[str, ...] = ()  # identifiers of the remedy's steps
+    steps: tuple[Step, ...] = ()  # the remedy
 
 
 class Node:
@@ -115,7 +107,6 @@ class Situation:
         self._finding = ''  # kind of the estimator's finding or 'none'; '' if it is unknown
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
-        self._has_explored = False  # whether the arm explored before the last stop
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
         #: version of a node's other network and the number of reports that name it, by node
         self._other_networks: dict[str, tuple[str, int]] = {}
@@ -148,8 +139,6 @@ class Situation:
                 self._accepted.append(node.values.get(VERSION, ''))
             elif name == 'controller':
                 self.doing = node.message
-                if node.values.get('mode') in ACTIVITIES:
-                    self._has_explored = node.values['mode'] in EXPLORING
             if name in FOLLOWERS:
                 self._compare_network(name, node.values.get(VERSION, ''))
 
@@ -185,12 +174,9 @@ class Situation:
         return ', '.join(trouble.text for trouble in self._troubles())
 
     def steps(self) -> list[str]:
-        """Return the identifiers of the steps that `trouble` advises, each once.
-
-        They are those of `control.remedy.Step`.
-        """
+        """Return the identifiers of the steps that `trouble` advises (`remedy.Step`), each once."""
         steps = (step for trouble in self._troubles() for step in trouble.steps)
-        return list(dict.fromkeys(steps))
+        return [step.identifier for step in dict.fromkeys(steps)]
 
     def _troubles(self) -> list[Trouble]:
         others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
@@ -207,7 +193,7 @@ class Situation:
             if node.level == DiagnosticStatus.WARN:
                 warnings.append(Trouble(f'warning: {name}: {node.message}'))
             else:
-                steps = remedy.parse(node.values.get(remedy.REMEDY_STEPS, ''))
+                steps = remedy.parse(node.values.get(REMEDY_STEPS, ''))
                 errors.append(Trouble(f'{name}: {node.message}', steps))
         return [*self._stops(), *others, *errors, *self._body(), *warnings]
 
@@ -234,19 +220,17 @@ class Situation:
 
     def _stops(self) -> list[Trouble]:
         """Return the parts of the status line about an anomaly and a stop."""
-        control = self._values('controller')
-        mode, cause = control.get('mode'), control.get('stop cause')
+        control, estimator = self._values('controller'), self._values('estimator')
+        mode, cause = control.get('mode'), control.get('stop cause', '')
         # The estimator may report a verification before the controller does.
-        is_verifying = (
-            mode == VERIFYING or self._values('estimator').get('verification') == 'running'
-        )
+        is_verifying = mode == VERIFYING or estimator.get('verification') == 'running'
         is_stopped = mode in (STOPPED, VERIFYING)
         is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
-        stop_steps = remedy.parse(control.get(remedy.REMEDY_STEPS, '')) if is_stopped else ()
+        causes = stops.parse(control.get(stops.STOP_CAUSES, cause))
         # The remedy of the stop is shown once if the anomaly is one of its causes.
-        is_in_stop = is_stopped_by_anomaly or set(stop_steps) >= REPAIR_STEPS
+        is_in_stop = is_stopped and StopCause.ANOMALY in causes
         evidence = f': {self.evidence}' if self.evidence else ''
-        of_finding = FINDING_STEPS.get(self._finding, REPAIR) if self.detected else ()
+        of_finding = remedy.parse(estimator.get(REMEDY_STEPS, '')) or REPAIR
         troubles = []
         if self.detected and is_verifying:
             troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified{evidence}'))
@@ -255,13 +239,12 @@ class Situation:
         elif self.detected:
             troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
         if is_stopped and not (is_verifying and is_stopped_by_anomaly):
-            text, steps = control.get('remedy', ''), stop_steps
-            if self._finding and set(steps) >= REPAIR_STEPS:
+            text, steps = control.get('remedy', ''), remedy.parse(control.get(REMEDY_STEPS, ''))
+            if is_in_stop and self._finding:
                 # The estimator knows the kind of the finding, and whether it is over.
-                known = _with_steps_of_finding(steps, of_finding)
-                text, steps = remedy.sentence(known), tuple(step.identifier for step in known)
-            if self._has_explored and Step.EXPLORE_GENTLY.identifier not in steps:
-                text, steps = f'{text}; {Step.EXPLORE.text}', (*steps, Step.EXPLORE.identifier)
+                explored, known = Step.EXPLORE in steps, of_finding if self.detected else ()
+                steps = tuple(stops.remedy_of(causes, explored, known))
+                text = remedy.sentence(steps)
             stop = control.get('stop', cause)
             troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
         return troubles
@@ -343,14 +326,5 @@ def _is_own(name: str) -> bool:
     return name.rpartition('/')[2] == 'bringup_status'
 
 
-def _with_steps_of_finding(steps: Iterable[str], of_finding: Iterable[Step]) -> list[Step]:
-    """Return the steps of a remedy with those of `REPAIR` replaced by those of the finding."""
-    by_identifier, known = {step.identifier: step for step in Step}, list[Step]()
-    for identifier in steps:
-        known += of_finding if identifier in REPAIR_STEPS else [by_identifier[identifier]]
-    return list(dict.fromkeys(known))
-
-
 def _with_remedy(text: str, *steps: Step) -> Trouble:
-    names = tuple(step.identifier for step in steps)
-    return Trouble(f'{text} (to go on: {remedy.sentence(steps)})', names)
+    return Trouble(f'{text} (to go on: {remedy.sentence(steps)})', steps)

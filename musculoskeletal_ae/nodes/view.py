@@ -30,12 +30,13 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import EXPLORING, LARGEST_AGE, Situation, figures
+from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -71,6 +72,7 @@ TRIGGERS = (
 )  # fmt: skip
 SERVICES = {'controller/explore': SetBool, **dict.fromkeys(TRIGGERS, Trigger), GET: GetParameters}
 SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
+EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value  # values of controller_mode
 #: service of each node whose availability shows that the node is running
 SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
 
@@ -92,7 +94,7 @@ class View(Node):
         self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
         self.page = page.Page(robot, *address, options.read_only, request)
-        for note in self.page.notes:
+        for note in self.page.scene.notes:
             self.get_logger().warning(f'mesh omitted: {printable(note)}')
         self.situation = Situation(self.get_namespace())
         self.reception = Reception(lambda text: self.get_logger().warning(text))

@@ -321,6 +321,22 @@ def test_a_stop_is_reported_with_every_cause_that_refuses_the_reset():
     assert bench.core.reset(bench.now).cause.identifier == 'second_publisher'
 
 
+@pytest.mark.parametrize('silent', [False, True])
+def test_after_a_stop_of_the_exploration_the_remedy_ends_with_exploring_again(silent):
+    bench = Bench(max_age=0.2, hold_time=0.5)
+    bench.core.explore(True)
+    bench.step(50)
+    if silent:  # an auto-recoverable cause, which becomes latched when the arm is released
+        bench.blind = {'muscles'}
+        bench.step(80)
+        assert bench.cause == 'stale_muscle_states'
+    else:
+        bench.stop()
+    assert bench.report().values['remedy steps'].endswith('reset_controller, explore')
+    bench.core.explore(False)
+    assert 'explore' not in bench.report().values['remedy steps']
+
+
 def test_a_new_network_keeps_the_correction_of_rest_feedback():
     bench = Bench(first_duration=0.5)
     bench.target(REST)

@@ -107,7 +107,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     assert robot.isolated == ()  # other parts share this object, so it must not change
     values = loop.core.report(loop.now).values
     assert values['finding'] in ('residual_distance', 'slack_tendon')
-    assert values['verification'] == 'running'
+    assert values['verification'] == 'running' and 'remedy steps' not in values
     loop.command[2] -= 0.003
     loop.step(cut, 100)
     assert loop.core.cause == ''
@@ -165,6 +165,15 @@ def test_a_reset_during_verification_restores_the_suspect(loop, healthy, cut):
     loop.core.reset()
     assert loop.core.body.isolated == ()
     assert loop.core.cause == ''
+
+
+def test_without_a_verification_the_report_names_the_remedy(loop, healthy, cut):
+    loop.core.configure(Detection(on_anomaly='stop'))
+    loop.step(healthy, 30)
+    loop.step(cut, 20)
+    report = loop.core.report(loop.now)
+    assert report.values['remedy steps'] == 'repair_muscle, reset_estimator'
+    assert report.message.endswith('repair the muscle; call estimator/reset')
 
 
 def test_a_suspect_restored_during_verification_leaves_the_anomaly_latched(loop, healthy, cut):

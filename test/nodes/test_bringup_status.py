@@ -8,11 +8,12 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import JointState
 
-from musculoskeletal_ae.control.remedy import identifiers
 from musculoskeletal_ae.control.stops import Condition, StopCause, remedy_of
+from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.remedy import identifiers, sentence
 
 
 def diagnostics(
@@ -66,14 +67,25 @@ def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
     assert 'error waits for joint_states' in capsys.readouterr().out
 
 
-def stopped(cause, mode='stopped'):
+def found(kind, **more):
+    """Return the report of a finding of this kind, or of none, by the estimator in /left."""
+    values = {'finding': 'none'}
+    if kind is not None:
+        steps = Finding(0, kind, '').remedy
+        values = {'finding': kind.value, 'remedy_steps': identifiers(steps)}
+    return diagnostics('/left/estimator', suspect_muscle='biceps', **values, **more)
+
+
+def stopped(cause, mode='stopped', also=(), explored=False):
     """Return the report of a stop by the controller in /left."""
+    steps = remedy_of([cause, *also], explored)
     values = {
         'mode': mode,
         'stop_cause': cause.identifier,
+        'stop_causes': ', '.join(each.identifier for each in (cause, *also)),
         'stop': str(Condition(cause)),
-        'remedy': cause.remedy,
-        'remedy_steps': identifiers(cause.steps),
+        'remedy': sentence(steps),
+        'remedy_steps': identifiers(steps),
     }
     return diagnostics(
         '/left/controller', f'stopped: {cause.text}', DiagnosticStatus.ERROR, **values
@@ -110,8 +122,7 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     situation.diagnosed(diagnostics('/left/estimator', **suspect, d='12.5', d_limit='9.0'))
     assert (situation.distance, situation.limit) == (12.5, 9.0)
     assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # no controller has reported
-    situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
-    situation.diagnosed(stopped(StopCause.ANOMALY))
+    situation.diagnosed(stopped(StopCause.ANOMALY, explored=True))
     assert situation.trouble() == (
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
         'call estimator/reset; call controller/reset; call controller/explore to explore again)'
@@ -140,33 +151,40 @@ def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_e
 @pytest.mark.parametrize(
     ('kind', 'first'),
     [
-        ('joint_sensors_disagree', 'check the named sensor'),
-        ('lengths_jumped', 'call estimator/zero'),
-        ('slack_tendon', 'repair the muscle'),
-        ('none', 'call controller/reset'),  # the cause of the stop is over
+        (Kind.JOINT_SENSORS_DISAGREE, 'check the named sensor'),
+        (Kind.LENGTHS_JUMPED, 'call estimator/zero'),
+        (Kind.SLACK_TENDON, 'repair the muscle'),
+        (None, 'call controller/reset'),  # the cause of the stop is over
     ],
 )
 def test_the_remedy_of_an_anomaly_is_that_of_its_kind(kind, first):
     situation = Situation('/left')
-    situation.diagnosed(diagnostics('/left/estimator', finding=kind, suspect_muscle='biceps'))
+    situation.diagnosed(found(kind))
     situation.diagnosed(stopped(StopCause.ANOMALY))
     _, _, remedy = situation.trouble().partition('STOPPED: anomaly detected (to go on: ')
     assert remedy.startswith(first) and 'call controller/reset' in remedy
-    assert (kind == 'slack_tendon') == ('repair' in situation.trouble())
+    assert (kind is Kind.SLACK_TENDON) == ('repair' in situation.trouble())
+
+
+def test_the_remedy_of_an_anomaly_is_that_of_its_kind_also_beside_other_causes():
+    situation = Situation('/left')
+    situation.diagnosed(found(Kind.LENGTHS_JUMPED))
+    situation.diagnosed(
+        stopped(StopCause.ANOMALY, also=[StopCause.LENGTH_OFFSETS_REVOKED, StopCause.OVERHEATED])
+    )
+    assert situation.steps() == [
+        'calibrate_lengths', 'wait_until_cool', 'reset_controller', 'explore_gently'
+    ]  # fmt: skip
 
 
 def test_the_remedy_of_several_causes_repairs_nothing_if_only_lengths_are_off():
     causes = (
         StopCause.IMPLAUSIBLE_MUSCLE_STATES, StopCause.ANOMALY, StopCause.LENGTH_OFFSETS_REVOKED
     )  # fmt: skip
-    steps = remedy_of(causes)
     situation = Situation('/left')
-    situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
-    lengths = {'finding': 'lengths_jumped', 'unknown_length_offsets': 'biceps'}
-    situation.diagnosed(diagnostics('/left/estimator', **lengths))
-    situation.diagnosed(
-        diagnostics('/left/controller', mode='stopped', remedy_steps=identifiers(steps))
-    )
+    situation.diagnosed(found(Kind.LENGTHS_JUMPED, unknown_length_offsets='biceps'))
+    first, *also = causes
+    situation.diagnosed(stopped(first, also=also, explored=True))
     assert situation.steps() == [
         'check_sensor', 'calibrate_lengths', 'reset_controller', 'explore_gently'
     ]  # fmt: skip

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declares the steps of remedies: identifiers for programs, and texts for users.
 
-A remedy is a sequence of steps, to be taken in order. /diagnostics contains it twice: the value
-`remedy` is a text for users, and `remedy steps` lists the identifiers.
+A remedy is a sequence of steps, to be taken in order. It is declared where the problem is: for stop
+causes in `control/stops.py`, for findings in `estimation/finding.py`. /diagnostics contains it
+twice: the value `remedy` is a text for users, and `remedy steps` lists the identifiers.
 """
 
 from collections.abc import Iterable
@@ -54,6 +55,7 @@ class Step(Enum):
     REPORT_LOG = 'report_log', 'report the error with the log of the controller'
 
 
+STEPS = {step.identifier: step for step in Step}  # by identifier
 REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics
 #: remedy for an anomaly
 REPAIR = Step.REPAIR_MUSCLE, Step.RESET_ESTIMATOR
@@ -69,9 +71,9 @@ def identifiers(steps: Iterable[Step]) -> str:
     return ', '.join(step.identifier for step in steps)
 
 
-def parse(value: str) -> tuple[str, ...]:
-    """Return the identifiers in a value `remedy steps`; unknown ones are kept."""
-    return tuple(filter(None, value.split(', ')))
+def parse(value: str) -> tuple[Step, ...]:
+    """Return the steps in a value `remedy steps`; unknown ones are left out."""
+    return tuple(STEPS[name] for name in value.split(', ') if name in STEPS)
 
 
 def table() -> str:
