@@ -32,7 +32,8 @@ class Settings:
     first_duration: float = settable(
         5.0,
         'duration of the movement to the target after a stop, and of the first movement with '
-        'method `geometric`, `first` or `second` (preset paper: also `proposed`)',
+        'method `geometric`, `first` or `second` (with presets other than `default`: also '
+        '`proposed`)',
         's',
         0.1,
         60.0,
