@@ -22,9 +22,11 @@ if worker := os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw'):
 # A shell makes its background processes ignore Ctrl-C; processes of tests would inherit this.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The first example loads compiled code, so examples have no deadline.
-settings.register_profile('no deadline', deadline=None)
-settings.load_profile('no deadline')
+# The first example loads compiled code, so examples have no deadline. Every run tries the same
+# examples; `./test.sh --hypothesis-profile search` tries new ones.
+settings.register_profile('search', deadline=None)
+settings.register_profile('repeatable', deadline=None, derandomize=True)
+settings.load_profile('repeatable')
 
 
 def pytest_collection_modifyitems(items: list[Any]) -> None:

@@ -187,7 +187,9 @@ class CommandLimiter:
         limit = np.minimum(tension_limit, self._robot.description.tension.limit)
         limit = self._certain(limit, sample)
         if kind == TENSION:
-            value = np.clip(value, self._robot.tension.bias, limit)
+            # The command of an isolated muscle is below T_bias; it rises at the limited rate.
+            least = np.minimum(self._robot.tension.bias, before)
+            value = np.clip(value, least, limit)
         else:
             shortest = self._shortest(before, change, sample, limit, dt)
             is_relaxed = sample.motor_tension * sample.usable <= limit

@@ -69,6 +69,23 @@ def test_the_lead_of_a_winding_muscle_demands_more_only_while_its_tension_is_bel
     assert (demanded(limit + 1.0, lead) <= limit).all()
 
 
+def test_the_tension_of_a_restored_muscle_rises_at_the_rate_limit():
+    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
+    wanted = Command(TENSION, np.full(COUNT, 2.0 * BIAS))
+    limiter.limit(wanted, now, LIMIT, DT)
+    limiter.use(ROBOT.without([0]), Settings())
+    for _ in range(30):
+        before = limiter.limit(Command(TENSION, np.zeros(COUNT)), now, LIMIT, DT).value
+    assert before[0] < BIAS
+    limiter.use(ROBOT, Settings())
+    largest = limiter.largest_change(TENSION, DT)
+    for _ in range(30):
+        sent = limiter.limit(wanted, now, LIMIT, DT).value
+        assert (sent - before <= largest + 1e-9).all()
+        before = sent
+    np.testing.assert_allclose(before, 2.0 * BIAS)
+
+
 def test_wrong_lengths_without_a_matching_tension_pay_out_at_the_rate_limit():
     limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
     held = unchanging(ROBOT, LENGTH, now)
