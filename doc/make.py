@@ -267,20 +267,17 @@ def estimates_table() -> str:
 
 
 def capabilities_table() -> str:
-    """Return the table of capabilities in README, with both emulator models."""
-    kin, foreign = (read(FOLDER / 'results' / folder) for folder in ('', 'foreign'))
-    lines = ['| capability | `kin` | `foreign` | experiment |', '|---|---|---|---|']
+    """Return the table of capabilities in README."""
+    results = read(FOLDER / 'results')
+    lines = ['| capability on `kin` | result | experiment |', '|---|---|---|']
     for what, text, name in CAPABILITIES:
-        cells = [_with_numbers(text, results.get(name)) for results in (kin, foreign)]
-        which = individuals(kin[name]['about']['seeds'])
-        lines.append(f'| {what} | {" | ".join(cells)} | `{name}`, {which} |')
+        which = individuals(results[name]['about']['seeds'])
+        lines.append(f'| {what} | {_with_numbers(text, results[name])} | `{name}`, {which} |')
     return '\n'.join(lines)
 
 
-def _with_numbers(text: str, result: dict[str, Any] | None) -> str:
+def _with_numbers(text: str, result: dict[str, Any]) -> str:
     """Return a text with the numbers of a result and with counts that follow from them."""
-    if result is None:
-        return '–'
     numbers = dict(result)
     numbers['hours'] = result.get('healthy_s', 0.0) / 3600.0
     if 'named_share' in result:
