@@ -173,7 +173,7 @@ def _sourced(site: Site) -> None:
         'the prefix of ROS',
         f'{system_python} -m venv {jazzy}',
         f'{jazzy}/bin/python -m pip install --no-compile -r {ROS_REQUIREMENTS}',
-        # Packages of the system on Ubuntu.
+        # On Ubuntu these are packages of the system, so the prefix of ROS does not contain them.
         f'{jazzy}/bin/python -m pip uninstall -y numpy PyYAML lark-parser empy setuptools',
         f'rm {jazzy}/bin/python* {jazzy}/pyvenv.cfg',
     )

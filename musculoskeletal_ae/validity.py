@@ -199,7 +199,8 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
         raise MessageError('not finite', 'an acceleration')
     norm = float(np.linalg.norm(acceleration))
     if not LEAST_GRAVITY <= norm <= MOST_GRAVITY:
-        raise MessageError('no gravity', f'{norm:.3g} m/s², an IMU at rest measures 9.81')
+        legal = f'{LEAST_GRAVITY:g} to {MOST_GRAVITY:g} (an IMU at rest measures 9.81)'
+        raise MessageError('implausible gravity', f'{norm:.3g} m/s²; legal: {legal}')
     return link, acceleration
 
 

@@ -284,7 +284,7 @@ def test_a_twist_is_in_the_root_link_finite_and_not_absurd():
 
 @pytest.mark.parametrize(
     ('acceleration', 'reason'),
-    [(math.nan, 'not finite'), (0.1, 'no gravity'), (40.0, 'no gravity')],
+    [(math.nan, 'not finite'), (0.1, 'implausible gravity'), (40.0, 'implausible gravity')],
 )
 def test_an_acceleration_that_is_no_gravity_is_refused_with_the_reason(acceleration, reason):
     message = Imu()

@@ -105,7 +105,7 @@ class _Stream:
     values: list[Array] = field(default_factory=list)
 
     def take(self, message: tuple[float, Any]) -> None:
-        """Add a message, a pair of time [s] and content."""
+        """Add a message, given as (time [s], content)."""
         came, content = message
         self.values.append(self.read(content, came))
         self.times.append(came)

@@ -98,7 +98,7 @@ class Activities:
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.
 
-        In the description, isolated muscles have no tension.
+        `robot` must already describe isolated muscles as muscles without tension.
         """
         for part in (
             self.ramps,

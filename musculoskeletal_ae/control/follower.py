@@ -91,8 +91,8 @@ class Stiffening:
     ) -> Array:
         """Return T_K [N], (M,).
 
-        T_K changes slowly: trajectories may use the fraction SHARE of the rate limit, and T_K uses
-        the rest.
+        Its change per step is limited: the lengths of trajectories may use the fraction SHARE of
+        the rate limit, so only the rest is left for T_K.
         """
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt
@@ -104,7 +104,7 @@ class Stiffening:
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near
             self.solution = solution
-        # Use half of that part, because the series elastic elements stretch as well.
+        # Use half of that rest, because the series elastic elements stretch as well.
         actuation = robot.actuation
         rates = actuation.fastest(settings.rate_limit) * actuation.tension_per_length(self._near)
         largest = 0.5 * (1.0 - SHARE) * rates * dt
@@ -152,7 +152,7 @@ class Follower(ActivityControl):
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.
 
-        In the description, isolated muscles have no tension.
+        `robot` must already describe isolated muscles as muscles without tension.
         """
         self._robot, self._settings = robot, settings
         self.winches.use(robot)

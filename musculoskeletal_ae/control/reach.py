@@ -275,7 +275,7 @@ class Roadmap:
 def _random_postures(robot: Robot, start: Array) -> Array:
     """Return random postures [rad] (POSTURES, D).
 
-    In a part of them, joints that rest at a stop at the start stay there.
+    A joint that is at a stop in `start` is placed at that stop in 30 % of the postures.
     """
     rng = np.random.default_rng(0)
     at_stop = AT_STOP * robot.kinematics.radian

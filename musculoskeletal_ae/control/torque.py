@@ -44,7 +44,7 @@ class TorqueControl(ActivityControl):
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.
 
-        In the description, isolated muscles have no tension.
+        `robot` must already describe isolated muscles as muscles without tension.
         """
         self._robot, self._settings = robot, settings
 

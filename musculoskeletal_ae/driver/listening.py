@@ -50,7 +50,7 @@ HOTTEST_AT_REST = 55.0  # highest temperature of modules without commands [°C];
 ZERO_TOLERANCE = 0.045  # largest length offset of a healthy arm [m]
 SLOPES = 0.2, 2.2  # legal range of the change of l, divided by that of the model
 MISPLACED = 0.012  # misfit to its own muscle from which a column can be misplaced [m]
-BETTER = 2.5  # another muscle must fit better by this factor
+BETTER = 2.5  # a column is misplaced only if another muscle fits it better by this factor
 MOVED = 0.04  # range of l from which its sign and slope can be checked [m]
 #: fraction of the misfit that may remain if angles instead of lengths are wrong
 JOINTS_BETTER = 0.8

@@ -147,7 +147,7 @@ class Winding(MotionTest):
     def _demanded(self, length: Array) -> Array:
         """Return the tensions that the commands demand at l [m] (..., M), [N] (..., M)."""
         demand = self._robot.actuation.demanded(length, self._target)
-        assert demand is not None  # such modules are tested by `Positioning`
+        assert demand is not None  # None: modules that follow positions; `Positioning` tests them
         return demand
 
     def _mean(self) -> _Reading:

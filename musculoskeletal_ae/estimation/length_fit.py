@@ -230,7 +230,8 @@ class LengthFit:
         length, outside = self._mae.lengths(theta, end), self._outside(theta)
         unbalanced, jacobian = self._torque(theta, pull)
         torque = unbalanced + joint_friction * turning
-        # A stop carries any torque, so a joint at its stop has the cost of a typical residual.
+        # A stop can carry any torque, so the residual of a joint at its stop means nothing. It is
+        # replaced by a typical one, so that the fit neither seeks nor avoids stops.
         at_stop = AT_STOP * self._radian
         is_free = (self._robot.lower + at_stop < theta) & (theta < self._robot.upper - at_stop)
         torque = np.where(is_free, torque, self._torque_noise)

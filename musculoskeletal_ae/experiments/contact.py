@@ -70,7 +70,7 @@ class ContactLoop(ClosedLoop):
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Push an individual that has learned, at rest, in motion and under gravity compensation."""
+    """Push a learned individual at rest, in motion and under gravity compensation."""
     robot, rng = study.robot, np.random.default_rng([seed, CONTACT_STREAM])
     settings, share = Settings(first_duration=2.0), 0.005 if study.quick else 1.0
     loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed)

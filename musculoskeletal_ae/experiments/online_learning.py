@@ -286,8 +286,9 @@ def online_learning(study: Study, rows: Rows) -> Plot:
         panel.set_ylim(bottom=0.0)
     return figure, (
         'Left: estimation error during online learning (10 s running means; bold: mean over '
-        f'individuals {", ".join(map(str, rows))}, pale: each individual), with the exponential '
-        'fit of the paper. Right: error on the held-out motion after every update.'
+        f'individuals {", ".join(map(str, rows))}, pale: each individual). Dashed: an '
+        'exponential fit to the mean, as in the paper (§IV-A). Right: error on the held-out motion '
+        'after every update.'
     )
 
 

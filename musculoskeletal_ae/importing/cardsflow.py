@@ -213,7 +213,7 @@ def _read_sdf(
     if root.tag != 'sdf' or model is None:
         raise refuse(file, 'expected an <sdf> element with a <model>')
     if len([*root.iter('model')]) > 1 or model.find('include') is not None:
-        raise refuse(file, 'expected a single model without <include>; merge them into one')
+        raise refuse(file, 'expected a single <model> without <include>; merge all models into one')
     version = [int(part) for part in root.get('version', '1.6').split('.')]
     frame_of_axis = (
         '1' if version < [1, 5] else '0'

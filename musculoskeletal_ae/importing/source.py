@@ -371,7 +371,8 @@ def urdf(source: Source) -> str:
     carriers = {0: root}  # link of each joint
     if not upright.isIdentity(1e-9):
         (carriers[0],) = distinct([f'{root}_upright'], source.links)
-        source.note('chosen', f'link {carriers[0]}: the root, upright; {root} as it rests')
+        reason = f'because the z axis of the root must point upwards, and {root} is rotated'
+        source.note('chosen', f'link {carriers[0]} was added as the root, {reason}')
     for link in source.links:
         joint, at = source.place(link)
         if joint and at.isIdentity(1e-9):

@@ -152,8 +152,8 @@ class GroupFit:
         with such a prior may still differ in those properties.
         """
         prior = self.prior
-        # Errors of the body model are common to all samples, so fewer samples count as independent
-        # (`priors.INDEPENDENT_SAMPLES`).
+        # Errors of the body model are common to all samples, so all samples together count as at
+        # most `priors.INDEPENDENT_SAMPLES` independent ones.
         self._weights = self._weights._replace(torque=self._weights.torque / prior.unread)
         prior.repeated = prior.repeated * prior.unread
         equations = self.equations(point)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals of measured states after the estimate by ②, and their statistics on a healthy arm.
+"""Residuals: T and l restored by ②, minus the measured ones; their statistics on a healthy arm.
 
     e = (T_est − T, l_est − l)                        scaled units, shape (2M,)
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, §III-D, eq. 4)

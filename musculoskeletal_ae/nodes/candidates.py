@@ -60,8 +60,8 @@ class Candidates:
         before = self.validator.anomaly(detected, time.monotonic())
         if before is not None:
             self._node.get_logger().warning(
-                f'an anomaly followed the new network; checkpoint version {before.version} is used '
-                'again'
+                'an anomaly was detected soon after a new network was accepted; returned to '
+                f'checkpoint version {before.version}'
             )
             self._use(before)
             self._publish(before)

@@ -163,7 +163,10 @@ class Shell(Node):
         return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
 
     def clock_jumped_back(self) -> None:
-        """Forget buffers, rates and filters; latches stay."""
+        """Discard buffers, rates and filters after the ROS clock has jumped back.
+
+        Latched anomalies and stops have to stay.
+        """
         if self.core:
             self.core.clock_jumped_back()
 

@@ -64,7 +64,10 @@ class StopRecording:
         self.saved: Path | None = None  # directory of the last recording
 
     def heard(self, topic: str, data: bytes) -> None:
-        """Keep a message, in CDR, of one of the topics; count it if it is too large."""
+        """Keep a serialized message (CDR) of one of the topics.
+
+        If it is too large, only count it in `left_out`.
+        """
         if len(data) > LARGEST_MESSAGE:
             self.left_out += 1
             return

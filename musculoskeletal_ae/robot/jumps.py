@@ -48,7 +48,12 @@ def _second_differences(
 
 
 def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
-    """Return which of the M lengths that `lengths` computes from θ jump within the limits, (M,)."""
+    """Return a mask (M,) of the lengths that jump somewhere within the joint limits.
+
+    Args:
+        lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
+        robot: The geometric model, for its joint limits.
+    """
     return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 

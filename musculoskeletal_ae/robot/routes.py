@@ -265,7 +265,9 @@ class Routes:
             _, leave, arrive = self._wrapped(poses, points)
             pull[:, self.wrapping] = 0.0
             pull = np.concatenate([pull, leave, arrive], axis=1)
-        # d · (a × (p − o)) = a · (p × d) + (o × a) · d
+        # A turn about the axis a through o moves a point p along the direction d of the tendon by
+        #     d · (a × (p − o)) = a · (p × d) + (o × a) · d
+        # where d is `pull`, p is `at`, a is `axis` and o is `origin`.
         axis, origin = poses.axis[:, 1:], poses.translation[:, 1:]
         slides = kin.tree.prismatic[1:, None]
         turn, shift = np.where(slides, 0.0, axis), np.where(slides, axis, np.cross(origin, axis))

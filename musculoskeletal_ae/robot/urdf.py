@@ -145,8 +145,9 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[str]:
 def _limit_mimics(parts: list[ET.Element]) -> bool:
     """Change continuous joints with <mimic> into revolute ones; return whether there are any.
 
-    A mimic joint needs no limits of its own. Pinocchio represents a continuous joint by two
-    coordinates, which cannot follow a single one.
+    Pinocchio represents a continuous joint by two coordinates, which cannot follow the single
+    coordinate of the mimicked joint. A revolute joint must have limits. They are so wide that they
+    never act, because the limits of the mimicked joint suffice.
     """
     followers = [
         part

@@ -49,8 +49,9 @@ class Transmission:
         T = max(0, e^γ T_read − b − F s),   T_end = T e^{−μ s}
 
     A tension sensor reads T itself. A motor current, converted to T_read [N] by
-    `robot.tension_source`, has an error of scale γ and an offset b. It also drives the friction F
-    of motor and gear, which opposes the motion. It can be negative, but a tendon does not push.
+    `robot.tension_source`, has an error of scale γ and an offset b. Part of the current overcomes
+    the friction F of motor and gear, which opposes the motion (s: module docstring). The converted
+    current can be negative, but T cannot, because a tendon does not push.
 
     γ, b and F are uncertain. So is the direction of friction while it reverses (|s| < 1):
 

@@ -150,7 +150,8 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
         kind = 'held out' if path in args.hold_out else 'learned from'
         after = error(learner.mae, pairs)
         change = f'{before[path]:.4f} → {after:.4f} {robot.kinematics.distance_unit}'
-        print(f'{path} ({kind}): {change} against its joint sensors')
+        note = 'before → after learning; reference: the recorded joint sensors'
+        print(f'{path} ({kind}): joint-angle error {change} ({note})')
         if path not in args.hold_out:
             continue
         if warning := anomaly_in(robot, pairs, learner.mae, args.preset):
@@ -315,7 +316,7 @@ def table(errors: list[PairError], title: str) -> str:
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:
-    """Return a table of every joint's mean absolute error, estimated from (T, l)."""
+    """Return a table of the mean absolute error of each joint angle, by estimates from (T, l)."""
     estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
     rows = zip(robot.joints, estimates['theta'], robot.units)

@@ -114,5 +114,7 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
     finally:
         server.serve = serve  # type: ignore[misc]
     if not served:
-        problem = 'visits to the page of this version of viser cannot be checked'
-        raise MusculoskeletalError(f'{problem}; install the version in .ci/requirements-view.txt')
+        raise MusculoskeletalError(
+            'this version of viser serves its page in an unknown way, so requests of other web '
+            'sites could not be refused; install the version in .ci/requirements-view.txt'
+        )

@@ -47,7 +47,8 @@ def test_with_an_exact_body_image_the_arm_settles_at_the_target_with_the_least_t
         arm.command_length(solution.length)
         arm.step(0.02)
     assert np.linalg.norm(arm.theta - theta) < 0.01
-    # The tendon's stretch grows with its length, which lowers its torque by up to 0.5 %.
+    # A longer tendon stretches more. This reduces the torque of a muscle by up to 0.5 %, and raises
+    # the tension that is needed.
     assert np.linalg.norm(solution.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
     assert not solution.missing_torque.any()
 

@@ -145,7 +145,7 @@ class AgreementCheck:
         return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
 
     def _shape(self, mae: Mae) -> Comparison:
-        """Compare the changes of all lengths over the fixed states."""
+        """Compare the shape: how l by ① varies over the fixed states, by the two networks."""
         theta, tension = self._postures.theta, self._postures.tension
         used = np.delete(np.arange(self._robot.muscle_count), self._isolated)
         new, old = (each.lengths(theta, tension)[:, used] for each in (mae, self._in_use))

@@ -6,17 +6,19 @@
 
 The lengths of a real arm differ from the model's by centimetres, so ② and ③ are compared with the
 lengths of ① rather than with the model's. Most of the difference is elongation, because a series
-elastic element may be much softer than its model. ① is therefore compared with lengths
-of the model whose elongation is multiplied, for each muscle, by the factor that fits the slope of
-the differences over the elongation. Constant differences of lengths do not change the slope.
+elastic element may be much softer than its model. ① is therefore compared with softened lengths of
+the model: the elongation of each muscle is multiplied by one factor, which is fitted to the
+differences between ① and the model. Differences that are the same in all states do not change it.
 
-The scale is the common factor of all route lengths by ①, with the same elongations removed. Errors
-of single muscles average out: the scale was 0.84 to 1.11 for healthy networks of both presets, on
-both shipped robots and both emulator models. Its error is the difference from 1.
+A further check is the *scale*. It removes the elongations and fits one factor between all route
+lengths by ① and those of the model. Errors of single muscles average out: the scale was 0.84 to
+1.11 for healthy networks of both presets, on both shipped robots and both emulator models. The
+error of the scale is its distance from 1.
 
 The relative error of a joint or muscle is its root mean square error divided by the standard
-deviation of the true values. A network with a constant output has a relative error of 1. LIMITS
-holds the largest permitted values.
+deviation of the true values. A network with a constant output has a relative error of 1. The *mean
+error* of a joint is the magnitude of its mean difference, divided by the same standard deviation.
+LIMITS holds the largest permitted values.
 
 Where muscles determine a joint only poorly, for example because several postures have the same
 lengths, a relative error of θ up to UNDETERMINED times the error of the best affine map of (T, l)
