@@ -29,7 +29,7 @@ def test_commands_that_change_too_fast_are_found():
     jump = ramp.copy()
     jump[20:, 1] -= 0.01
     (violation,) = steps(jump).too_fast
-    assert 'muscle 1 by -11.0 mm' in violation
+    assert 'muscle 1 changed by -11.0 mm' in violation
     assert steps(jump).largest_in == pytest.approx(0.011)
     # After a missed message the change is known, but not that of a single tick.
     assert steps(jump, NUMBER + (NUMBER >= 20)).largest_in == pytest.approx(0.001)

@@ -172,5 +172,5 @@ def test_a_checkout_of_another_user_is_reported(tmp_path):
         env={**os.environ, 'HOME': '/nonexistent'},
     )
     assert done.returncode == 1
-    assert f'{clone} belongs to root' in done.stderr
+    assert f'{clone} cannot be written: it belongs to root' in done.stderr
     assert 'unbound' not in done.stderr

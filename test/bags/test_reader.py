@@ -173,6 +173,6 @@ def test_of_two_types_on_one_topic_none_is_guessed(tmp_path):
     write(path / 'a.mcap')
     write(path / 'b.mcap', schema='std_msgs/msg/String', text='string data')
     with pytest.raises(
-        BagError, match='topic /anomaly has the types std_msgs/msg/Float64, std_msgs'
+        BagError, match='topic /anomaly has the types std_msgs/msg/Float64 and std_msgs'
     ):
         Bag.open(path)

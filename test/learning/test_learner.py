@@ -349,6 +349,7 @@ def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_recei
         rests.append((last, heard))
         for sample in between(before, last, 40):
             arm.send(sample)
+        arm.last = last
         for _ in range(11):
             arm.rest(0.1, last)
             for link in heard:
