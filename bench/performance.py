@@ -86,7 +86,7 @@ Measured by `bench wire`:
 - *missed*: messages that did not arrive
 - *CPU*: of all nodes, including the training process of the learner
 - *combined*: estimator and controller in one process (`bringup.sh --combined`)
-- *plain node*: one simple rclpy node with eager torch, without safety and control
+- *plain node*: a minimal rclpy node with uncompiled PyTorch, without safety checks or control
 - *messages alone*: five nodes that exchange the same messages without any computation
 
 {wire}

@@ -9,7 +9,7 @@ At each message, for the desired θ, θ̇, θ̈ (`trajectory`),
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
-slides, and μ is learned (`mae.touch`) or FRICTION.
+slides, and μ is learned or a typical value (`control/friction.py`).
 
 Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
 dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is
@@ -38,6 +38,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
 from musculoskeletal_ae.control.feedback import RestFeedback, depends_on_limit
+from musculoskeletal_ae.control.friction import FRICTION, tendon_friction
 from musculoskeletal_ae.control.methods import Solution, stiffness_command
 from musculoskeletal_ae.control.ramps import Ramp
 from musculoskeletal_ae.control.settings import Settings
@@ -50,7 +51,6 @@ from musculoskeletal_ae.signals.friction import slid
 
 PROPORTIONAL = 0.7  # proportional gain k_p of the posture error
 INTEGRAL = 4.0  # integral gain k_i of the posture error [1/s]
-FRICTION = 0.05  # μ if none was learned: a typical value of hand-built arms
 #: fraction of the rate limit for a trajectory's lengths; the rest is for tensions and feedback
 SHARE = 0.7
 #: largest number of moments of a trajectory at which the network is evaluated; even with 10 000
@@ -350,13 +350,6 @@ class Follower(ActivityControl):
         feedback.step(self.error, jacobian, inputs.pull, inputs.limit, gain, inputs.dt)
         self._shift = feedback.correction
         return length + feedback.shift(jacobian)
-
-
-def tendon_friction(robot: Robot, mae: Mae) -> Array:
-    """Return μ of each muscle (M,): as learned, or FRICTION."""
-    touch = getattr(mae, 'touch', None)
-    friction: Array = np.full(robot.muscle_count, FRICTION) if touch is None else touch.friction
-    return friction
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:

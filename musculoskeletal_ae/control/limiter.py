@@ -209,7 +209,7 @@ class CommandLimiter:
     def _certain(self, limit: Array, sample: MuscleSample) -> Array:
         """Return the highest T [N] (M,) whose true value is at most `limit` with confidence.
 
-        A tension of T_bias stays allowed: an uncertain tendon is not paid out until it is slack.
+        It is never lowered below T_bias, so that uncertainty alone does not make a tendon slack.
         """
         bias = self._robot.description.tension.bias
         spread = np.nan_to_num(sample.tension_spread)

@@ -38,9 +38,8 @@ class Prior:
     #: σ of the logarithm of a motor current's scale, and of its offset and drive friction as shares
     #: of T_limit
     drive: tuple[float, float, float] = DRIVE_SPREAD
-    drive_friction_mean: float = (
-        DRIVE_FRICTION_MEAN  # mean of the drive friction as a share of T_limit
-    )
+    #: mean of the drive friction as a share of T_limit
+    drive_friction_mean: float = DRIVE_FRICTION_MEAN
 
     def spread(self, layout: Layout) -> Array:
         """Return the prior spread s of every parameter of a muscle."""

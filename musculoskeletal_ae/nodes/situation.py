@@ -28,7 +28,7 @@ from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
 LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
 #: time without a report after which a node counts as silent [s]; nodes report once a second
 SILENCE = 2.0
-TICK = 1.0  # longest time between two ticks unless this process was paused [s]
+TICK = 1.0  # time between two ticks above which this process was paused [s]
 #: time without a report after which a node that is not in NEEDED no longer counts [s]
 FORGET_TIME = 5.0
 #: nodes whose silence is an error once they have reported

@@ -81,13 +81,12 @@ def judge(
         return Judgement([], ())
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).astype(int)]
     tension = robot.actuation.known_tension(tension)
+    used = np.ones(robot.muscle_count, dtype=bool) if used is None else used
     segments = np.zeros(len(theta), dtype=int) if segments is None else segments
     lengths = _Lengths(robot, length[rows], tension[rows], used, segments[rows])
     measured = _Hypothesis(None, theta[rows])
     best, signs = measured, lengths.signs(measured.theta)
-    least = lengths.misfit(best.theta * signs.sign)
-    if np.isfinite(least):
-        least *= BETTER
+    least = BETTER * lengths.misfit(best.theta * signs.sign)
     for other in _hypotheses(lengths, theta[rows]):
         others = lengths.signs(other.theta)
         if (misfit := lengths.misfit(other.theta * others.sign)) < least:
@@ -168,11 +167,9 @@ class _Lengths:
     """Muscle lengths of a moving arm, with which postures are compared."""
 
     def __init__(
-        self, robot: Robot, length: Array, tension: Array, used: Bools | None, segments: Ints
+        self, robot: Robot, length: Array, tension: Array, used: Bools, segments: Ints
     ) -> None:
-        self.robot, self._length, self._tension = robot, length, tension
-        everything = np.ones(robot.muscle_count, dtype=bool)
-        self._used: Bools = everything if used is None else used
+        self.robot, self._length, self._tension, self._used = robot, length, tension, used
         self._segments = [np.flatnonzero(segments == each) for each in np.unique(segments)]
 
     def _model(self, theta: Array) -> Array:
@@ -229,7 +226,7 @@ class _Lengths:
             changes.append(self._centred(self._model(posture) - base))
         change = np.stack(changes, axis=-1)  # (N, M, joints)
         measured = self._centred(self._length[:, self._used] - base)
-        # The normal equations of a fit without some muscles are sums over the others.
+        # Each muscle adds one term to the normal equations; without its term, it is left out.
         products = np.einsum('nmj,nmk->mjk', change, change)
         rights = np.einsum('nmj,nm->mj', change, measured)
         scale[moved] = _solve(products.sum(axis=0), rights.sum(axis=0))

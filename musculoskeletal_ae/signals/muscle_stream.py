@@ -329,6 +329,7 @@ class MuscleStream:
         self.body = body or BodyState.healthy(robot.muscle_count)
         self.use_transmission(Transmission(np.zeros(robot.muscle_count)))
         self._levels = LevelCheck(robot)
+        self._window = window
         #: the last messages as measured, (3, M) each
         self._readings: deque[Array] = deque(maxlen=window)
         #: the last messages, including rejected ones, (3, M) each
@@ -442,7 +443,7 @@ class MuscleStream:
     def _pull(self, states: Array) -> Array | None:
         """Record the raw values of a rejected message; return `RejectionError.pull`."""
         self._all_readings.append(states)
-        if len(self._all_readings) < (self._all_readings.maxlen or 1):
+        if len(self._all_readings) < self._window:
             return None
         offset = self.body.offsets.offset
         each = [self._levels.plausible_pull(one, offset) for one in self._all_readings]

@@ -31,8 +31,8 @@ BUTTONS = {
     'call estimator/zero': CALIBRATE,
     'call controller/explore to explore again': EXPLORE,
 }
-PUSH_STIFFNESS = 200.0  # force per distance that the mouse drags [N/m]
-MOST_PUSH = 60.0  # [N]
+PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
+MOST_PUSH = 60.0  # largest force of a push with the mouse [N]
 MOST_PAYLOAD = 5.0  # [kg]
 
 
