@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmarks and long tests that are not part of the package: kills, soak, timings, calibration."""
+"""Benchmarks and long tests of the package. They are not installed with it."""
 
 import sys
 from pathlib import Path
@@ -7,5 +7,5 @@ from pathlib import Path
 # Import this before numpy, because it limits BLAS to one thread.
 import musculoskeletal_ae  # noqa: F401
 
-# The tests' support code creates hostile networks and robots.
+# Benches import modules of test/ that create hostile networks and robots.
 sys.path.append(str(Path(__file__).resolve().parent.parent / 'test'))

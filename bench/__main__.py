@@ -44,5 +44,5 @@ def main(argv: list[str]) -> int:
 
 if __name__ == '__main__':
     replace_unprintable()
-    STOP.install(Reaction.RAISE)  # SIGTERM ends a bench and its processes like Ctrl-C
+    STOP.install(Reaction.RAISE)  # SIGTERM then ends a bench and its child processes as Ctrl-C does
     sys.exit(main(sys.argv[1:]))

@@ -8,11 +8,11 @@ network. With the learned network, the bench measures:
 
 - estimate: mean ‖θ_est − θ‖ in further exploration, before and after learning,
 - control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random holdable postures,
-- rupture: several muscles rupture in turn while the arm explores. The share of ruptures
-  after which a muscle is isolated within 10 s, the share with the right muscle, and the mean time
-  to the finding,
+- rupture: several muscles rupture in turn while the arm explores. The columns are the share of
+  ruptures after which a muscle is isolated within 10 s, the share after which it is the ruptured
+  muscle, and the mean time from a rupture to the isolation,
 - max/limit: the highest true tension as a multiple of `tension.limit`, except after a rupture,
-- wrong: isolated muscles and stops of the healthy arm.
+- wrong: the number of muscles that are isolated, and of stops, although the arm is healthy.
 
 Tensions are the true ones of the emulated arm, whatever its sensors measure.
 """
@@ -39,9 +39,9 @@ from musculoskeletal_ae.robot.robot import Robot
 EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held-out motion [s]
 TARGETS, HELD = 5, 4.0  # number of targets, and time for each of them [s]
 RUPTURES = 3
-MOVING = 4.0  # duration of motion before a rupture [s]
+MOVING = 4.0  # time for which the arm explores before a rupture [s]
 LATEST = 10.0  # longest time from a rupture to its isolation [s]
-#: kinds of modules: actuation and tension_source of muscles.yaml
+#: kinds of muscle modules, each with the entries of muscles.yaml that describe it
 KINDS = {
     'stiffness': {'actuation': 'stiffness'},
     'position': {'actuation': 'position'},
@@ -63,15 +63,15 @@ class Result(NamedTuple):
     after: float
     control: float
     isolated: float  # fraction of the ruptures after which a muscle was isolated
-    named: float
-    finding_time: float  # mean time to the finding [s]
+    named: float  # fraction of the ruptures after which only the ruptured muscle was isolated
+    finding_time: float  # mean time from a rupture to the isolation [s]
     highest: float  # highest tension, relative to tension.limit
     wrong: float
     samples: float
 
 
 def with_kind(robot: Robot, kind: str) -> Robot:
-    """Return the robot with another kind of modules."""
+    """Return the robot with muscle modules of the kind `kind` in KINDS."""
     return Robot(with_modules(robot.description, **KINDS[kind]))
 
 
@@ -82,7 +82,7 @@ class Watched:
         self._arm, self.highest = arm, 0.0
 
     def note(self) -> None:
-        """Record the present tensions."""
+        """Update the highest tension by the present ones."""
         share = self._arm.tension / self._arm.robot.tension.limit
         self.highest = max(self.highest, float(share.max()))
 
@@ -103,7 +103,7 @@ def learn(
 
 
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
-    """Return the mean error of the estimate while exploring [rad], and wrong isolations."""
+    """Explore for a time [s]; return the mean error of the estimate [rad] and wrong isolations."""
     loop = IsolatingLoop(arm, mae, EXPLORATION_STREAM + 50 + seed)
     loop.run(1.0)
     loop.core.explore(True)
@@ -117,7 +117,7 @@ def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) ->
 
 
 def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tuple[float, int]:
-    """Return the mean distance from targets after HELD [s], and the number of stops."""
+    """Return the mean distance from targets after HELD seconds [rad], and the number of stops."""
     robot, rng = arm.robot, np.random.default_rng([seed, 0xAC])
     postures = (robot.random_postures(1, rng)[0] for _ in range(TRIES))
     errors, stops, loop = [], 0, ClosedLoop(arm, mae)
@@ -136,7 +136,12 @@ def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tu
 
 
 def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, float]:
-    """Rupture muscles in turn; return the shares isolated and named, and the mean time [s]."""
+    """Rupture `count` muscles in turn.
+
+    Returns:
+        The share of ruptures after which a muscle was isolated, the share after which only the
+        ruptured muscle was, and the mean time from rupture to isolation [s].
+    """
     isolated, named, times = 0, 0, []
     for m in np.random.default_rng([seed, 0x2B]).permutation(arm.robot.muscle_count)[:count]:
         arm.reset()
@@ -161,7 +166,7 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
 
 
 def measure(robot: Robot, kind: str, initial: Mae, reality: str, seed: int, share: float) -> Result:
-    """Measure one individual with one kind of module."""
+    """Measure one individual with one kind of module; `share` scales the durations and counts."""
     own = with_kind(robot, kind)
     arm = make_arm(own, seed, reality)
     watched = Watched(arm)

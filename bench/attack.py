@@ -39,14 +39,14 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-JITTER = 0.03  # delay between computing and publishing a command on a loaded machine [s]
-RELIEF = 0.3  # an excess tension justifies fast paying out for this time [s]
+JITTER = 0.03  # longest delay from computing to publishing a command on a loaded machine [s]
+RELIEF = 0.3  # paying out may exceed the rate limit for this time after an excess tension [s]
 SILENT = 10.0  # longest legal time between two reports of a node under attack [s]
-GROWTH = 1.2  # largest legal ratio of a node's memory to that at age YOUNG
-YOUNG = 300.0  # age of a node from which its memory is compared [s]
-#: tension relative to tension.limit, and the longest legal time above it [s]
+GROWTH = 1.2  # largest legal ratio of a node's memory to its memory at the age YOUNG
+YOUNG = 300.0  # age of a node from which on its memory must not grow [s]
+#: A tension may exceed ABOVE times tension.limit for at most MOMENT [s].
 ABOVE, MOMENT = 1.1, 0.5
-STILL = 0.002  # distance by which a muscle of a stopped arm may be wound in [m]
+STILL = 0.002  # largest length by which a muscle of a stopped arm may be wound in [m]
 MOST_MEMORY = 500.0  # largest legal memory of a node at any time [MB]
 
 
@@ -114,9 +114,16 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
 
 
 def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscles: int) -> Array:
-    """Return which muscles exceeded `limit` [N] shortly before commands at `time` [s] (N,): (N, M).
+    """Return for each command which muscles exceeded `limit` [N] in the RELIEF seconds before it.
 
-    `loads` are times [s] and measured T [N] (M,); `muscles` is M.
+    Args:
+        time: Times of the commands [s], (N,).
+        loads: Times [s] and measured T [N] (M,).
+        limit: Limits of the tensions [N].
+        muscles: Number of muscles M.
+
+    Returns:
+        A mask, (N, M).
     """
     if not loads:
         return np.zeros((len(time), muscles), dtype=bool)
@@ -127,9 +134,9 @@ def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscle
 
 
 def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array:
-    """Return the longest uninterrupted time of each muscle above `highest` [N]: [s] (M,).
+    """Return for how long [s] each muscle was above `highest` [N] without interruption, at most.
 
-    `loads` are times [s] and measured T [N] (M,).
+    `loads` are times [s] and measured T [N] (M,). The result is (M,), or (0,) without loads.
     """
     if not loads:
         return np.zeros(0)
@@ -141,7 +148,7 @@ def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array
 
 
 def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
-    """Return the largest length that any muscle was wound in between two times [m]."""
+    """Return the largest length [m] by which a muscle was wound in from `begin` to `end` [s]."""
     during = value[(time > begin) & (time < end)]
     if len(during) < 2:
         return 0.0
@@ -149,7 +156,7 @@ def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
 
 
 def without(times: Array, intervals: list[tuple[float, float]]) -> Bools:
-    """Return which times lie outside all intervals."""
+    """Return a mask of the times that lie outside all intervals (begin, end)."""
     outside = np.ones(len(times), dtype=bool)
     for begin, end in intervals:
         outside &= (times < begin) | (times > end)
@@ -159,7 +166,7 @@ def without(times: Array, intervals: list[tuple[float, float]]) -> Bools:
 def attack_graph(
     folder: Path, initial: Path, size: Size, seed: int, planned: list[tuple[str, int, str]]
 ) -> list[Row]:
-    """Attack the running system of one seed."""
+    """Run the system for one seed, attack it, and return the checked promises."""
     from bench.attack_graph import Attack
     from bench.attack_kinds import Scene, random_event
 

@@ -27,7 +27,7 @@ from robots import chain
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 LONGEST = 5.0  # longest legal CPU time for one file [s]
-MOST_MEMORY = 300  # memory that one file may add to the process's peak [MB]
+MOST_MEMORY = 300  # largest memory that reading one file may add to the peak of the process [MB]
 NASTY = (0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {})
 KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
@@ -37,8 +37,8 @@ class Attempt(NamedTuple):
 
     kind: str
     outcome: str
-    seconds: float  # CPU time
-    memory: float  # memory added to the peak of the process [MB]
+    seconds: float  # CPU time of reading it [s]
+    memory: float  # memory that reading it added to the peak of the process [MB]
 
     @property
     def broken(self) -> bool:
@@ -47,7 +47,7 @@ class Attempt(NamedTuple):
         return not sound or self.seconds > LONGEST or self.memory > MOST_MEMORY
 
 
-# -- making them ----------------------------------------------------------------------------------
+# -- making hostile files -------------------------------------------------------------------------
 
 
 def strange_file(file: Path, rng: random.Random) -> None:
@@ -92,7 +92,7 @@ def bomb(rng: random.Random) -> str:
 
 
 def changed_numbers(text: str, rng: random.Random) -> str:
-    """Return a text with one of its quoted attributes replaced."""
+    """Return an XML text with the value of one attribute replaced."""
     parts = text.split('"')
     parts[rng.randrange(1, len(parts), 2)] = rng.choice(
         ['nan', '-1', '1e300', '0', '', '0 0', '1 ' * 10_000, '\x9b1m', '1e-300', '-0.001 0 0']
@@ -101,7 +101,7 @@ def changed_numbers(text: str, rng: random.Random) -> str:
 
 
 def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
-    """Return the bytes with one to three random faults."""
+    """Return `data` with one to three random faults, some of them pieces of `other`."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         at = rng.randrange(len(changed) + 1)
@@ -126,7 +126,7 @@ def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
             start = rng.randrange(len(other))
             changed[at : at + size] = other[start : start + size]
         else:
-            # Extreme values of a length or a time, preferably in the header of a record.
+            # Replace a length or a time by an extreme value, preferably in a record's header.
             value = rng.choice((0, 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1, len(data)))
             heads = [i for i in range(max(0, at - 200), at) if data[i + 2 : i + 9] == bytes(7)]
             at = rng.choice(heads) if heads else at
@@ -136,7 +136,7 @@ def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
-# -- reading them ---------------------------------------------------------------------------------
+# -- reading hostile files ------------------------------------------------------------------------
 
 
 class Reader:
@@ -274,7 +274,7 @@ def _write_bag(path: Path) -> Path:
 
 
 def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attempt]:
-    """Read files number `start` to `count`."""
+    """Write and read the hostile files number `start` to `count`; yield the outcome of each."""
     reader = Reader(folder)
     for i in range(start, count):
         kind = KINDS[i % len(KINDS)]
@@ -326,7 +326,7 @@ def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
 
 
 def _child(start: str, count: str, seed: str, folder: str) -> None:
-    # A limit on CPU time ends a child that hangs, which is a finding.
+    # Limits of memory and CPU time end a child that hangs; its parent reports that as a finding.
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     resource.setrlimit(resource.RLIMIT_CPU, (3600, 3600))
     import faulthandler

@@ -71,7 +71,7 @@ PATIENCE = 90.0  # longest wait for an expected event [s]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
-#: values outside the range of every parameter
+#: values that no parameter accepts
 ILLEGAL = (math.nan, math.inf, -math.inf, 1e308, -1e308, -1e12)
 TEXTS = ('', 'torso', '\x1b[2J', '\x9b1m', 'ö' * 300, '/dev/zero', 'a\nb', '*' * 3000)
 LENGTHS = (0, 1, 2, 6, 18, 1000)
@@ -82,7 +82,7 @@ class Command(NamedTuple):
 
     time: float  # time of publishing by the publisher's clock [s]
     number: int  # sequence number of the message
-    life: int  # number of controller restarts before it
+    life: int  # number of controller restarts before the command
     topic: str
     value: Array
 
@@ -136,7 +136,7 @@ class Attack:
         self.processes: dict[str, Process] = {}
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
-        self.sent: set[int] = set()  # digests of hostile values
+        self.sent: set[int] = set()  # digests of the hostile messages
         self.genuine: dict[str, Any] = {}  # last message that the system itself sent, by topic
         self.commands: list[Command] = []
         self.life = 0
@@ -155,10 +155,10 @@ class Attack:
         self.foreign: list[tuple[float, float]] = []
         self.lying: list[tuple[float, float]] = []
         self.strangers: list[Process] = []  # duplicate nodes that the attack started
-        self.watches_processes = True  # whether the end of a process is a finding
+        self.watches_processes = True  # whether a process that ends counts as a violation
         self._learner = ''  # identity of the system's own learner, from /diagnostics
-        self._other_learners = set[str]()  # identities of duplicates that the attack started
-        self._lying_since = 0.0  # time since which sensors are wrong, or 0 if they are not [s]
+        self._other_learners = set[str]()  # identities of the learners that the attack started
+        self._lying_since = 0.0  # time since which sensor data are wrong [s]; 0 if they are right
         self._topics: dict[str, str] = {}
         self._services: dict[str, str] = {}
         self._looked = self._judged = 0.0
@@ -171,7 +171,7 @@ class Attack:
 
     def __exit__(self, *_: object) -> None:
         self.end_strangers()
-        for process in self.processes.values():  # a suspended process handles no other signal
+        for process in self.processes.values():  # a suspended process could not handle SIGINT
             with suppress(ProcessLookupError):
                 process.process.send_signal(signal.SIGCONT)
         end_processes([process.process for process in self.processes.values()], signal.SIGTERM)
@@ -185,7 +185,7 @@ class Attack:
         self.life += name == 'controller'
 
     def start_second(self, name: str, node: str = '') -> None:
-        """Start a second node of a kind; `node` is its node name if it is not the same."""
+        """Start a second process of the node `name`; `node` is its node name if it differs."""
         remapping = ['-r', f'__node:={node}'] if node else []
         self.strangers.append(self.process(name, f'second_{name}', remapping))
 
@@ -199,7 +199,7 @@ class Attack:
 
     def process(self, name: str, log: str = '', remapping: Sequence[str] = ()) -> Process:
         """Start the process of a node."""
-        # A second node uses another directory, because it is refused in that of the first.
+        # A second node needs a state directory of its own, because the first one locks its own.
         saved = f'state_directory:={self.folder / (log or "state")}'
         own = {
             'controller': ['max_age:=1.0', 'explore:=true', saved],
@@ -312,7 +312,8 @@ class Attack:
         client, futures = self._client(kind, service), []
 
         def answered() -> bool:
-            # A killed node seems ready for some time, and requests to it are lost.
+            # A killed node seems ready for some time, and requests to it are lost. The request is
+            # therefore repeated every 5 s.
             if client.service_is_ready() and len(futures) < 1 + (time.monotonic() - begun) / 5.0:
                 futures.append(client.call_async(request or kind.Request()))
             return any(future.done() for future in futures)
@@ -376,7 +377,7 @@ class Attack:
     def topics(self) -> dict[str, str]:
         """Return the types of all subscribed topics, by name."""
         for name in NODES:
-            with suppress(NodeNameNonExistentError):  # just killed; topics known
+            with suppress(NodeNameNonExistentError):  # just killed; its topics are known already
                 pairs = self.node.get_subscriber_names_and_types_by_node(name, self.namespace)
                 self._topics |= {topic: kinds[0] for topic, kinds in pairs}
         return self._topics
@@ -392,7 +393,7 @@ class Attack:
     def publish(self, topic: str, kind: str) -> None:
         """Publish one hostile message."""
         if topic not in self.publishers:
-            # The publisher, and with it the latched message, is removed after the burst.
+            # `episode` destroys latching publishers after a burst, and thereby their last message.
             qos = LATCHED if topic.endswith(LATCHING) else OWN
             self.publishers[topic] = self.node.create_publisher(message_class(kind), topic, qos)
             self.spin(0.1)
@@ -401,7 +402,7 @@ class Attack:
         try:
             self.publishers[topic].publish(message)
         except (TypeError, ValueError, AssertionError, UnicodeError):
-            return  # rclpy refuses to send such a message
+            return  # rclpy refuses to send this message, so it does not count as sent
         self.tried['messages'] += 1
 
     def hostile(self, topic: str, kind: Any) -> Any:
@@ -481,7 +482,8 @@ class Attack:
         if not self.moving():
             return
         topics, services = list(self.topics().items()), list(self.services().items())
-        # All topics, or a few: some stop the arm at once, and the others then see no moving arm.
+        # Messages on some topics stop the arm at once. Most episodes therefore use few topics, so
+        # that messages on the other topics also meet a moving arm.
         topics = self.rng.sample(topics, self.rng.choice((1, 2, 4, len(topics))))
         until, rng = self.tried['messages'] + messages, self.rng
         when = sorted(rng.randrange(messages) for _ in range(kills))
@@ -576,7 +578,7 @@ def _nasty(kind: str, rng: random.Random) -> Any:
             bits = int(kind.removeprefix(prefix))
             low, high = -(2 ** (bits - 1)) * sign, 2 ** (bits - sign) - 1
             return rng.choice((0, 1, low, high, rng.randint(low, high)))
-    return None  # a message
+    return None  # `kind` is a message type
 
 
 def illegal_value(rng: random.Random) -> ParameterValue:

@@ -29,8 +29,8 @@ from musculoskeletal_ae.remedy import STEPS, Step
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # duration of an attack [s]
-REPORT_TIME = 2.0  # time after which the status line has to report a problem [s]
-OFFSET = 0.08  # size of false length offsets [m]
+REPORT_TIME = 2.0  # time from the begin of a problem until the status line must report it [s]
+OFFSET = 0.08  # absolute value of false length offsets [m]
 
 
 class Scene:
@@ -39,7 +39,7 @@ class Scene:
     def __init__(self, attack: Attack) -> None:
         """Use a running system and the hostile node of `attack`."""
         self.attack, self.rng = attack, attack.rng
-        self.what = ''  # description of the present attack, which findings name
+        self.what = ''  # description of the present attack, for the reports of violations
 
     # -- the course of an attack ----------------------------------------------------------------
 
@@ -339,9 +339,8 @@ def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
     """Return an attack that suspends or kills a node."""
 
     def attack(scene: Scene) -> None:
-        scene.attack.watches_processes = (
-            False  # `recover` restarts it if the status line advises that
-        )
+        # The process ends on purpose. `recover` restarts it if the status line advises that.
+        scene.attack.watches_processes = False
         if is_paused:
             scene.pause(name)
         else:

@@ -44,8 +44,7 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-# Never used for learning.
-HELD_OUT_SEED = 9001
+HELD_OUT_SEED = 9001  # seed of the held-out motion, which no experiment learns from
 EVERY = 10  # every tenth message is evaluated
 
 

@@ -39,7 +39,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 60.0  # duration of the held-out motion [s]
 STEPS = 400, 1200  # number of training steps of each update
-#: what the learner receives of the joint angles, by its source of θ
+#: function that returns the joint angles which the learner receives, by its source of θ
 VIEWS: dict[str, JointView] = {
     SENSOR: lambda _learner, _n, _true, read: read,
     NONE: lambda *_: None,

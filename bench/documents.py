@@ -40,8 +40,8 @@ PAGES = (
 BACKGROUND = 'Ctrl-C ends it'
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
 START_PATIENCE = 1800  # longest wait for the first status line, installation included [s]
-COMMAND_PATIENCE = 900  # longest duration of all other commands of a page [s]
-#: longest duration of one `ros2` command, which would wait for ever for a system that has ended [s]
+COMMAND_PATIENCE = 900  # longest duration of all commands of a page after that [s]
+#: longest duration of a `ros2` command [s]; it would wait for a system that has ended forever
 ANSWER_PATIENCE = 300
 NAME = 'musculoskeletal_ae'
 INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'
@@ -86,7 +86,7 @@ class Command(NamedTuple):
 
     line: str
     is_background: bool
-    skipped_because: str  # reason for which the command is skipped; '' if it is run
+    skipped_because: str  # reason why the command is skipped; '' if it is run
 
 
 def commands(page: Path) -> list[Command]:
@@ -165,7 +165,7 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
     ) as shell:  # fmt: skip
         for line in shell.stdout or ():
             print(line.replace(str(clone), '…').replace(str(home), '~'), end='', flush=True)
-    # Clean the clone for the next page, but keep what is installed.
+    # Remove files that the page created, but keep ignored ones such as the installed packages.
     subprocess.run(['git', 'clean', '-fdq'], cwd=clone, check=True)
     return shell.returncode == 0
 

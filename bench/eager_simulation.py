@@ -49,7 +49,8 @@ class EagerSimulation:
         count, ways = len(tree.parent), np.eye(len(tree.parent), dtype=bool)
         for i in range(1, count):
             ways[i] |= ways[tree.parent[i]]
-        turning = ways[:, 1:] & ~tree.slides[1:]  # ∂τ_k/∂θ_j for j at or before k that turns
+        # whether joint j turns and lies at or before k, so that ∂τ_k/∂θ_j is not 0 for this reason
+        turning = ways[:, 1:] & ~tree.slides[1:]
         self.before = _single(turning[1:])
         onto = np.zeros((count - 1, robot.joint_count))
         if tree.terms.shape[1] > 2:
@@ -61,7 +62,7 @@ class EagerSimulation:
         self.lever = _single(tree.axis), _single(tree.centre), _single(tree.mass)
         self.poses = tuple(map(_single, (tree.placement, tree.first, tree.second)))
         self.carried, self.carries = _single(tree.carried[1:]), _single(tree.carries[1:])
-        self.hangs = _single(ways[1:, 1:].T)  # bodies that a joint carries
+        self.hangs = _single(ways[1:, 1:].T)  # 1 where the joint (row) carries the body (column)
         self.down, self.tip = _single(tree.gravity), _single(tree.effector)
         self.springs, self.preload = _single(tree.springs), _single(tree.preload)
         self.sliding = torch.as_tensor(tree.slides[1:])[:, None]
@@ -159,7 +160,7 @@ class EagerSimulation:
         bending = cross(down, cross(weight, axis)) + cross(push, cross(arm, axis))
         torque = (axis * torch.where(self.sliding, force, turning)).sum(dim=-1)
         bend = torch.where(self.sliding, cross(axis, force), bending)
-        lower = self.before * (bend @ axis.transpose(1, 2))  # ∂τ_k/∂θ_j, j at or before k
+        lower = self.before * (bend @ axis.transpose(1, 2))  # ∂τ_k/∂θ_j for joints j at or before k
         both = lower + lower.transpose(1, 2) - torch.diag_embed(lower.diagonal(dim1=1, dim2=2))
         load = theta @ self.springs - self.preload - torque @ self.onto
         return load, self.springs - self.onto.T @ both @ self.onto

@@ -38,10 +38,10 @@ sys.path.insert(0, str(ROOT / 'test' / 'view'))
 from browser import Browser  # noqa: E402 - the tests' own browser
 
 SIZE = 1280, 720  # size of the page [pixels]
-SCALE, COLOURS = 0.75, 128  # scale and number of colours of the pictures
+SCALE, COLOURS = 0.75, 128  # size of the pictures relative to the page; number of colours
 SCALED = round(SCALE * SIZE[0]), round(SCALE * SIZE[1])
-LEARNING = 60.0  # duration of the film before the rupture [s]
-MOVING_ON = 25.0  # duration of the film after the isolation [s]
+LEARNING = 60.0  # time for which the running system is recorded before the rupture [s]
+MOVING_ON = 25.0  # time for which it is recorded after the isolation [s]
 EVERY = 1.0  # time between two pictures while the arm learns [s]
 EVERY_LATER = 0.4  # time between two pictures around the rupture [s]
 FRAME = 110  # time for which a picture of the film is shown [ms]
@@ -68,7 +68,8 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
         return False
 
     try:
-        # Without a graphics card, the drawing time depends on the number of points.
+        # Draw fewer pixels than the page has: without a graphics card, drawing takes longer the
+        # more pixels there are.
         browser.call(
             'Emulation.setDeviceMetricsOverride',
             width=SIZE[0], height=SIZE[1], deviceScaleFactor=SCALE, mobile=False,

@@ -69,8 +69,9 @@ class Spread:
     def __init__(self) -> None:
         """Begin without networks."""
         self.most: defaultdict[str, float] = defaultdict(float)
-        #: smallest d over its threshold with a ruptured muscle
-        self.least_ruptured, self.refused, self.count = np.inf, list[str](), 0
+        #: smallest d of a ruptured muscle, as a multiple of the detection threshold
+        self.least_ruptured = np.inf
+        self.refused, self.count = list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
         """Measure and validate a network."""

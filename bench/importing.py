@@ -43,7 +43,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
 INDIVIDUAL = 0
-DRAWN = 'visual', 'collision'  # elements of a URDF that have no effect on lengths
+DRAWN = 'visual', 'collision'  # elements of a link that do not affect muscle lengths
 IMPORTED = (
     'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',
     'wrong signs', 'check_robot',
@@ -67,7 +67,7 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
         at = link.find('inertial/origin')
         text = '0 0 0' if at is None else at.get('xyz', '0 0 0')
         centres[link.get('name', '')] = [*map(float, text.split())]
-        # Masses have no effect on lengths, but MuJoCo refuses those that are missing or zero.
+        # Masses do not affect muscle lengths, but MuJoCo refuses links without mass.
         for part in link.findall('inertial'):
             link.remove(part)
         weight = ET.SubElement(link, 'inertial')

@@ -30,9 +30,9 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-LONGEST = 6.0  # time of the latest kill [s]; a child starts, trains and saves within it
+LONGEST = 6.0  # latest time of a kill [s]; until then, a child has started, trained and saved
 SPACING = 0.02  # time between two samples [s]
-STEPS = 20  # training steps of an update; short updates give many states to be killed in
+STEPS = 20  # training steps of an update; few, so that many saves are interrupted by a kill
 DEADLINE = 60.0  # longest time in which a child may start [s]
 
 
@@ -95,7 +95,7 @@ class Child:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            # A line without an end was interrupted by the kill and does not count.
+            # The kill interrupted a line that does not end in a newline, so it does not count.
             if line.endswith('\n'):
                 self.lines.append(line.split())
                 if line.startswith('found'):
@@ -125,7 +125,8 @@ class Child:
 def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> list[str]:
     """Kill `kills` children one after another; return descriptions of the losses."""
     rng = np.random.default_rng(seed)
-    # States that may be on disk: a sample may be saved before the child can report it.
+    # All stores that may be on disk: the kill may come after a sample was saved and before the
+    # child has reported it.
     possible = [SampleStore()]
     lost: list[str] = []
     newest, published = 0, 0
@@ -133,7 +134,8 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
         last = life == kills
         child = Child(robot.description.directory, directory, initial, life)
         begun, wanted = time.monotonic(), rng.uniform(0.0, LONGEST)
-        # Earlier children may be killed while they start; the last one must start.
+        # Late kills hit a child that has started. Early ones may hit it while it starts, but the
+        # last child must start, because it shows what the others have saved.
         if last or wanted > 0.5 * LONGEST:
             child.up.wait(DEADLINE)
         time.sleep(max(0.0, begun + wanted - time.monotonic()))

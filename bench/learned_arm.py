@@ -21,7 +21,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: time between two updates [s], and training steps of each: as accurate as the node, but faster
+#: time between two updates [s], and training steps of each. The learned network is as accurate as
+#: that of the node, but learning takes less CPU time.
 SELDOM, STEPS = 20.0, 400
 
 
@@ -32,7 +33,7 @@ class Seldom(Trainer):
 
     @property
     def ready(self) -> bool:
-        """Whether enough new data have arrived."""
+        """Whether SELDOM seconds of messages, and enough new data, have arrived."""
         self._asked += 1
         if self._asked < SELDOM / SAMPLE_TIME or not super().ready:
             return False

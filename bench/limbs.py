@@ -20,7 +20,8 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.description import refusal
 from musculoskeletal_ae.robot.directories import find_robot
 
-#: limbs: number of tendons of an arm's wrist (0: no wrist), 'neck', or 'held' (an arm of 4 joints)
+#: limbs of each body, by name. A number is an arm, and counts the tendons of its wrist (0: no
+#: wrist). 'held' is an arm whose joint elbow_yaw is fixed, so that it has four joints.
 BODIES: dict[str, tuple[int | str, ...]] = {
     '5x10': (0,),
     '7x14': (4,),
@@ -39,7 +40,7 @@ WRIST = """<r>
   <joint name="wrist_deviation" type="revolute"><parent link="carpus"/><child link="hand"/>
     <origin xyz="0 0 0"/><axis xyz="0 1 0"/>
     <limit lower="-0.45" upper="0.45" effort="8" velocity="6"/></joint></r>"""
-#: name and angle on the forearm [degrees], from front to left, of each tendon, by their number
+#: tendons of a wrist, by their number: name, and angle on the forearm [degrees] from front to left
 WRIST_WIRES = {
     4: {'extensor_carpi_radialis': 45, 'extensor_carpi_ulnaris': 135,
         'flexor_carpi_ulnaris': 225, 'flexor_carpi_radialis': 315},
@@ -66,7 +67,8 @@ NECK = """<r>
     <inertia ixx="0.010" ixy="0" ixz="0" iyy="0.010" iyz="0" izz="0.007"/></inertial>
     <visual><origin xyz="0.01 0 0.09"/><geometry><sphere radius="0.085"/></geometry></visual></link>
   </r>"""
-#: tendon: (angle [degrees] from front to left, radius [m], height [m]) on torso and head
+#: via points of each tendon of the neck: first on the torso, then on the head. Each is an angle
+#: [degrees] from front to left, a radius [m] and a height [m].
 NECK_WIRES = {
     'sternocleidomastoid': ((4, 0.099, 0.032), (109, 0.070, 0.045)),
     'scalene': ((58, 0.077, 0.068), (25, 0.069, -0.020)),
@@ -75,7 +77,7 @@ NECK_WIRES = {
     'splenius': ((154, 0.072, 0.035), (95, 0.070, 0.019)),
     'semispinalis': ((143, 0.070, 0.031), (104, 0.060, 0.050)),
 }
-#: muscle, joint, sign: intended effect of the added tendons, as in moment_arms.csv
+#: intended moment arms of the wrist's tendons as in moment_arms.csv: muscle, joint, sign
 WRIST_SIGNS = [('extensor', 'wrist_flexion', '+'), ('flexor', 'wrist_flexion', '-')]
 Muscle = dict[str, Any]
 
@@ -120,7 +122,7 @@ class Body:
             parts = [p for p in parts if p.get('name') != 'wrist']
             parts[-1:-1] = ET.fromstring(WRIST)  # noqa: S314
         names = {p.get('name') for p in parts}
-        for part in map(ET.fromstring, map(ET.tostring, parts)):  # a copy
+        for part in map(ET.fromstring, map(ET.tostring, parts)):  # copies, which are changed below
             if part.tag == 'joint' and part.get('type') != 'fixed' and part.get('name') != held:
                 self.joints.append(prefix + part.get('name', ''))
             for element in part.iter():
@@ -131,7 +133,7 @@ class Body:
                     element.set('xyz', mirrored(element.get('xyz', '')))
                     r, p, y = map(float, element.get('rpy', '0 0 0').split())
                     element.set('rpy', f'{-r:g} {p:g} {-y:g}')
-                if right and element.tag == 'axis':  # mirroring reverses the rotation
+                if right and element.tag == 'axis':  # the mirrored joint turns the other way
                     x, y, z = map(float, element.get('xyz', '').split())
                     element.set('xyz', f'{0.0 - x:g} {y:g} {0.0 - z:g}')
             base = part.find("parent[@link='torso']")

@@ -57,7 +57,7 @@ from musculoskeletal_ae.options import Parser, number, seeds
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
-ALL_NODES = 'with learner'  # of `bench wire`
+ALL_NODES = 'with learner'  # the kind of `bench wire` that runs all nodes
 HEAD = (
     'model', 'seed', 'joints', 'muscles', 'before [rad]', '`paper`', 'after', 'detected', 'named',
     'trajectory [rad]', 'export, network [mm]', 'export, body', 'file, body', 'of', 'real time',
@@ -146,7 +146,8 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
     """
     robot, mae = study.robot, study.network(seed)
     plan = GraspAndRupture(robot, study.held_out_time, seed)
-    plan.grasp = -1.0  # never: the dumbbell of the paper is too heavy for some of these arms
+    # A negative time means never: the dumbbell of the paper is too heavy for some of these arms.
+    plan.grasp = -1.0
     initial = study.network(None)
     with_ruptures = record(study.arm(seed), initial, 0xC0 + seed, plan.duration, plan)
     healthy = record(study.arm(seed), initial, 0xD0 + seed, study.held_out_time)

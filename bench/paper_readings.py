@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare readings of the paper's simulation L_sim,1 on development individuals.
+"""Compares interpretations of the paper's simulation L_sim,1 on development individuals.
 
     experiment online_learning --seeds 0,1 --keep FOLDER
     python -m bench paper_readings FOLDER --seeds 0,1
 
 The paper does not print the unit of τ in w₆ = 0.001, and its English and Japanese texts differ in
-what l_sim is. For each reading, the simulator of preset `paper` follows the commands of the
-held-out motion with the networks before and after learning, as `experiment simulation` does. Prints
-a Markdown table of the mean errors, and of the share of tensions at T_bias.
+what l_sim is. For each interpretation ("reading"), the simulator of preset `paper` follows the
+commands of the held-out motion with the networks before and after learning, as `experiment
+simulation` does. Prints a Markdown table of the mean errors, and of the share of tensions at
+T_bias.
 
 "Sent" is l_target, "in the simulation" is l_target − l_comp(T_sim), and "measured" is the measured
 length of the arm.
@@ -31,17 +32,17 @@ from musculoskeletal_ae.paper.simulation import SEARCH
 from musculoskeletal_ae.robot.robot import Robot
 
 SENT, IN_SIMULATION, MEASURED = 'sent', 'in the simulation', 'measured'
-UNITS = {'N·m': 1.0, '0.1 N·m': 10.0, 'N·cm': 100.0, 'N·mm': 1000.0}  # factors [1/(N·m)]
+UNITS = {'N·m': 1.0, '0.1 N·m': 10.0, 'N·cm': 100.0, 'N·mm': 1000.0}  # number of units in 1 N·m
 
 
 class Reading(NamedTuple):
-    """One reading of the print."""
+    """One interpretation of what the paper states about L_sim,1."""
 
     unit: str = 'N·mm'
     length: str = SENT
     epochs: int = SEARCH.epochs
     clips: bool = True  # whether θ and T are kept within their limits
-    preset: str = 'paper'  # preset of the networks
+    preset: str = 'paper'  # preset of the networks that simulate
 
     @property
     def text(self) -> str:

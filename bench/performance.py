@@ -33,20 +33,21 @@ from musculoskeletal_ae.robot.robot import Robot
 ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
-EXPLORING = 60.0  # duration of the exploration that yields the samples of an update [s]
+EXPLORING = 60.0  # duration of the exploration whose samples an update is timed with [s]
 FLAME_RATE = 200.0  # rate of muscle_states while a profile is recorded [Hz]
 STARTING = 60.0  # longest wait for the first command [s]
-SETTLING = 15.0  # time from the start of the nodes to the recording of a profile [s]
+SETTLING = 15.0  # time from the start of the nodes until profiles are recorded [s]
 
-#: times of the first measured version (commit be0daee) on an idle machine with two cores
+#: CPU times [µs] of the first version that was measured (commit be0daee), by row of the table; the
+#: machine had two cores and was idle otherwise
 BEFORE_CORE = {
     'estimate: θ, T, l from ②': 19.0, 'one step of method proposed, preset default': 380.0,
     'one step of method proposed, preset paper': 530.0, 'simulation step': 150.0,
     f'simulation step, time per arm in a batch of {timings.MANY}': 6.7,
 }  # fmt: skip
-TORCH_BEFORE = 118.0  # time of the first row in torch on that machine [µs]
-#: values at each rate [Hz]: latency at 50 %, 99 % and largest [ms], and CPU time of all nodes [% of
-#: a core]. The learner runs at rates up to 200 Hz.
+TORCH_BEFORE = 118.0  # time of the first row of BEFORE_CORE in eager torch on that machine [µs]
+#: results of that version by rate [Hz]: latency as median / 99th percentile / maximum [ms], and CPU
+#: time of all nodes [% of a core]. The learner ran at 100 and 200 Hz, but not at 500 Hz.
 BEFORE_WIRE = {100.0: ('3.4 / 9.4 / 19', 138), 200.0: ('2.4 / 8.6 / 17', 172),
                500.0: ('0.6 / 6.1 / 12', 166)}  # fmt: skip
 BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'controller': 145,
@@ -147,7 +148,7 @@ def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
     cells = []
     for (robot, rate, kind), result in measured.items():
         latency = ' / '.join(f'{value:.1f}' for value in result.latency)
-        # The earlier values were measured with the learner, except those at 500 Hz.
+        # The values of BEFORE_WIRE were measured with the learner, except those at 500 Hz.
         same = 'nodes' if rate == max(RATES) else 'with learner'
         known = BEFORE_WIRE[rate] if (robot, kind) == (ARM, same) else ('', '')
         lost = f'{result.late:.1f}', f'{result.missed:.1f}'
@@ -265,7 +266,7 @@ def main(argv: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         training, update, network = learning(ARM, Path(folder))
         _, large_update, _ = learning(LARGE, Path(folder))
-        started(network)  # not counted, because it may compile
+        started(network)  # its times do not count, because this first start may compile kernels
         used, held = started(network)
         steps = timings.measure(Robot.load(ARM), DEFAULT)
         moved = wire(args.seconds)

@@ -27,7 +27,7 @@ from musculoskeletal_ae.options import Parser
 
 ROOT = Path(__file__).resolve().parents[1]
 ROS_REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt'
-#: all packages that `--node` installs: the imports of the core and the estimator
+#: packages that `--node` installs: all that the core and the estimator import
 NODE_REQUIREMENTS = ('numpy', 'pin', 'safetensors', 'msgspec', 'PyYAML')
 #: package versions of Ubuntu 24.04
 UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1', 'lark==1.1.9')
@@ -35,7 +35,8 @@ UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1'
 APT_PINOCCHIO = ('pin==2.7.0', 'numpy==1.26.4')
 DEBIAN_PACKAGES = 'python3,ca-certificates,procps,util-linux'
 BRINGUP = ('--robot', 'arm26', '--duration', '10')
-#: Tests of what depends on the platform: numbers, compiled libraries, files, processes and rclpy.
+#: tests of parts that depend on the platform: arithmetic, compiled libraries, files, processes and
+#: rclpy
 TESTS = (
     'test/robot/test_kinematics.py',
     'test/robot/test_wrapping.py',
@@ -61,9 +62,9 @@ class Site:
     """One platform: its clone, its log, and the commands that enter it."""
 
     folder: Path
-    setup: list[str] = field(default_factory=list)  # shell lines before every command
-    inside: list[str] = field(default_factory=list)  # command that runs a shell on the platform
-    clone_inside: str = ''  # path of the clone on the platform, if different
+    setup: list[str] = field(default_factory=list)  # shell lines that precede every command
+    inside: list[str] = field(default_factory=list)  # words of the command that enters the platform
+    clone_inside: str = ''  # path of the clone as seen on the platform, if it differs from `clone`
 
     @property
     def clone(self) -> Path:
@@ -109,7 +110,7 @@ def _environment(home: Path) -> dict[str, str]:
     }
     paths = kept.get('PATH', '').split(os.pathsep)
     kept['PATH'] = os.pathsep.join(path for path in paths if not path.startswith(sys.prefix))
-    # Reuse the download cache of pip.
+    # HOME changes below, so name the user's pip cache: it saves the downloads.
     kept.setdefault('PIP_CACHE_DIR', str(Path.home() / '.cache' / 'pip'))
     return {**kept, 'HOME': str(home)}
 
@@ -119,7 +120,8 @@ def interpreter(version: str) -> Path | None:
     pyenv = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv')) / 'versions'
     candidates = [shutil.which(f'python{version}'), *sorted(pyenv.glob(f'{version}.*/bin/python'))]
     for candidate in filter(None, candidates):
-        # The shims of pyenv on PATH may only report that no version is selected.
+        # A candidate on PATH may be a shim of pyenv. It runs no Python, but reports an error, if
+        # pyenv has not selected this version.
         script = 'import sys, venv; print("%d.%d" % sys.version_info[:2])'
         run = subprocess.run([candidate, '-c', script], capture_output=True, text=True)
         if run.stdout.strip() == version:
@@ -219,7 +221,7 @@ def _debian_13(site: Site) -> None:
         'Debian 13',
         f'debootstrap --variant=minbase --include={DEBIAN_PACKAGES} trixie {root}',
         f'cp /etc/resolv.conf {root}/etc/',
-        # For networks that reach registries through a custom certificate.
+        # Some networks need a custom certificate or pip.conf to reach package registries.
         f'[ -z "${{PIP_CERT-}}" ] || cp -L "$PIP_CERT" {root}/"$PIP_CERT"',
         f'[ ! -e /etc/pip.conf ] || cp /etc/pip.conf {root}/etc/',
         f'cp -a {site.clone} {root}/root/clone',

@@ -8,8 +8,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-TICK = os.sysconf('SC_CLK_TCK')  # unit of CPU times in /proc [1/s]
-PAGE = os.sysconf('SC_PAGE_SIZE')  # unit of memory sizes in /proc [bytes]
+TICK = os.sysconf('SC_CLK_TCK')  # /proc counts CPU time in ticks: ticks per second
+PAGE = os.sysconf('SC_PAGE_SIZE')  # /proc counts memory in pages: bytes per page
 PATIENCE = 20.0  # longest wait for the end of a process [s]
 
 

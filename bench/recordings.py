@@ -51,9 +51,9 @@ class Split(NamedTuple):
     name: str
     training: Run  # rest samples
     test: Run  # all rows
-    #: the same rest samples by run, to which the statics are fitted; if empty, they are not fitted
+    #: `training` by run, to which `Statics` is fitted; empty if it is not fitted to this split
     rests: list[Run]
-    #: all rows of the training runs, to which polynomials are also fitted; or None
+    #: all rows of the training runs; if given, polynomials are fitted to them as well
     full: Run | None = None
 
 
@@ -66,8 +66,8 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
     """Split the soft neck: training with one payload, or with two and test with the third."""
     none, half, whole = recording.runs
     own = none.at_rest(HALF)
-    # Rows of every second pose, which are not used for training. A pose extends from the end of
-    # the previous rest to the end of its own.
+    # The rests of every other pose (HALF) are for training, so test on all rows of the poses
+    # between. A pose extends from the end of the previous rest to the end of its own rest.
     pose = np.searchsorted(none.rests[:, 1], np.arange(len(none.length)), side='right')
     others = (pose % 2 == 1) & (pose < len(none.rests))
     yield Split('0 g → other poses, 0 g', own, _rows(none, others), [], _rows(none, ~others))
@@ -110,7 +110,10 @@ SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {
 def models(
     recording: Recording, split: Split, directory: Path, learned: dict[tuple[str, bool], Model]
 ) -> Iterator[tuple[str, Model]]:
-    """Yield every model of a split with its name; `learned` keeps those of equal training rows."""
+    """Yield every model of a split with its name.
+
+    `learned` caches the models of the package, because several splits have the same training rows.
+    """
     efforts = (False, True) if split.training.effort.size else (False,)
     for with_effort in efforts:
         what = 'lengths and efforts' if with_effort else 'lengths'

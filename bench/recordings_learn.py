@@ -25,7 +25,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
 INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
-#: effort in the training rests that counts as this tension, where effort is taken for tension [N]
+#: tension [N] that stands for a strong effort (the 95 % quantile of the training rests), in models
+#: that take efforts for tensions
 STRONG = 40.0
 
 Model = Callable[[Run], Array]  # returns θ [rad], (N, D)
@@ -68,7 +69,10 @@ def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
 
 
 def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
-    """Return what stands for the tensions [N]: those assumed, or T_bias with the effort on top."""
+    """Return a function that computes the tensions [N], (N, M), of a run.
+
+    With efforts, the tension is T_bias plus the scaled effort; otherwise, the assumed tension.
+    """
     if not with_effort:
         return lambda run: np.tile(robot.actuation.assumed_tension, (len(run.length), 1))
     strong = np.quantile(np.abs(training.effort), 0.95)
@@ -83,9 +87,10 @@ def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], 
 def package(
     link: SoftLink, directory: Path, training: Run, with_effort: bool = False, seed: int = 0
 ) -> Model:
-    """Return what this package learns: a network, trained on the calibrated body of the rests.
+    """Return the estimate of θ by a network of this package, trained on the rest samples.
 
-    Without efforts, the tension is unknown. With them, they are taken for tensions.
+    The network learns the body model that was calibrated with them. With efforts, these are taken
+    for tensions; without, the tensions are unknown.
     """
     robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
     tension = tensions(robot, training, with_effort)
@@ -111,10 +116,10 @@ class Statics:
     of the IMU in a run is unknown as well, and 0 in runs without training samples.
     """
 
-    #: log K [N·m/rad], log k [N/m], log γ, p [m], λ: prior means and spreads
+    #: means and standard deviations of the prior of log K [N·m/rad], log k [N/m], log γ, p [m], λ
     MEAN = np.array([0.0, np.log(3000.0), 0.0, 0.001, 1.0])
     SPREAD = np.array([1.0, 1.5, 0.1, 0.002, 0.5])
-    #: standard deviations of the prior of the IMU's orientation, and of a rest sample [rad]
+    #: standard deviations of the IMU's orientation in the prior, and of θ in a rest sample [rad]
     TILT, NOISE = 0.02, 0.015
     ROUNDS = 15
 
@@ -156,7 +161,8 @@ class Statics:
             stiffness = np.exp(stiff) * (over > 0.0)
             torque = held + np.einsum('nmd,nm->nd', jacobian, stiffness * over)
             slope = slope + np.einsum('nmi,nm,nmj->nij', jacobian, stiffness, jacobian)
-            # A payload may make the link unstable without its tendons.
+            # With slack tendons, a payload may make the link unstable: the slope is then not
+            # positive definite, and the Newton step would not lead to an equilibrium.
             least = np.linalg.eigvalsh(slope)[:, 0]
             slope = slope + np.maximum(0.0, 0.2 - least)[:, None, None] * eye
             step = np.linalg.solve(slope, torque[..., None])[..., 0]
@@ -165,9 +171,10 @@ class Statics:
 
 
 def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float:
-    """Return R² of payloads of left-out runs, by ridge regression on means of each run's end.
+    """Estimate each run's payload by ridge regression on the other runs; return R².
 
-    1: the payload is known exactly; 0 or less: no better than the mean payload.
+    The inputs are the means of lengths, and optionally efforts and θ, at the last rest of each run.
+    R² is 1 if all payloads are estimated exactly, and 0 or less if the mean payload is as good.
     """
     rests = [run.at_rest(slice(-1, None)) for run in runs]
     parts = [[run.length[0]] for run in rests]
@@ -190,7 +197,7 @@ def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float
 
 
 def bend_gain(run: Run, azimuths: Array) -> float:
-    """Return by how much the bend at rest rises with the commanded one [rad/m]."""
+    """Return the slope of the bend at rest [rad] over the commanded bend, as tendon length [m]."""
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound = -rest.length @ out
@@ -199,7 +206,7 @@ def bend_gain(run: Run, azimuths: Array) -> float:
 
 
 def effort_slope(run: Run, azimuths: Array) -> float:
-    """Return by how much the efforts at rest rise with the commanded bend, in units of effort/m."""
+    """Return the slope of the efforts at rest over the commanded bend, as tendon length [m]."""
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound, effort = -rest.length @ out, rest.effort @ out

@@ -21,7 +21,8 @@ import yaml
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-#: link below and above the joints, whose axes cross in the middle
+#: robot of a soft link: one half of the link below and one half above the two joints, whose axes
+#: cross in the middle of the link
 URDF = """<robot name="{name}">
   <link name="base"/>
   <joint name="bend_x" type="revolute"><parent link="base"/><child link="cross"/>
@@ -51,7 +52,7 @@ class Run:
     length: Array  # l, paid-out tendon since the start [m], (N, M)
     effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
     theta: Array  # θ, which an independent sensor measured [rad], (N, D)
-    rests: Array  # first row of each rest, and the row after its last one, (R, 2)
+    rests: Array  # first row of each rest, and the row after its last row, (R, 2)
 
     def at_rest(self, rows: slice = slice(None)) -> Run:
         """Return the rest samples as a run."""
@@ -88,7 +89,7 @@ class SoftLink:
         document = {
             'joints': ['bend_x', 'bend_y'], 'muscles': muscles, 'end_effector': 'head',
             'actuation': 'position', 'tension_source': tension_source,
-            # Tendons of steel, without an elastic element.
+            # The tendons are of steel and have no series elastic element, so they hardly stretch.
             'series_elastic': {'force': 1000.0, 'rate': 1000.0, 'wire_stretch': 1e-6},
             'tension': {'bias': 5.0, 'limit': 60.0, 'max': 100.0},
         }  # fmt: skip
@@ -110,7 +111,7 @@ class Repository:
     """A public repository with recordings."""
 
     name: str  # owner/name on GitHub
-    recording: str  # name of the link, under which its results stand
+    recording: str  # name of the link; the results are stored under it
     licence: str
     robot: str  # one line about the robot and its sensors
     read: Callable[[Files], Recording]
@@ -172,7 +173,10 @@ def _columns(text: str) -> dict[str, Array]:
 
 
 def _ends(changes: Array, count: int, rows: int) -> Array:
-    """Return first and last row of the last `rows` of each pose, which ends at a change."""
+    """Return the last `rows` rows of each pose, (R, 2): the first row, and the row after the last.
+
+    A pose ends at a row in `changes` or at `count`. Poses of at most twice `rows` are left out.
+    """
     ends = np.append(changes, count)
     starts = np.append(0, changes)
     spans = [(end - rows, end) for start, end in zip(starts, ends) if end - start > 2 * rows]
@@ -182,7 +186,8 @@ def _ends(changes: Array, count: int, rows: int) -> Array:
 def soft_neck(files: Files) -> Recording:
     """Read the open-loop runs of the soft neck: encoders [degrees] and an IMU, 100 per second."""
     folder = 'paper-results/csv-results/Frontiers-Test-Bench-Evaluation-Soft-Robotic-Link'
-    spool, ratio = 0.01, 5.69  # radius of the spool [m]; distance of the tendons over that radius
+    # radius of the spool [m], and distance of the tendons from the middle as a multiple of it
+    spool, ratio = 0.01, 5.69
     runs = []
     for load in (0, 500, 1000):
         column = _columns(files.text(f'{folder}/imu_openloop/spring_test_{load}gr.csv'))
@@ -205,10 +210,8 @@ def soft_neck(files: Files) -> Recording:
 
 def soft_arm(files: Files) -> Recording:
     """Read the control runs of the soft arm: motors [rad], currents [mA], IMU, 50 per second."""
-    spool, distance = (
-        0.0093,
-        0.0382,
-    )  # radius of the spool, and distance of the tendons from the axis [m]
+    # radius of the spool, and distance of the tendons from the middle of the link [m]
+    spool, distance = 0.0093, 0.0382
     runs = []
     for name in files.names(r'graphs/Control/.*/Masa_f?\d+/.*\.csv'):
         rows = [line.split(',') for line in files.text(name).split('\n')]
@@ -218,7 +221,7 @@ def soft_arm(files: Files) -> Recording:
             continue
         theta, length = table[:, 5:7], -spool * table[:, 7:10]
         if np.abs(theta).max() > 1.6 or np.abs(length).max() > 0.2:
-            continue  # the motors or the IMU had failed
+            continue  # impossible values: the motors or the IMU failed during this run
         rests = np.array([[len(table) - round(REST / 0.02), len(table)]])
         short, effort = name.rpartition('/')[2], table[:, 13:16]
         runs.append(Run(short, load, length, effort, theta, rests))
@@ -230,9 +233,10 @@ def continuum_stand(files: Files) -> Recording:
     """Read the test stand: commanded shortenings [0.1 mm] of three tendons, and a tracked tip [mm].
 
     The tip moves on a sphere. Its bend is the direction from the centre of that sphere, seen along
-    the axis that the unloaded link has. Where the tendons run is not stated; it is estimated from
-    the training rows (`fitted`). A tendon that is not shortened is slack where the link
-    bends away from it. Lengths are given ten times as large: the learner suits links of human size.
+    the axis that the unloaded link has. The publication does not state where the tendons run;
+    `fitted` estimates it from the training rows. A tendon that is not shortened is slack where the
+    link bends away from it. Lengths are returned ten times as large as they are, because the
+    learner is made for links of human size.
     """
     rows = [line.split(',') for line in files.text('Dataset/Dataset.txt').split()]
     table = np.array(rows, float)

@@ -10,7 +10,7 @@ import numpy as np
 from bench.recordings_read import repositories
 
 ALL_ROWS = ', of all rows'
-#: what stands for all polynomials that were fitted to all rows of the training runs
+#: label of the one row that stands for all polynomials fitted to all rows of the training runs
 OF_ALL_ROWS = 'best polynomial of all training rows (chosen by its test error)'
 
 

@@ -52,7 +52,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 SMALLEST, INDIVIDUAL, UNSEEN = '2x6', 0, 5000
 HELD_OUT = 300.0  # duration of the held-out motion [s]
-#: heading of each row in the table, by its number
+#: heading of each column of the table, by the key of its numbers in a Row
 COLUMNS = {
     'nominal': '② nominal [rad a joint]',
     'before': 'before [rad a joint]',
@@ -72,9 +72,8 @@ def measure(body: str, folder: Path, minutes: float) -> Row:
     """Return the results of a body; errors are divided by √D."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
-    (folder / 'initial.safetensors').unlink(
-        missing_ok=True
-    )  # remove the file of an interrupted run, because training is timed
+    # Training is timed, so a file that an interrupted run left must not replace it.
+    (folder / 'initial.safetensors').unlink(missing_ok=True)
     begun = time.process_time()
     nominal = initial(robot, folder)
     row = {'training': time.process_time() - begun}
@@ -110,9 +109,10 @@ def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
     updater, count = BodyUpdater(robot, mae), len(exploring.theta)
     kept, rng = np.linspace(0, count - 1, CAPACITY, dtype=int), np.random.default_rng(0)
     times = []
-    with one_thread():  # like the training process
+    with one_thread():  # as in the training process of the learner
         for _ in range(6):
-            kept = np.append(kept[1:], rng.integers(count))  # each update has a new sample
+            # Every update of the node has a new sample.
+            kept = np.append(kept[1:], rng.integers(count))
             part = exploring.part(kept)
             none = np.zeros_like(part.tension)
             observations = Observations(

@@ -63,10 +63,10 @@ class Row(NamedTuple):
     """Results of one individual."""
 
     least_squares: float  # error of least squares on the nominal geometry [rad]
-    off: float  # largest |l − f_geo| over the shoulder's sweep, l as the sensor reads it [mm]
+    off: float  # largest |l − f_geo| while the shoulder sweeps; l is the sensor's reading [mm]
     before: float  # error of preset `paper` before learning [rad]
-    after: float  # error of its last network, accepted or not [rad]
-    simulated: float  # tension error of its simulator after learning [N]
+    after: float  # error of the last network of preset `paper`, accepted or not [rad]
+    simulated: float  # tension error of the simulator of preset `paper` after learning [N]
     refused: float  # fraction of the networks that failed validation
 
 

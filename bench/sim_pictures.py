@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-LOAD = -50.0  # force on the hand in z, as in the paper's simulation [N]
+LOAD = -50.0  # vertical force on the hand [N], as in the paper's simulation
 
 
 def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:

@@ -44,12 +44,13 @@ from musculoskeletal_ae.robot.robot import Robot
 
 PART = 300.0  # robot time of each recording [s]
 REPORT = 1800.0  # robot time between two reports [s]
-#: time until which the error may still vary [s], because the network has just begun to learn
+#: robot time from which on the error is checked [s]; before, the network has just begun to learn
 SETTLED = 1800.0
-TOLERATED = 1.2
-#: time from which memory is compared [s]; before, imports, the store and the reservoir fill it
+TOLERATED = 1.2  # largest legal ratio of an error, or of the memory, to its earlier value
+#: robot time from which on memory is checked [s]; before, imports, the sample store and the
+#: reservoir of messages fill it
 FILLED = 7200.0
-SLOWER = 1.5  # largest legal ratio of update times, last quarter to first
+SLOWER = 1.5  # largest legal ratio of the median update times in the last and the first quarter
 
 
 class RareTrainer(Trainer):
@@ -136,7 +137,7 @@ def main(argv: list[str]) -> int:
     reported = 0
     filled = most = 0.0
     for part in range(round(3600.0 * (2.0 if args.quick else args.hours) / PART)):
-        # A longer tendon has to be wound in further, and the muscle then reads shorter.
+        # A tendon that has crept must be wound in further, so its sensor reads a shorter length.
         crept = np.full(robot.muscle_count, -1e-3 * args.creep * PART / 3600.0 * part)
         arm.set_length_offset(crept)
         stream = record(arm, learner.mae, part, args.moving)

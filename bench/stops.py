@@ -20,10 +20,10 @@ from pathlib import Path
 from musculoskeletal_ae.nodes.parameters import COMBINED, PARAMETERS
 from musculoskeletal_ae.options import Parser, whole
 
-LATEST = 3.0  # latest time of the signal after the start [s]
+LATEST = 3.0  # longest time from the start of the process to the signal [s]
 LONGEST_END = 60.0  # longest legal time from the signal to the end of the process [s]
 ENDED_BY_SIGNAL = (-signal.SIGINT, -signal.SIGTERM)
-PACKAGE = 'site-packages/musculoskeletal_ae'  # part of a file name in a traceback
+PACKAGE = 'site-packages/musculoskeletal_ae'  # in a traceback: the package had started
 SIGNS_OF_A_CRASH = ('Traceback', 'Exception ignored', 'error', 'Fatal')
 
 

@@ -45,7 +45,7 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.robot import Robot
 
-#: legal tension relative to tension.limit, and longest legal time above it [s]
+#: A tension may exceed ALLOWED times tension.limit for at most LONGEST [s].
 ALLOWED, LONGEST = 1.1, 0.5
 EXPLORED = 60.0  # duration of the exploration [s]
 TARGETS, HELD = 4, 4.0  # number of targets of each method, and time for each target [s]
@@ -68,7 +68,7 @@ class Excess(NamedTuple):
 
 
 def excess(share: Array, dt: float) -> Excess:
-    """Return the excess of measured tensions.
+    """Return how far and how long measured tensions exceeded their limit.
 
     Args:
         share: Tensions as multiples of the limit, (N, M).
@@ -97,7 +97,7 @@ class Observed:
 
     @property
     def excess(self) -> Excess:
-        """Return the excess of the recorded tensions."""
+        """Return how far and how long the recorded tensions exceeded their limit."""
         return excess(np.array(self.shares), SAMPLE_TIME)
 
 

@@ -50,7 +50,7 @@ class Row(NamedTuple):
     ours: Callable[[], object]
     torch_eager: Callable[[], object] | None = None
     several: int = 1
-    products: int = 0  # multiply-adds of the network; 0 if they depend on the input
+    products: int = 0  # multiply-adds of the network in a call; 0 if they depend on the input
 
 
 class Timed(NamedTuple):
@@ -211,7 +211,8 @@ def eager_proposed_paper(
         pulls = _tensor(TENSION_SCALE * tension).expand(joints + 1, -1)
         latent = _enter(network, postures, pulls)
         lengths = network.decode(latent)[:, -muscles:] / LENGTH_SCALE
-        jacobian = (lengths[1:] - lengths[0]) / step / TENSION_SCALE  # (D, M), acts on scaled T
+        # Gᵀ (D, M), for tensions that are scaled by TENSION_SCALE
+        jacobian = (lengths[1:] - lengths[0]) / step / TENSION_SCALE
         z, aim, load = latent[0], _tensor(theta), _tensor(torque)
         count = paper.SEARCH.candidates
         steps = paper.SEARCH.largest_step * torch.arange(count) / count
@@ -252,7 +253,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         return simulated
 
     def step(simulated: Any) -> Callable[[], object]:
-        # Reading the last arm's angles waits for all of them.
+        # A GPU computes asynchronously. Reading the angles waits until it has finished.
         return lambda: simulated.step(0.01).theta[-1].tolist()
 
     network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)

@@ -41,7 +41,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 NODES = ('hardware_emulator', 'estimator', 'sim', 'controller')
-#: executables of each row
+#: names of the nodes that run in each row of the table
 KINDS = {
     'nodes': NODES,
     'combined': ('hardware_emulator', 'sim', 'combined'),
@@ -78,8 +78,8 @@ rclpy.init()
 with contextlib.suppress(KeyboardInterrupt):
     rclpy.spin(Plain())
 """
-#: for each node: the topic whose messages trigger publishing ('' for a timer), the published
-#: topics, and the other subscribed topics
+#: topics of each node: the one whose messages trigger publishing ('' for a timer), the published
+#: ones, and the other subscribed ones
 BARE = {
     'bare_hardware_emulator': ('', 'muscle_states joint_states', 'muscle_length_command'),
     'bare_estimator': (
@@ -177,7 +177,8 @@ class System:
             else:
                 assignments[name].append(f'checkpoint:={network}')
             if name in ('controller', 'combined'):
-                # A pause of a busy machine must not stop the emulated arm.
+                # A busy machine may pause for longer than the default `max_age`, which would stop
+                # the arm.
                 assignments[name] += ['explore:=true', 'max_age:=1.0']
             if name == 'learner':
                 assignments[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
@@ -190,18 +191,20 @@ class System:
             if name in BARE:
                 command = [sys.executable, '-c', ALONE, name, robot, str(rate), *BARE[name]]
             self.nodes[name] = subprocess.Popen(command, **quiet)
-        # Without rclpy's signal handlers, because SIGTERM has to end the whole bench.
+        # With its own signal handlers, rclpy would end only its context on SIGTERM. The handlers of
+        # `bench.__main__` end the whole bench.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._rclpy, self._node = rclpy, rclpy.create_node('wire')
         executor = make_executor()
         executor.add_node(self._node)
         self.stamps: dict[str, list[int]] = defaultdict(list)
         for topic in ('muscle_states', 'muscle_length_command'):
-            # rclpy inspects the signature and cannot handle that of a partial.
+            # rclpy inspects the signature of a callback and cannot handle that of a `partial`, so
+            # a default value binds the topic.
             def take(_: Any, info: dict[str, Any], topic: str = topic) -> None:
                 self.stamps[topic].append(info['source_timestamp'])
 
-            # Raw messages keep the CPU time of this observer low.
+            # Only the time stamps are needed. Leaving messages serialized saves CPU time.
             self._node.create_subscription(
                 Float64MultiArray, topic, take, qos_profile_sensor_data, raw=True
             )
@@ -225,9 +228,9 @@ class System:
 class Wire(NamedTuple):
     """Results of a system of nodes."""
 
-    latency: tuple[float, ...]  # median, 99th percentile, largest [ms]
-    late: float  # percentage of late messages [%]
-    missed: float  # percentage of missed messages [%]
+    latency: tuple[float, ...]  # median, 99th percentile and maximum [ms]
+    late: float  # messages of the emulator without a command within two periods [%]
+    missed: float  # messages of the emulator that did not arrive [%]
     cpu: dict[str, float]  # CPU time of each node [% of a core]
 
     def __str__(self) -> str:
@@ -269,7 +272,7 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
         )
     after = np.searchsorted(commands, states)
     known = after < len(commands)
-    latency = (commands[after[known]] - states[known]) * 1e-6  # [ms]
+    latency = (commands[after[known]] - states[known]) * 1e-6  # stamps in ns, latency in ms
     late = (latency > 2e3 / rate).sum() + (states[~known] < states[-1] - 2e9 / rate).sum()
     late = 100.0 * float(late) / len(states)
     missed = 100.0 * max(0.0, 1.0 - len(states) / (rate * passed))

@@ -45,7 +45,7 @@ HELD_OUT = 300.0  # duration of the held-out motion [s]
 AFTER = 30.0  # duration of the motion after a calibration [s]
 LONGEST = 120.0  # longest duration of a calibration [s]
 SETTLING = 20.0  # time until the arm hangs still [s]
-#: error of the stated posture [rad], added to the angle of each joint
+#: error of the posture that is stated to the calibration [rad], the same for each joint
 STATED = 0.0
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 

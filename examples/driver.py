@@ -23,9 +23,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.robot.robot import Robot
 
-RATE = 100.0  # [Hz]
-SPOOL = 0.01  # [m] radius of the spools
-SILENCE = 0.5  # [s] without a command after which tension decreases to T_bias
+RATE = 100.0  # rate at which sensors are read and tensions regulated [Hz]
+SPOOL = 0.01  # radius of the spools [m]
+SILENCE = 0.5  # time without a command after which tensions decrease to T_bias [s]
 RELEASE = 100.0  # rate of this decrease [N/s]
 
 
@@ -58,7 +58,7 @@ class Driver(Node):
         super().__init__('driver')
         self.robot = Robot.load(self.declare_parameter('robot', 'arm26').value)
         self.bus = Bus(self.robot)
-        # The last command: l_target [m] or T [N], and its time of arrival [s].
+        # The last command: l_target [m], or T [N] if `by_tension`, and its time of arrival [s].
         self.target, self.by_tension, self.commanded_at = None, False, -SILENCE
         self.setpoint = np.full(self.robot.muscle_count, self.robot.tension.bias)
         self.states = self.create_publisher(Float64MultiArray, 'muscle_states', 10)
@@ -96,7 +96,7 @@ if __name__ == '__main__':
     rclpy.init()
     try:
         rclpy.spin(Driver())
-    except (MusculoskeletalError, ParameterException) as error:  # unknown robot, or not a name
+    except (MusculoskeletalError, ParameterException) as error:  # `robot` is unknown, or no string
         sys.exit(f'error: {error}')
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -19,7 +19,7 @@ from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-PERIOD = 0.01  # [s] between two readings
+PERIOD = 0.01  # time between two readings [s]
 
 parser = argparse.ArgumentParser(description='Learn an emulated arm, and estimate its joints.')
 parser.add_argument(
@@ -37,12 +37,12 @@ arm = EmulatedArm(robot, seed=1)
 learner = Learner(robot, initial)
 
 rng, time = np.random.default_rng(0), 0.0
-errors = []  # of the initial and the newest network, at each rest [rad]
+errors = []  # errors of the initial and of the newest network [rad], at each rest
 for theta in robot.random_postures(options.postures, rng):
     tension = rng.uniform(40.0, 120.0, robot.muscle_count)
     goal = robot.muscle_lengths(theta[None], tension[None])[0]
     direction, start = FrictionDirection(), arm.sense().length
-    for step in range(150):  # move for half a second, then rest
+    for step in range(150):  # move for 0.5 s, then rest for 1 s
         time += PERIOD
         arm.command_length(start + (goal - start) * min(1.0, step / 50))
         arm.step(PERIOD)

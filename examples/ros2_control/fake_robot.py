@@ -25,8 +25,8 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
-UPDATE_RATE = 100.0  # [Hz] of the controller_manager
-SPOOL_RADIUS = 0.012  # [m]
+UPDATE_RATE = 100.0  # update rate of the controller_manager [Hz]
+SPOOL_RADIUS = 0.012  # radius of the spools [m]
 
 
 class Hardware:
@@ -38,7 +38,7 @@ class Hardware:
         index = np.arange(self.robot.muscle_count)
         self.motors = [f'{muscle}_motor' for muscle in self.robot.muscles]
         self.direction = np.where(index % 2, 1.0, -1.0)  # −1: the angle rises as the motor winds in
-        self.zero = 0.5 * index  # [rad] at θ = 0 without tension
+        self.zero = 0.5 * index  # motor angles at θ = 0 without tension [rad]
 
     def read(self) -> dict[str, dict[str, float]]:
         """Return the state interfaces of every joint: angles [rad] and torques [N·m]."""
@@ -82,7 +82,7 @@ class FakeRobot(Node):
     def update(self) -> None:
         """Read the hardware, publish its state, and write the last command, however old it is."""
         states = self.hardware.read()
-        message = JointState(name=sorted(states))  # the order means nothing
+        message = JointState(name=sorted(states))  # receivers match by name, so any order is right
         message.header.stamp = self.get_clock().now().to_msg()
         for field in ('position', 'velocity', 'effort'):  # NaN: the joint has no such interface
             values = [states[name].get(field, math.nan) for name in message.name]
@@ -101,7 +101,7 @@ if __name__ == '__main__':
     rclpy.init()
     try:
         rclpy.spin(FakeRobot())
-    except (MusculoskeletalError, ParameterException) as error:  # unknown robot, or not a name
+    except (MusculoskeletalError, ParameterException) as error:  # `robot` is unknown, or no string
         sys.exit(f'error: {error}')
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
