@@ -33,16 +33,17 @@ from musculoskeletal_ae.schema import Strict, convert
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN
 
 FORMAT_VERSION = 1  # version of the file format
-#: largest size of a checkpoint [bytes]; the networks of the shipped arms have a hundredth of it
+#: largest size of a checkpoint [bytes]; those of the shipped robots have a hundredth of this size
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024  # largest size of a checkpoint's header [bytes]
-# No trained network has values beyond the following limits. They could overflow when `Mae` folds
-# units and standardisation into the layers.
+# No trained network has values beyond the following limits. Values beyond them could overflow when
+# `Mae` folds units and standardisation into the layers.
 LARGEST = 1e9  # largest absolute value of any number
 SMALLEST_STD = 1e-9  # smallest standard deviation
 LARGEST_FRICTION = 5.0  # largest μ; the tensions at the ends of a tendon then differ 150-fold
 SMALLEST_EIGENVALUE = 1e-12  # smallest eigenvalue of a covariance, relative to the largest one
-#: smallest eigenvalue of the springs' stiffness, relative to the largest one; negative by rounding
+#: smallest eigenvalue of the springs' stiffness, relative to the largest one; it is 0 except for
+#: rounding errors
 SMALLEST_SPRING_EIGENVALUE = -1e-6
 #: largest absolute values in the estimate of the middle posture: θ [rad], T [N], l [m], G [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
@@ -188,8 +189,8 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
 
     Args:
         data: The bytes.
-        robot: If present, the network must have its joints and muscles in the same order, and
-            its estimate of the middle posture must be within LARGEST_ESTIMATES.
+        robot: If present, the network must have this robot's joints and muscles in the same order,
+            and the network's estimate of the middle posture must be within LARGEST_ESTIMATES.
         source: Name of the checkpoint in error messages.
 
     Raises:
@@ -231,7 +232,8 @@ def _metadata(data: bytes) -> Metadata:
         problem = f'no metadata ({error}); this is not a checkpoint of musculoskeletal_ae'
         raise CheckpointError(problem) from error
     values = {key: _json(text, key) for key, text in entries.items()}
-    # The version is checked first, because another version may violate the whole schema.
+    # The version is checked first, because a file of another version may violate the schema in
+    # many ways, and the error should name the cause.
     version = values.get('format_version')
     if version is True or version != FORMAT_VERSION:
         problem = f'format_version {version!r:.100}; legal: {FORMAT_VERSION}'
@@ -294,7 +296,7 @@ def _check_covariance(name: str, covariance: Array) -> None:
     if not np.array_equal(covariance, covariance.T):
         raise CheckpointError(f'tensor {name} is not symmetric')
     try:
-        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # equal if there is only one
+        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # the same one if there is only one
     except np.linalg.LinAlgError as error:
         raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
     # The detector inverts the matrix, so it must not be close to singular.

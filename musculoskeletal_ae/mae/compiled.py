@@ -12,7 +12,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Singles
 
-# With Python's numbers, numba would compute in double precision.
+# With Python's floats instead, numba would compute in double precision.
 ONE, TWO, LARGEST = np.float32(1.0), np.float32(2.0), np.float32(7.9)
 P0, P1, P2, P3, P4, P5, P6 = np.array(
     [4.89352455891786e-3, 6.37261928875436e-4, 1.48572235717979e-5, 5.12229709037114e-8,
@@ -33,7 +33,7 @@ def _tanh(u: np.float32) -> np.float32:
 
 @njit(cache=True, fastmath=True, error_model='numpy', nogil=True)
 def tanh_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
-    """Overwrite u (N, units) with tanh(u + bias); return it and its derivative."""
+    """Overwrite u (N, units) with h = tanh(u + bias); return h and dh/du."""
     slope = np.empty_like(u)
     for n in range(u.shape[0]):
         for i in range(u.shape[1]):

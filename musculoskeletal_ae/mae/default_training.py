@@ -4,17 +4,18 @@
     L = ‖θ − θ_calc‖ + ‖T − T_calc‖ + ‖l − l_calc‖ + ‖G − G_calc‖
 
 Each norm is in units of the standard deviation of the data, so that all have similar weight. G is
-the muscle Jacobian ∂l/∂θ through ①, which control needs. Its error is the difference quotient
-between each sample and a close neighbour, its twin. Every sample passes through all three masks.
-Muon updates the matrices, with a step size that rises and then falls to zero.
+the muscle Jacobian ∂l/∂θ through ①, which control needs. Each sample has a twin, which is a close
+neighbour. The length error of the sample minus that of its twin, divided by their distance, serves
+as the error of G. Every sample passes through all three masks. Muon updates the matrices, with a
+step size that rises and then falls to zero.
 
 LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. A body of several groups
 that share no joint or muscle gets a block of the network for each group. The layers of a larger
 group grow in proportion to its D + M. If they grew by the square root, the error of θ of a
-body with 17 joints and 40 muscles would be 0.0045 instead of 0.0030 rad per joint. The mini-batches
-of initial training grow with D + M of the largest group to the power of 1.5. With this power, ② is
-a tenth better for that body than for the arm with 5 joints; if they grew in proportion to D + M, ②
-would be worse.
+body with 17 joints and 40 muscles would be 0.0045 instead of 0.0030 rad per joint. The number of
+mini-batches in initial training grows with D + M of the largest group to the power of 1.5. With
+this power, the error of ② is a tenth lower for that body than for the arm with 5 joints. If the
+number grew in proportion to D + M, the error would be higher than for the arm.
 """
 
 import math
@@ -45,20 +46,21 @@ BATCH = 128  # number of samples of a mini-batch
 SAMPLES = 200_000  # largest number of different samples
 STEP_SIZE = 0.004  # step size of the biases; `optimiser` derives the step size of the matrices
 REFERENCE = 5 + 10  # D + M of the arm to which LAYERS and STEPS apply
-# Largest number of muscles per joint that count. Further muscles add equations, but no unknowns.
+# `size` counts at most this number of muscles per joint, because further muscles add equations, but
+# no unknowns.
 COUNTED_MUSCLES = 2.5
 
-# Fraction of samples with tensions beyond tension.limit. A payload causes such tensions, and an
-# estimator trained on a few of them degrades gracefully.
+# Fraction of samples with tensions beyond tension.limit. Payloads can cause such tensions. An
+# estimator that was trained with a few of these samples loses accuracy only gradually there.
 OVERLOAD_SHARE = 0.2
 # Samples of θ exceed each joint limit by up to this fraction of the range. A network is least
 # accurate at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
-# Distance of twins in standard deviations of θ: small compared with the curvature of a route, but
-# large enough for float32 to resolve the difference.
+# Distance between a sample and its twin, in standard deviations of θ. Over this distance, routes are
+# almost linear, but float32 still resolves the difference.
 TWIN_DISTANCE = 0.1
-# Lower limit of the standard deviation in scaled units. Standardisation would otherwise amplify a
-# joint or muscle that hardly varies.
+# Lower limit of the standard deviation that standardisation divides by, in scaled units. Without
+# it, standardisation would amplify the noise of a joint or muscle that hardly varies.
 LEAST_SPREAD = 1e-4
 RISE = 0.05  # fraction of the training during which the step size rises
 
@@ -103,9 +105,9 @@ def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State
 
 
 def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Return the highest tension of each sample [N]: tension.limit, in some rows up to tension.max.
+    """Return the upper limit of the tensions of each sample [N], (count, M).
 
-    The shape is (count, M).
+    It is tension.limit, except in some random samples, where it is up to tension.max.
     """
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
@@ -118,7 +120,8 @@ def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generato
     Args:
         robot: The geometric model.
         samples: Scaled (θ, T, l), (N, D+2M).
-        std: Standard deviations of the samples, (D+2M,); twins are TWIN_DISTANCE of them apart.
+        std: Standard deviations of the samples, (D+2M,). The twins' distance in θ, measured in
+            these standard deviations, is TWIN_DISTANCE.
         rng: Draws the directions in θ.
 
     Returns:
@@ -148,7 +151,7 @@ def loss(network: Network, samples: Tensor) -> Tensor:
     values = torch.cat([rows.repeat(3, 1), twins])  # (4N, D+2M)
     error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std
-    # The difference quotient of the error between neighbours is the error of ∂l/∂θ.
+    # The error of l as a difference quotient between sample and twin is the error of ∂l/∂θ.
     between = (error[-count:] - error[:count])[:, -muscles:] / TWIN_DISTANCE
     slope = (between.square().sum(dim=1) + TINY).sqrt().mean()
     parts = error[:-count].square().split([joints, muscles, muscles], dim=1)

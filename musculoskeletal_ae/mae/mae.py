@@ -4,23 +4,24 @@
     z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z)
 
 (paper, §III-A). Inputs and outputs are in SI units. The constructor folds the units of the network,
-its standardisation and the constant mask inputs into the first and last layers. One estimate is
-therefore six small matrix products and nothing else.
+its standardisation and the constant mask inputs into the first and last layers. One estimate
+therefore computes only six small matrix products and the activations between them.
 
 The products use single precision, because the weights of a large body then fit into a core's cache.
 The rounding error of 1e-6 is far below the error of a network. Inputs and outputs are arrays of
 double precision.
 
-Sensor values of isolated muscles have no influence. θ is then the most likely posture given the
-other muscles' lengths. Each isolated muscle's length is replaced by ①(θ, T), and ② then gives T and
-l:
+Sensor values of isolated muscles have no influence. If muscles are isolated, θ is the most likely
+posture given the lengths of the other muscles:
 
     θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T) of the other muscles
 
-θ̄ and s are mean and standard deviation of the training data. Σ is the covariance of the length
-residuals of ② on the healthy arm. ② fits θ to the same lengths, so its residuals lack the part that
-an error of θ explains. Generalised least squares give the same θ with or without that part, for any
-subset of the muscles.
+The length of each isolated muscle is then replaced by ①(θ, T), and ② gives T and l of all muscles.
+
+θ̄ and s are the mean and standard deviation of θ in the training data. Σ is the covariance of the
+length residuals of ② on the healthy arm. ② fits θ to the same lengths, so its residuals lack the
+part that an error of θ explains. Generalised least squares give the same θ with or without that
+part, for any subset of the muscles.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ Layer = tuple[Array, Array]
 # Constants of the estimate with isolated muscles.
 NEWTON_STEPS = 10  # largest number of Newton steps
 SETTLED = 1e-4  # step below which the iteration ends [rad]
-LENGTH_NOISE = 0.0003  # standard deviation that is added to the healthy length residuals [m]
-LENGTH_SPREAD = 0.003  # standard deviation of a length without anomaly statistics [m]
+LENGTH_NOISE = 0.0003  # standard deviation of the sensor noise that is added to Σ [m]
+LENGTH_SPREAD = 0.003  # standard deviation of each length if there are no anomaly statistics [m]
 
 
 class BlockDiagonal:
@@ -67,7 +68,8 @@ class BlockDiagonal:
         Args:
             blocks: Weights of the blocks, each (in, out).
             into: x[..., into] are the inputs of all blocks, in order; None if x is in this order.
-            out: y[..., out] of the blocks' outputs y are the outputs; None to keep their order.
+            out: The result is y[..., out], where y are the outputs of all blocks, in order; None
+                if the result is y.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
@@ -92,8 +94,8 @@ class BlockDiagonal:
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
     """Return x @ weight, shape (..., out), for x (..., in).
 
-    Uses the method `dot` where possible, because the overhead of the operator @ is 0.4 µs higher.
-    This is as long as the product of a layer with one row takes.
+    The operator @ has 0.4 µs more overhead than the method `dot`, as much as the product of one row
+    with a layer takes. `dot` is therefore used where possible.
     """
     if x.ndim > 2 or isinstance(weight, BlockDiagonal):
         return x @ weight
@@ -107,7 +109,7 @@ class Activation(NamedTuple):
     Attributes:
         value: Returns h(u); may overwrite u.
         with_slope: Returns h and dh/du at u + bias; may overwrite u.
-        gain: The factor of u, which the weights before the activation include.
+        gain: Factor from x to u; the weights of the layer before the activation include it.
     """
 
     value: Callable[[Singles], Singles]
@@ -193,7 +195,7 @@ class Stack:
         return (product(x, weight) + bias).astype(np.float64)
 
     def with_pullback(self, values: Array) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the output, and a function from dL/d(output) to dL/d(input)."""
+        """Return the output and its pullback: a function that maps dL/d(output) to dL/d(input)."""
         x, slopes = values.astype(np.float32), []
         for (weight, bias), activation in zip(self.layers, self.activations):
             x, slope = activation.with_slope(product(x, weight), bias)
@@ -222,7 +224,8 @@ class Stack:
         """
         x, tangent = values.astype(np.float32), directions.astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
-            # A single product of all rows is twice as fast as numpy's product of each (K, in).
+            # numpy would multiply each (K, in) matrix separately. One product of all rows is twice
+            # as fast.
             shape = tangent.shape[:-1]
             if len(shape) > 1:
                 tangent = tangent.reshape(-1, tangent.shape[-1])
@@ -239,7 +242,7 @@ class Stack:
 def side_by_side(
     stacks: Sequence[Stack], into: Ints | None = None, out: Ints | None = None
 ) -> Stack:
-    """Combine stacks into one, with `into` and `out` as in `BlockDiagonal`."""
+    """Return one stack of block-diagonal layers; `into` and `out` are those of `BlockDiagonal`."""
     if len(stacks) == 1:
         return stacks[0]
     layers = list[tuple[BlockDiagonal, Singles]]()
@@ -262,8 +265,8 @@ class Mae:
     #: weight (out, in) and bias (out,) in scaled, standardised units, group by group
     encoder: tuple[Layer, ...]
     decoder: tuple[Layer, ...]
-    mean: Array  # mean of scaled (θ, T, l) in standardisation, (D+2M,)
-    std: Array  # standard deviation of scaled (θ, T, l) in standardisation, (D+2M,)
+    mean: Array  # mean by which scaled (θ, T, l) are standardised, (D+2M,)
+    std: Array  # standard deviation by which scaled (θ, T, l) are standardised, (D+2M,)
     version: int = 0  # rises with every checkpoint that the learner publishes
     training: str = ''  # description of the training, for people
     anomaly: AnomalyStatistics | None = None  # statistics of the residuals on healthy data
@@ -426,7 +429,7 @@ class Mae:
 
     @property
     def transmission(self) -> Transmission:
-        """What lies between readings of tension and T_end, as far as it has been learned."""
+        """The learned relation between tension readings and the bone-side tension T_end."""
         if self.touch is None:
             return Transmission(self.friction)
         return Transmission(self.friction, self.touch.drive, self.touch.drive_covariance)
@@ -439,8 +442,8 @@ class Mae:
     def without(self, isolated: Iterable[int]) -> Mae:
         """Return the same network with exactly these muscles isolated.
 
-        The anomaly statistics keep only the other muscles. If a muscle is restored, the statistics
-        lack it and are therefore marked as not calibrated.
+        The anomaly statistics lose the residuals of the isolated muscles. If a muscle is restored,
+        they still lack its residuals and are therefore marked as not calibrated.
         """
         isolated = tuple(sorted(isolated))
         if isolated == self.isolated:

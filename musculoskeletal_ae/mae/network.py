@@ -3,8 +3,8 @@
 
     z = f_encode(θ, T, l, mask),   (θ, T, l) = f_decode(z),   z of size D+M
 
-(paper, §III-A). All quantities are in scaled units. Masked entries are zero at the input of the
-first layer.
+(paper, §III-A). All quantities are in scaled units. The mask selects two of the three quantities;
+the entries of the third are zero at the input of the first layer.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,7 +37,7 @@ class Layers(NamedTuple):
 
 
 class Blocks(nn.Module):
-    """Parallel stacks; each uses some of the inputs and computes some of the outputs."""
+    """Parallel stacks of layers; each uses some of the inputs and computes some of the outputs."""
 
     order: Tensor
 
@@ -58,8 +58,9 @@ class Blocks(nn.Module):
 class Network(nn.Module):
     """The network of D joints and M muscles.
 
-    Its layers have D+2M+3, *hidden, D+M, *reversed hidden and D+2M units. With several groups, each
-    group has a block of such layers with its own D, M and hidden layers.
+    Its layers have D+2M+3, *hidden, D+M, *reversed hidden and D+2M units. The inputs are (θ, T, l)
+    and the three entries of the mask. With several groups, each group has a separate block of
+    layers, with the group's own D, M and hidden layers.
     """
 
     mean: Tensor
@@ -81,10 +82,10 @@ class Network(nn.Module):
             joints: Number of joints D.
             muscles: Number of muscles M.
             layers: Activation, and hidden layers of a network with one block.
-            mean: Mean of scaled (θ, T, l) in standardisation, (D+2M,).
-            std: Standard deviation of scaled (θ, T, l) in standardisation, (D+2M,).
-            blocks: Hidden layers of the block of each group; by default, one block with the hidden
-                layers of `layers`.
+            mean: Mean by which scaled (θ, T, l) are standardised, (D+2M,).
+            std: Standard deviation by which scaled (θ, T, l) are standardised, (D+2M,).
+            blocks: Sizes of the hidden layers in each group's block; by default, the network is
+                one block with the hidden layers of `layers`.
         """
         super().__init__()
         self.joints, self.muscles, self.activation = joints, muscles, layers.activation
@@ -109,7 +110,7 @@ class Network(nn.Module):
         self.register_buffer('rows', torch.tensor(rows, dtype=torch.float32))
 
     def encode(self, values: Tensor, mask: Tensor) -> Tensor:
-        """Return z (N, D+M) of scaled (θ, T, l) (N, D+2M) and indices (N,) into `Mask`."""
+        """Return z (N, D+M) of scaled (θ, T, l) (N, D+2M); `mask` (N,) has indices into `Mask`."""
         standard = (values - self.mean) / self.std
         rows = self.rows[mask]  # (N, D+2M+3)
         width = standard.shape[-1]
@@ -117,7 +118,7 @@ class Network(nn.Module):
         return self.encoder(x)  # (N, D+M)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return scaled (θ, T, l) (N, D+2M); `decoder` returns them standardised."""
+        """Return scaled (θ, T, l) (N, D+2M) of z (N, D+M); `decoder` returns them standardised."""
         return self.decoder(z) * self.std + self.mean
 
     def forward(self, values: Tensor, mask: Tensor) -> Tensor:
@@ -173,7 +174,7 @@ def from_mae(mae: Mae) -> Network:
 
 
 class TorchLengths:
-    """Muscle lengths of a network and their gradients for the simulator, on any torch device."""
+    """Computes a network's muscle lengths and their gradients for simulation on a torch device."""
 
     def __init__(self, mae: Mae, device: str = 'cpu') -> None:
         """Copy the weights of a network to the device."""

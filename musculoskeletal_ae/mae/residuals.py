@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals: T and l restored by ②, minus the measured ones; their statistics on a healthy arm.
+"""Residuals (T and l restored by ② minus measured T and l) and their statistics on a healthy arm.
 
     e = (T_est − T, l_est − l)                        scaled units, shape (2M,)
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, §III-D, eq. 4)
@@ -18,8 +18,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
-# Lowest standard deviation in scaled units, below any sensor's resolution (0.02 N, 0.01 mm). It
-# keeps the covariance invertible if a network restores some combination of its inputs perfectly.
+# Lowest standard deviation of a residual in scaled units; as 0.02 N or 0.01 mm, it is below any
+# sensor's resolution. It keeps the covariance invertible if a network restores some combination of
+# its inputs perfectly.
 FLOOR = 1e-4
 ANYTHING = 10.0  # standard deviation of a residual that is ignored, in scaled units
 LEAST_MOTION = 60.0  # duration of motion that calibrated touch statistics require [s]
@@ -31,7 +32,7 @@ def residuals(
     """Return the residuals e in scaled units, (..., 2M), which are 0 for isolated muscles.
 
     Args:
-        restored: States that the network restored from the measured ones.
+        restored: States that the network restored from the measured T and l.
         tension: Measured T [N], (..., M).
         length: Measured l [m], (..., M).
         isolated: Indices of isolated muscles.
@@ -79,11 +80,14 @@ class AnomalyStatistics:
         return np.sqrt(squares)
 
     def without(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return the statistics with the residuals of these muscles set to 0."""
+        """Return the statistics for residuals that are always 0 for these muscles."""
         return self._with_spread(muscles, FLOOR)
 
     def ignoring(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return the statistics in which the residuals of these muscles may have any value."""
+        """Return statistics in which any residual of these muscles is normal.
+
+        Their residuals then hardly change the result of `distances`.
+        """
         return self._with_spread(muscles, ANYTHING)
 
     def _with_spread(self, muscles: Sequence[int], spread: float) -> AnomalyStatistics:
@@ -100,7 +104,8 @@ class TouchStatistics:
     """Statistics that distinguish contact from friction (`estimation/contact.py`)."""
 
     friction: Array  # tendon friction μ of each muscle, (M,): T = T_end e^{±μ}
-    spread: Array  # root mean square of τ_ext of the healthy moving arm [N·m], (D,); positive
+    #: root mean square of the estimated τ_ext of the healthy moving arm [N·m], (D,); positive
+    spread: Array
     time: float = 0.0  # duration of the motion in which `spread` was measured [s]
     #: γ, b [N] and F [N] of motor currents (`signals.friction.Transmission`), (3, M); None for
     #: tension sensors

@@ -69,7 +69,7 @@ def check_device(device: str) -> None:
     try:
         # An available device may still fail to compute, so compute something.
         torch.ones(1, device=device).sum().item()
-    except (RuntimeError, AssertionError) as error:  # AssertionError: torch was built without it
+    except (RuntimeError, AssertionError) as error:  # torch without CUDA raises AssertionError
         raise MusculoskeletalError(
             f'device {device!r}: torch {torch.__version__} cannot use it; legal: cpu. '
             'For a GPU, install its driver and a build of torch that supports it (pytorch.org)'
@@ -83,8 +83,8 @@ def train_on(device: str) -> None:
         MusculoskeletalError: If torch cannot use the device.
     """
     check_device(device)
-    # A default device slows every call of torch, which costs a fifth of a training step. It is
-    # therefore not set for the CPU.
+    # While a default device is set, every call of torch is slower, and a training step takes a
+    # fifth longer. No default device is therefore set for the CPU.
     torch.set_default_device(None if device == 'cpu' else device)
 
 
@@ -92,7 +92,8 @@ def train_on(device: str) -> None:
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread within a `with` block.
 
-    Matrices this small gain little from a second core and lose much if that core is busy.
+    Products of small matrices are hardly faster on two cores, and much slower if one of the cores
+    is busy.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -140,7 +141,9 @@ def initial_mae(
 
 
 def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
-    """Add the history and anomaly statistics of the geometric model to a trained network.
+    """Return a trained network as a `Mae` with its history and anomaly statistics.
+
+    The statistics are those of held-out states of the geometric model.
 
     Args:
         robot: The geometric model.
@@ -179,7 +182,7 @@ class PairError(NamedTuple):
 
 
 def pair_errors(mae: Mae, states: State) -> list[PairError]:
-    """Return the errors of all nine (mask, output) pairs on some states."""
+    """Return the mean errors over some states, for all nine pairs of mask and output."""
     result = []
     for mask in Mask:
         restored = mae.decode(mae.encode(mask, *states))

@@ -2,8 +2,8 @@
 """Inputs and outputs of the network: (θ, T, l), their scaled units and the three masks.
 
 The paper (§III-A) scales (θ, T, l) to [rad], [N/200], [mm/100], which gives them similar
-magnitudes. Two of the three quantities enter the network; the mask selects them. Values outside the
-network are in SI units.
+magnitudes. Two of the three quantities enter the network; the mask selects which two. Outside the
+network, all values are in SI units.
 """
 
 from enum import Enum

@@ -16,8 +16,7 @@ IEEE Robotics and Automation Letters, 2020. Section and equation numbers are the
     §IV-A           exploration.py        the three steps of random motion
 
 `constants.py` holds the numbers of the paper, and the values that this project chose where the
-paper gives none. Preset `paper` runs the code of this folder. Of the other folders, only `presets/`
-imports it.
-Parts that both presets share (the network's arithmetic, Adam, the geometric model) are imported
-from elsewhere.
+paper gives none. Preset `paper` runs the code of this folder. No folder except `presets/` imports
+from it. Parts that both presets share (the network's arithmetic, Adam, the geometric model) are
+imported from other folders.
 """

@@ -18,7 +18,7 @@ read once, when a method starts, and is limited to the highest permitted tension
 N·mm and T in the network's units. G is a forward difference with Δθ = 0.01 rad.
 
 Every method maps (robot, mae, θ_target [rad] (D,), τ_target [N·m] (D,), T [N] (M,)) to a command.
-There T is T_const or T_current, as the method's equation states.
+Its argument T is T_const or T_current, whichever the equation of the method contains.
 """
 
 import numpy as np
@@ -62,7 +62,7 @@ def second(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) 
 def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
     """Return the command (12) for T_current.
 
-    It does not enforce tension limits and always reports a torque error of zero.
+    The method does not enforce tension limits and always reports a torque error of zero.
     """
     terms = control_loss(robot, mae, theta, torque, tension)
     z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)

@@ -6,7 +6,7 @@
 
 Each of C iterations takes the best of N step sizes. They are the lower ends γ_k = k γ_max/N, k = 0
 … N − 1, of N equal parts of [0, γ_max]; because 0 is one of them, the loss never rises. The paper
-does not state which point of each part it takes. The losses (9), (13) and (14) are sums of norms of
+does not state which point of each part to use. The losses (9), (13) and (14) are sums of norms of
 affine maps of the decoded state:
 
     L(z) = Σ_k w_k ‖A_k y − b_k‖₂,   y = f_decode(z) in scaled units
@@ -20,11 +20,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-TINY = 1e-12  # added to every norm before a division by it, because a norm may be zero
+TINY = 1e-12  # added to every norm that is a divisor, because a norm may be zero
 
 
 class Term(NamedTuple):
-    """One norm of the loss, acting on scaled (θ, T, l)."""
+    """One term w_k ‖A_k y − b_k‖₂ of the loss, where y is scaled (θ, T, l)."""
 
     weight: float  # w_k
     matrix: Array  # A_k, (rows, D+2M)

@@ -50,7 +50,7 @@ class LatentSimulation:
         self._robot = robot
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Use this network, and this robot, which states the isolated muscles."""
+        """Set the network, and the robot with the currently isolated muscles."""
         self._mae, self._robot = mae, robot.with_elasticity(mae.elasticity)
         self._load = Load(self._robot.kinematics)
 

@@ -62,7 +62,7 @@ class DefaultPreset:
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detector that uses d, and those for slack tendons and jammed modules."""
+        """Return the detector of large residuals, and those of slack tendons and jammed modules."""
         from musculoskeletal_ae.estimation.detectors.jammed_module import (
             JammedModule,
             JammedPosition,
@@ -78,13 +78,13 @@ class DefaultPreset:
         return ResidualDistance(robot, settings, slack), [slack, jammed]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return the methods of the paper except `proposed`, which follows a trajectory here."""
+        """Return the paper's methods without `proposed`, which follows trajectories instead here."""
         from musculoskeletal_ae.paper.control import METHODS
 
         return {name: method for name, method in METHODS.items() if name != 'proposed'}
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return the three steps of the paper, with some joints at their limits."""
+        """Return the paper's three steps, with targets that have some joints at their limits."""
         from musculoskeletal_ae.control.exploration import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps
 

@@ -2,7 +2,7 @@
 """The interface of a preset: one strategy for each part in which the presets differ.
 
 A preset only selects strategies, which are implemented beside related code. Each method imports its
-strategy when it is called, because options and parameters are read without numpy and torch.
+strategy when it is called, so that reading options and parameters imports neither numpy nor torch.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Preset(Protocol):
         validates_updates: Whether the learner validates an update before it publishes it
             (`estimation/checkpoint_validation.py`).
         simulates_on_devices: Whether the simulator can run on a torch device.
-        methods_without_tension: Names of the control methods that start from no measured tension.
+        methods_without_tension: Names of the control methods that need no measured tension.
     """
 
     name: str

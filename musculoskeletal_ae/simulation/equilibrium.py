@@ -6,19 +6,20 @@
     l = l_target,  0 ≤ T ≤ T_max                                position-controlled modules
     B θ̇ = −(g(θ) + K θ − b − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
-The paper descends on a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and
-length, and the arm settles in another posture. Here torque and length are equations instead. On the
-surface z = ①(θ, T) of the latent space, they are D+M equations for D+M unknowns, and their root is
-the rest posture. (Solving for z itself, with decoded θ and T, gives a root no closer to that of the
-body, and each step costs more.)
+The paper minimises a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and
+length, so the arm does not settle at the balance of torques. This module therefore solves torque
+and length as equations. On the surface z = ①(θ, T) of the latent space, they are D+M equations for
+D+M unknowns, and their root is the rest posture. (One could also solve for z itself, with decoded θ
+and T. This root is no closer to the rest posture of the body, and each step costs more.)
 
 The arm approaches the root against a viscous resistance B, by linearly implicit Euler steps. These
 are Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and
-geared muscle modules, and so makes speeds realistic; it is larger where muscles have larger moment
-arms, and includes the dampers of the joints. B does not affect the rest posture. K and b describe
+geared muscle modules, which makes speeds realistic. It includes the dampers of the joints, and is
+larger where muscles have larger moment arms. B does not affect the rest posture. K and b describe
 the springs of the joints (`JointElasticity`): the values that the network has learned, or else
 those of the robot description. A joint limit is a hard stop that exerts any torque needed. Tendon
-friction (`friction`) does affect the rest posture: it differs after winding in and paying out.
+friction (`friction`) does affect the rest posture: the arm rests in different postures after
+tendons have been wound in and after they have been paid out.
 """
 
 import math
@@ -53,11 +54,11 @@ JOINT_SPEED = 5.0
 MODULE_SPEED = 0.25  # largest winding speed of muscle modules [m/s], the same as in the emulator
 ROUNDS = 3  # largest number of rounds to find the tendons whose friction reverses in a step
 FARTHEST = 0.05  # largest distance by which a position command runs ahead of the module [m]
-POSTURES_PER_COEFFICIENT = 10  # number of postures per coefficient to which a cubic is fitted
+POSTURES_PER_COEFFICIENT = 10  # a cubic is fitted to this number of postures per coefficient
 
 
 class ArmState(NamedTuple):
-    """N arms between two steps."""
+    """State of N arms after a step."""
 
     theta: Array  # θ_sim [rad], (N, D)
     tension: Array  # T_sim [N], (N, M)
@@ -88,7 +89,7 @@ class Body(NamedTuple):
 
 
 class Limbs(NamedTuple):
-    """The cubics of all limbs, concatenated, for `add_slopes`.
+    """The cubics of all limbs (groups of joints and muscles), concatenated for `add_slopes`.
 
     Flat arrays let the same compiled code serve any number of limbs.
     """
@@ -123,14 +124,14 @@ def follow(
 
     Args:
         command: l_target [m].
-        followed: The length it had reached a step before [m].
+        followed: The length that the module had reached before this step [m].
         length: Muscle length [m].
-        span: How far the command can lie below `length` until the tension is T_max [m].
-        loose: How far the command can lie above `length`, as with a slack tendon [m].
+        span: Distance of the command below `length` at which the tension reaches T_max [m].
+        loose: Distance of the command above `length` beyond which the tension does not change [m].
         most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # Beyond these limits the tension no longer changes, but the way back would take time.
+    # Beyond these limits the tension no longer changes, but the module would need time to return.
     return clip(reached, length - span, length + max(loose, most))
 
 
@@ -208,10 +209,11 @@ def add_slopes(
 def turn(
     body: Body, theta: Array, push: Array, matrix: Array, most: float, fixed: Array, arrived: Array
 ) -> None:
-    """Fill `arrived` with θ (D, N) after a step of at most `most` [rad] per joint.
+    """Fill `arrived` with θ (D, N) after the Newton step Δθ that solves matrix · Δθ = push.
 
-    Joints at a stop stay there, and forced joints move to their forced angles. Only the lower half
-    of the symmetric matrix (D, D, N) is read; it is overwritten.
+    Δθ is scaled down so that no joint moves by more than `most` [rad]. A joint that `push` presses
+    against its stop stays there, and forced joints move towards their angles in `fixed`. Only the
+    lower half of the symmetric `matrix` (D, D, N) is read, and it is overwritten.
     """
     joints, arms = theta.shape
     way, turned, held = np.zeros((joints, arms)), push.copy(), np.empty((joints, arms), np.bool_)
@@ -381,7 +383,7 @@ def advance(
 
 
 class QuasiStatics:
-    """The equations above for one robot and the network that `use` has set."""
+    """Simulates arms of one robot by the equations above, with the network that `use` has set."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.slopes = robot, Slopes(robot)
@@ -446,7 +448,7 @@ class Slopes:
     approaches an equilibrium, whereas the network itself determines where the equilibrium lies. The
     network's exact second derivatives would cost ten times the rest of the step. The cubics of a
     limb depend on its own joints only. A cubic in all 17 joints of an upper body would have 1140
-    coefficients instead of 120.
+    coefficients, whereas one in the 7 joints of an arm has 120.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -479,7 +481,7 @@ class Slopes:
 
 
 class Cubics:
-    """The cubics of one limb."""
+    """Fits a cubic in θ to the length of each muscle of one limb."""
 
     def __init__(self, group: Group, postures: Array) -> None:
         """Prepare fits to lengths at postures θ [rad] (N, D) of the whole body."""
@@ -494,7 +496,11 @@ class Cubics:
         self._bend = _derivative(quadratic, linear, joints)  # (D, linear, quadratic)
 
     def fit(self, lengths: Array) -> tuple[Array, Array]:
-        """Fit lengths [m] (N, M) at these postures; return `first` and `second` of `Limbs`."""
+        """Fit cubics to lengths [m] (N, M) at the N postures of the constructor.
+
+        Returns:
+            The entries of this limb in `Limbs.first` and `Limbs.second`.
+        """
         cubic = self._inverse @ lengths[:, self._muscles]  # (basis, M)
         first = np.einsum('dqb,bm->qmd', self._slope, cubic)
         bend = np.einsum('elq,qmd->mlde', self._bend, first)
@@ -503,9 +509,10 @@ class Cubics:
 
 
 def _derivative(basis: list[tuple[int, ...]], target: list[tuple[int, ...]], joints: int) -> Array:
-    """Return one matrix for each ∂/∂θ_d, from coefficients in `basis` to those in `target`.
+    """Return the matrices (D, target, basis) that differentiate a polynomial by each θ_d.
 
-    The shape is (D, target, basis).
+    Matrix d maps the polynomial's coefficients in `basis` to the coefficients of its derivative
+    ∂/∂θ_d in `target`.
     """
     place = {term: i for i, term in enumerate(target)}
     matrices = np.zeros((joints, len(target), len(basis)))

@@ -5,9 +5,9 @@
 
 (paper, §III-F: the necessary torque from the geometric model), compiled by numba. K and b describe
 the springs of the joints (`JointElasticity`). Pinocchio computes the same torque of the weight, and
-a test compares the two. However, it has no gradient with a wrench, and a call from Python takes as
-long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with axis a_k needs only
-sums over the bodies that it carries:
+a test compares the two. However, Pinocchio has no gradient with a wrench, and calling it from
+Python takes as long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with
+axis a_k needs only sums over the bodies that it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
@@ -64,7 +64,7 @@ def of(arm: int, vectors: Array) -> Vector:
 
 @njit(cache=True)
 def polynomial(terms: Array, order: int, x: float) -> float:
-    """Return the derivative of an order up to 2 of Σ terms_k xᵏ."""
+    """Return the polynomial Σ terms_k xᵏ (order 0), or its first or second derivative by x."""
     value = 0.0
     for k in range(len(terms) - 1, order - 1, -1):
         factor = 1.0
@@ -116,7 +116,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
     """Fill load [N·m] (D, N) and its gradient ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
 
     The wrench [N, N·m] (6, N) acts at the end effector's origin, in axes of the root link. The
-    gradient neglects the contribution of its torque.
+    gradient includes the wrench's force, but not its torque.
     """
     joints, arms = len(tree.parent), theta.shape[1]
     pose, bend = np.empty((joints, 6, 3, arms)), np.empty((3, arms))

@@ -28,7 +28,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
 LONGEST_STEP = 0.01  # longest step [s]; longer times are divided into several steps
-CHUNK = 384  # number of arms whose arrays fit into a core's cache
+CHUNK = 384  # number of arms in a call of the compiled code; their arrays fit into a core's cache
 SETTLING_STEP = 0.1  # duration of a step of `settle` [s]
 SETTLING_STEPS = 300  # largest number of steps of `settle`
 SETTLED = 1e-6  # motion in a step below which the arms have settled [rad]
@@ -103,11 +103,11 @@ class Simulation:
         Raises:
             FloatingPointError: If it cannot be simulated; the current network then stays in use.
         """
-        self._body.use(mae if self._device is None else _there(mae, self._device), self.robot)
+        self._body.use(mae if self._device is None else _on_device(mae, self._device), self.robot)
         self.mae = mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Isolate exactly these muscles, indices in T and l; they then exert no tension."""
+        """Isolate exactly the muscles with these indices in T and l; they then exert no tension."""
         self.robot = self.robot.without(muscles)
         self.use(self.mae)
 
@@ -133,7 +133,7 @@ class Simulation:
         self.state = ArmState(theta, tension, length, length, holding, slid)
 
     def step(self, dt: float) -> ArmState:
-        """Advance by `dt` [s] and return the arms; a `dt` that is not positive does nothing."""
+        """Advance by `dt` [s] if it is positive, and return the new state of the arms."""
         substeps = int(np.ceil(dt / LONGEST_STEP - 1e-9))
         for _ in range(substeps):
             self._advance(dt / substeps)
@@ -170,7 +170,7 @@ class Simulation:
         if wrench.any():
             values['external wrench'] = f'{np.round(wrench, 3).tolist()} N, N·m'
         if limits := self.limits():
-            # No warning, because a healthy arm that explores reaches its limits all the time.
+            # This is not a warning, because an exploring healthy arm often reaches its limits.
             return Report('ok', f'at the limit: {", ".join(limits)}', values)
         commanded = np.isfinite(command).all()
         waiting = self.robot.actuation.choose('resting at T_bias', 'holding its lengths')
@@ -196,7 +196,7 @@ class Simulation:
         self.state = ArmState(*map(np.concatenate, zip(*arms, strict=True)))
 
 
-def _there(mae: Mae, device: str) -> Any:
+def _on_device(mae: Mae, device: str) -> Any:
     """Return a network that computes its lengths on a torch device."""
     # Imported here, because a node that simulates one arm does not need torch.
     from musculoskeletal_ae.mae.network import TorchLengths
@@ -209,9 +209,9 @@ def _there(mae: Mae, device: str) -> Any:
 def on_all_cores(function: Callable[[slice], ArmState], pieces: Sequence[slice]) -> list[ArmState]:
     """Return function(piece) for each piece, in order; the calls run in parallel.
 
-    The function must not wait for another piece. Threads suffice, because compiled code and numpy
-    release Python's global lock. BLAS is limited to one thread, because parallelism at both levels
-    is slower than at either.
+    A call must not wait for another call. Threads suffice, because compiled code and numpy release
+    Python's global lock. BLAS is limited to one thread, because parallel calls with a parallel BLAS
+    are slower than either alone.
     """
     pool, libraries = _cores()
     with libraries.limit(limits=1, user_api='blas'):
