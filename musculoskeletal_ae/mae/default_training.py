@@ -56,8 +56,8 @@ OVERLOAD_SHARE = 0.2
 # Samples of θ exceed each joint limit by up to this fraction of the range. A network is least
 # accurate at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
-# Distance between a sample and its twin, in standard deviations of θ. Over this distance, routes are
-# almost linear, but float32 still resolves the difference.
+# Distance between a sample and its twin, in standard deviations of θ. Over this distance, routes
+# are almost linear, but float32 still resolves the difference.
 TWIN_DISTANCE = 0.1
 # Lower limit of the standard deviation that standardisation divides by, in scaled units. Without
 # it, standardisation would amplify the noise of a joint or muscle that hardly varies.
