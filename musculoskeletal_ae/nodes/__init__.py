@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thin rclpy shells: declare parameters, convert messages, call the core, publish."""
+"""ROS nodes and tools, as thin rclpy shells around the core modules.
+
+A node declares parameters, converts messages, calls the core, and publishes the results.
+"""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Latches an anomaly until the estimator confirms that it has ended.
 
-A true message on `anomaly_detected` latches an anomaly at once. A false one does not clear it,
-because any node could publish it. The latch then asks the estimator by `estimator/check_health`.
+A message `true` on `anomaly_detected` latches an anomaly at once. A message `false` does not clear
+the latch, because any node could publish it. Instead, the latch calls the estimator's service
+`estimator/check_health`, and is cleared if that succeeds.
 """
 
 from __future__ import annotations
@@ -19,10 +20,15 @@ ASK_PERIOD = 1.0  # time after which a request that the estimator has not answer
 
 
 class AnomalyLatch:
-    """Latches anomalies for one node, from messages of `anomaly_detected`."""
+    """Latches the anomalies that messages of `anomaly_detected` report to one node."""
 
     def __init__(self, node: Node, follow: Callable[[bool], object]) -> None:
-        """Begin without an anomaly; call `follow` with every confirmed change."""
+        """Begin without an anomaly.
+
+        Args:
+            node: The node; it calls the service of the estimator.
+            follow: Called with True when an anomaly is latched, with False when it is cleared.
+        """
         self._node, self._follow = node, follow
         self._is_latched = False
         self._client: Any = node.create_client(Trigger, SERVICE)
@@ -32,7 +38,7 @@ class AnomalyLatch:
         self._timer.cancel()
 
     def take(self, detected: bool) -> None:
-        """Process a message of anomaly_detected."""
+        """Process the value of a message of `anomaly_detected`."""
         if detected:
             self._give_up()
             if not self._is_latched:
@@ -43,7 +49,10 @@ class AnomalyLatch:
             self._ask()
 
     def _ask(self) -> None:
-        """Ask the estimator; drop an earlier request, which a restarted estimator never answers."""
+        """Ask the estimator whether the anomaly has ended.
+
+        An earlier request without an answer is dropped: a restarted estimator never answers it.
+        """
         if self._future is not None:
             self._client.remove_pending_request(self._future)
         self._future = self._client.call_async(Trigger.Request())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers that an emulated, simulated or estimated arm shares: states, markers and frames.
+"""Publishers of states, markers and frames for emulated, simulated and estimated arms.
 
 Markers show bones, muscles and names in RViz and Foxglove. The bones of the hardware are ivory and
 opaque, the bones of the estimate green, and the bones of the simulator violet. Link poses are
@@ -35,9 +35,9 @@ from musculoskeletal_ae.validity import read_wrench
 
 MARKER_RATE = 10.0  # rate of the markers [Hz]
 NAME_HEIGHT = 0.018  # height of the muscles' names [m]
-#: colours of the bones by arm: red, green, blue and opacity
+#: colour of the bones of these arms: red, green, blue and opacity
 BONE_COLOURS = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
-HARDWARE_COLOUR = (*BONE_COLOUR, 1.0)  # colour of the bones of all other arms
+HARDWARE_COLOUR = (*BONE_COLOUR, 1.0)  # colour of the bones of all arms not in BONE_COLOURS
 # After a pause (a debugger, a jump of /clock) the arm continues without simulating the missed time.
 # Therefore one step covers at most LONGEST_STEP or MOST_PERIODS periods, whichever is longer.
 LONGEST_STEP = 0.1  # [s]
@@ -95,7 +95,7 @@ class Frames:
         self._publisher = node.create_publisher(TFMessage, '/tf', RELIABLE)
 
     def publish(self, theta: Array) -> None:
-        """Publish the poses at θ [rad] (D,)."""
+        """Publish the poses of all links at the joint angles θ [rad], (D,)."""
         robot, stamp = self._node.robot, self._node.get_clock().now().to_msg()
         joints, transforms = robot.kinematics.tree.transforms(theta[None])[0], []
         for frame in body_frames(robot.kinematics.model):
@@ -110,7 +110,10 @@ class Frames:
 
 
 class Arm(Shell):
-    """A node that takes the place of an arm; like real muscle modules, it obeys every publisher."""
+    """A node that takes the place of an arm.
+
+    Like real muscle modules, it follows commands even while several nodes publish them.
+    """
 
     accepted_from_all = COMMANDS
 
@@ -120,12 +123,18 @@ class Arm(Shell):
         return max(LONGEST_STEP, MOST_PERIODS / self.rate)
 
     def follow_wrench(self, arm: str, follow: Callable[[Array], object]) -> None:
-        """Pass wrenches from ARM/external_wrench to `follow`: (6,) [N, N·m] in root link axes."""
+        """Call `follow` with each wrench from ARM/external_wrench.
+
+        A wrench has the shape (6,): force [N] and torque [N·m] in the axes of the root link.
+        """
         topic, frame = f'{arm}/external_wrench', self.root_frame
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def follow_length_commands(self, follow: Callable[[Array], object]) -> None:
-        """Pass l_target [m] (M,) to `follow`; with ros2_control, convert motor commands to it."""
+        """Call `follow` with each commanded l_target [m], (M,).
+
+        On a ros2_control robot, l_target is computed from the commands to the motors.
+        """
         if not self.motors.command_topic:
             self.follow_muscles('muscle_length_command', follow)
             return
@@ -133,12 +142,19 @@ class Arm(Shell):
         self.listen(Float64MultiArray, MOTOR_COMMAND, take, RELIABLE)
 
     def advertise(self, prefix: str, joint_sensors: bool, description: bool) -> None:
-        """Advertise the states under a topic prefix, and `robot_description` if `description`."""
+        """Advertise the topics of the arm's state.
+
+        Args:
+            prefix: Prefix of the topic names, such as `sim/`. Motors of a ros2_control robot are
+                published instead of `muscle_states` only if it is empty.
+            joint_sensors: Whether to publish `joint_states`.
+            description: Whether to publish `robot_description`.
+        """
         self._joints = None
         self.sources.watch(f'{prefix}joint_states', f'{prefix}muscle_states')
         if joint_sensors:
             self._joints = self.create_publisher(JointState, f'{prefix}joint_states', RELIABLE)
-        # Motors may share a topic with the joints, for example if joint_state_broadcaster is used.
+        # Motors and joints may share a topic, for example if joint_state_broadcaster is used.
         self._motors = self._muscles = None
         if not prefix and self.motors.is_ros2_control:
             topic = self.motors.state_topic
@@ -156,7 +172,14 @@ class Arm(Shell):
     def publish_state(
         self, theta: Array, length: Array, tension: Array, temperature: Array
     ) -> None:
-        """Publish θ [rad] (D,), l [m], T_read [N] and temperatures [°C] (M,)."""
+        """Publish the state of the arm.
+
+        Args:
+            theta: θ [rad], (D,).
+            length: l [m], (M,).
+            tension: T_read [N], (M,).
+            temperature: Temperatures of the muscle modules [°C], (M,).
+        """
         tension = self.robot.tension_source.to_message(tension)
         stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
         if motors is not None and is_heard(motors):

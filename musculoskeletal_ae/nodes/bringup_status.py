@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `bringup_status`: prints one line a second about a running arm, for `bringup.sh`.
 
-joint_states, estimated_joint_states, anomaly, /diagnostics → stdout. Its own report on /diagnostics
-is the situation of the whole arm, with the level of the worst node.
+joint_states, estimated_joint_states, anomaly, /diagnostics → stdout. This node's own report on
+/diagnostics summarizes the whole arm and has the level of the worst node.
 """
 
 import math
@@ -22,12 +22,13 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
 from musculoskeletal_ae.report import Report
 
-#: time after the first estimate during which problems of the start are not shown [s]
+#: time after the first estimate during which problems are not shown, because most of them end by
+#: themselves while the nodes start [s]
 SETTLING = 4.0
 
 
 class BringupStatus(Shell):
-    """Prints the estimation error, A, and the numbers of samples and checkpoints."""
+    """Prints the estimation error, the anomaly A, and the numbers of samples and checkpoints."""
 
     # The node is not watched for progress, because printing blocks while a terminal is paused.
     is_watched = False
@@ -37,7 +38,8 @@ class BringupStatus(Shell):
         self.duration: float = self.parameter('duration')
         self.patience: float = self.parameter('patience')
         self.begun = time.monotonic()
-        self.measured: tuple[float, Array | None] = -math.inf, None  # time of arrival [s], and θ
+        #: time of arrival [s] and θ of the newest joint_states; θ is None before the first message
+        self.measured: tuple[float, Array | None] = -math.inf, None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
@@ -53,7 +55,7 @@ class BringupStatus(Shell):
 
     @property
     def theta(self) -> Array | None:
-        """Measured θ [rad] (D,); None without a recent message."""
+        """Measured θ [rad], (D,); None if no message has arrived recently."""
         at, theta = self.measured
         return theta if time.monotonic() - at <= LARGEST_AGE else None
 
@@ -62,7 +64,7 @@ class BringupStatus(Shell):
             self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - measured))))
 
     def report(self) -> Report:
-        """Return the situation of the whole arm."""
+        """Return a report on the whole arm, with the level of the worst node."""
         self.situation.tick()
         return Report(self.situation.level(), self.situation.trouble() or 'all nodes are OK', {})
 
@@ -77,7 +79,8 @@ class BringupStatus(Shell):
                 )
             return
         self.started = self.started or now
-        # At first, reports of the nodes are still those of the time before the first messages.
+        # Print nothing yet if there are problems: shortly after the start, the last reports of the
+        # nodes still describe the time when they waited for messages.
         if now - self.started >= SETTLING or not self.situation.trouble():
             self._print_line(now - self.started)
         if 0.0 < self.duration <= now - self.started:

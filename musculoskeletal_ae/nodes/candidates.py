@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of the estimator that selects the network for all nodes.
+"""The part of the estimator that selects the network that all nodes use.
 
     mae_checkpoint (learner) ─► validation ─► accepted_checkpoint (estimator) ─► controller, sim
 
-Candidates arrive on the topic `mae_checkpoint`, or from the file of the parameter `checkpoint`. The
-estimator uses an accepted network and publishes it latched. If an anomaly follows soon after a new
-network, the estimator publishes the previous one again. No other node validates networks.
+Candidates arrive on the topic `mae_checkpoint`, or from the file that the parameter `checkpoint`
+names. The estimator uses an accepted network and publishes it latched. If an anomaly is detected
+soon after a network was accepted, the estimator returns to the previous network and publishes that
+again. No other node validates the candidates of the learner.
 """
 
 import time
@@ -28,7 +29,7 @@ class Candidates:
 
     Attributes:
         validator: Validation rules, and the recent messages that networks are validated on.
-        queue: Candidates from the topic; it validates them in small steps.
+        queue: Queue of the candidates from the topic, which are validated in small steps.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class Candidates:
 
         Args:
             node: The estimator.
-            use: Puts an accepted network to use.
+            use: Called with each network that the estimator is to use from now on.
             on_candidate: Called when a candidate from the topic was accepted.
         """
         self._node, self._use, self._on_candidate = node, use, on_candidate
@@ -54,7 +55,11 @@ class Candidates:
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def on_anomaly(self, detected: bool) -> None:
-        """Process a change of the anomaly; replace a recent network that may be its cause."""
+        """Handle the begin or the end of an anomaly.
+
+        A network that was accepted shortly before the anomaly may be its cause, and is replaced by
+        the previous network.
+        """
         if detected and self.validator.mae is not None:
             self.queue.give_up()
         before = self.validator.anomaly(detected, time.monotonic())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool `check_driver`: checks the driver of a real arm against its contract.
 
-It reads muscle_states and joint_states; with --move it publishes muscle_length_command. Of a
-ros2_control robot it reads the JointState of the motors, and commands their positions.
+It reads muscle_states and joint_states, and with --move it publishes muscle_length_command. For a
+ros2_control robot, it instead reads the JointState of the motors and commands their positions.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class CheckDriver:
         self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
         self.muscles: Callable[[Any, dict[str, int]], object] = lambda *_: None
         self.joints: Callable[[JointState], object] = lambda _: None
-        self.measured: Callable[[], Any] = lambda: None  # the newest θ of the joint sensors
+        self.measured: Callable[[], Any] = lambda: None  # returns the newest θ of the joint sensors
         subscribe: Any = self.node.create_subscription
         kind = message_class(self.motors.state_type)
         subscribe(kind, self.topic, lambda m, info: self.muscles(m, info), SENSOR)
@@ -75,7 +75,7 @@ class CheckDriver:
         return ', '.join(sorted(kinds - {self.motors.state_type}))
 
     def listen(self) -> Verdict:
-        """Wait for a driver, listen to it, and return the verdict."""
+        """Wait for a driver, listen to its messages, and return the verdict on them."""
         chosen, node = self.options, self.node
         kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
         self.motors.reset()
@@ -106,7 +106,10 @@ class CheckDriver:
         return verdict
 
     def alone(self, own: int = 0) -> bool:
-        """Return True if no node besides our `own` publishers commands the arm.
+        """Return True if no other node publishes commands to the arm.
+
+        Args:
+            own: Number of publishers of commands that this tool has itself.
 
         Raises:
             MusculoskeletalError: If another node publishes commands.
@@ -119,7 +122,7 @@ class CheckDriver:
         return True
 
     def wind(self, verdict: Verdict) -> None:
-        """Wind each muscle in slightly, and add faults of its response to the verdict."""
+        """Wind each muscle in slightly, and add the faults of its response to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
         read = partial(
             import_heavy('musculoskeletal_ae.validity').read_muscle_states,
@@ -153,7 +156,8 @@ class CheckDriver:
         self.muscles = follow
 
         def ended() -> bool:
-            # Check again that no other node commands the arm, because discovery may be late.
+            # Check in every round that no other node commands the arm, because a node may be
+            # discovered late.
             return self.alone(1) and (winding.done or time.monotonic() - last > SILENCE)
 
         self.spin_until(ended, math.inf)
@@ -162,10 +166,10 @@ class CheckDriver:
 
 
 def _motors(robot: Robot, options: Namespace) -> MotorInterface:
-    """Return the interface to the motors, as the options state it.
+    """Return the interface to the motors that the parameter files in the options describe.
 
     Raises:
-        MusculoskeletalError: If a file of parameters cannot be used, or does not fit the muscles.
+        MusculoskeletalError: If a parameter file cannot be used, or does not fit the muscles.
     """
     kind: Any = import_heavy('musculoskeletal_ae.signals.motor_interface').MotorInterface
     interface: MotorInterface = kind(motor_settings(options.params_file), robot.muscles)
@@ -173,10 +177,12 @@ def _motors(robot: Robot, options: Namespace) -> MotorInterface:
 
 
 def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
-    """Return the motion test of the chosen muscles.
+    """Return the motion test of the muscles that the options name, or of all.
+
+    It is a `Winding`, or a `Positioning` for modules that follow positions.
 
     Raises:
-        MusculoskeletalError: If the options name an unknown muscle, or too small a tension.
+        MusculoskeletalError: If the options name an unknown muscle, or a tension that is too low.
     """
     muscles = robot.muscle_indices(options.muscles or [])
     winding: Any = import_heavy('musculoskeletal_ae.driver.winding').Winding

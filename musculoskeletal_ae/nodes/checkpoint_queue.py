@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handles checkpoints from a topic in small steps, to keep commands on time."""
+"""Handles checkpoints from a topic in small steps, between which the node publishes on time."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -19,7 +19,7 @@ LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical one has ha
 
 
 class CheckpointQueue:
-    """Handles one checkpoint at a time, and then the newest one that has arrived meanwhile."""
+    """Handles one checkpoint at a time; of those that arrive meanwhile, only the newest is kept."""
 
     def __init__(
         self,
@@ -35,8 +35,8 @@ class CheckpointQueue:
             node: Node whose timer runs the steps.
             reception: Counts the checkpoints that were used and rejected.
             topic: Topic of the checkpoints.
-            handle: Returns the steps of one checkpoint. A step raises a MusculoskeletalError to
-                reject the checkpoint; the last step puts it to use.
+            handle: Returns an iterator over the steps of handling one checkpoint. A step raises a
+                MusculoskeletalError to reject the checkpoint; the last step puts it to use.
             unfit: Called with the reason if a checkpoint is unusable (CheckpointError). A network
                 that does not explain the arm (GateError) is only rejected.
         """
@@ -54,7 +54,9 @@ class CheckpointQueue:
         return self._steps is not None or self._next is not None
 
     def propose(self, message: UInt8MultiArray) -> None:
-        """Handle a checkpoint as soon as the previous one is done.
+        """Keep a checkpoint until the present one has been handled, then handle it.
+
+        A checkpoint that was still waiting is dropped.
 
         Raises:
             CheckpointError: If the message is too large to be a network.
@@ -87,7 +89,7 @@ class CheckpointQueue:
             if isinstance(error, CheckpointError) and not isinstance(error, GateError):
                 self._unfit(str(error))
             self._reception.reject(self._topic, error.reason, str(error))
-        except Exception as error:  # noqa: BLE001 - a received file may do anything
+        except Exception as error:  # noqa: BLE001 - a received checkpoint may cause any exception
             self._reception.reject_error(self._topic, error)
-        if self._steps is steps:  # otherwise `give_up` was called, and another checkpoint has begun
+        if self._steps is steps:  # false if the step has called `give_up`
             self._steps = None

@@ -59,8 +59,8 @@ from musculoskeletal_ae.validity import (
 class Controller(Shell):
     """Passes messages, parameters and services to the core controller; publishes its commands."""
 
-    # Several publishers of muscle_states stop the arm. Their messages are still accepted, because
-    # paying out needs the readings.
+    # While several nodes publish muscle_states, the arm is stopped. Their messages are still
+    # accepted, because the stop pays the muscles out and needs the readings for that.
     accepted_from_all = frozenset({'muscle_states'})
 
     def __init__(self, **options: Any) -> None:
@@ -113,7 +113,7 @@ class Controller(Shell):
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
-        # The timer checks message ages, and publishes commands while no sensor messages arrive.
+        # While no estimates arrive, this timer checks message ages and publishes commands.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
         if self.parameter('explore'):
             self.core.explore(True)
@@ -197,7 +197,7 @@ class Controller(Shell):
 
     def _trajectory(self, message: JointTrajectory) -> None:
         points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
-        begin = stamp.sec + 1e-9 * stamp.nanosec  # 0: now
+        begin = stamp.sec + 1e-9 * stamp.nanosec  # a stamp of 0 means: begin now
         self.core.trajectory(points, begin - self.now() if begin > 0.0 else 0.0)
         self._warn_if_slowed()
 
@@ -278,7 +278,7 @@ class Controller(Shell):
         self._record_stop()
 
     def _publish_mode(self) -> None:
-        """Publish mode and stop cause as identifiers when they change."""
+        """Publish the identifiers of mode and stop cause when one of them changes."""
         supervisor = self.core.supervisor
         mode = supervisor.mode
         if supervisor.condition is not None:
@@ -288,12 +288,12 @@ class Controller(Shell):
             self.mode.publish(String(data=mode))
 
     def _remember_stop(self) -> None:
-        """Keep a latched stop for the case that this controller is killed."""
+        """Keep a latched stop on disk, so that a restarted controller is still stopped."""
         supervisor = self.core.supervisor
         self.memory.note(supervisor.condition if supervisor.is_latched else None)
 
     def _record_stop(self) -> None:
-        """Save the last seconds before a latched stop."""
+        """Save a recording of the last seconds before a latched stop, once for each stop."""
         supervisor = self.core.supervisor
         if not supervisor.is_latched or supervisor.condition is None:
             self.recorded = None
@@ -317,7 +317,7 @@ class Controller(Shell):
         held = {} if changing else report.values
         stiffness = [f'{k}: {v}' for k, v in held.items() if k.startswith('joint stiff')]
         before, self.logged = self.logged, stopped + stiffness
-        # Two loops, because rclpy refuses to log with two severities from one line of code.
+        # Log in two loops, because rclpy refuses to log with two severities from one line of code.
         for line in stopped:
             if line not in before:
                 self.get_logger().warning(line)

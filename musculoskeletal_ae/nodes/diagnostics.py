@@ -16,7 +16,7 @@ PERIOD = 1.0  # time between reports [s]
 
 
 class Diagnostics:
-    """Publishes the reports of one node, each as a single status."""
+    """Publishes the reports of one node, each as one DiagnosticStatus."""
 
     def __init__(self, node: Node, reception: Reception, hardware: str) -> None:
         """Prepare the reports of a node.
@@ -24,7 +24,7 @@ class Diagnostics:
         Args:
             node: The node.
             reception: Counts of the messages that the node has used and rejected.
-            hardware: Hardware id of the status.
+            hardware: Value of `hardware_id` in each status.
         """
         self._node, self._reception, self._hardware = node, reception, hardware
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -34,7 +34,12 @@ class Diagnostics:
         self.identity = secrets.token_hex(8)
 
     def tell(self, report: Report, rates: Mapping[str, float]) -> None:
-        """Publish a report with the rates of the used messages [Hz], by topic."""
+        """Publish a report.
+
+        Args:
+            report: The report.
+            rates: Rate at which the node uses messages [Hz], by topic.
+        """
         rejected = self._reception.rejected
         values = {**report.values, 'identity': self.identity}
         values |= {f'{topic} rate': f'{rate:.1f} Hz' for topic, rate in rates.items()}

@@ -2,9 +2,10 @@
 """The node `estimator`: estimates joint angles from muscle length and tension, detects anomalies.
 
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
-anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros
-(joint_states support this calibration), estimated/markers; on request muscle_joint_states and /tf.
+anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros,
+estimated/markers; on request muscle_joint_states and /tf.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
+joint_states are optional; the length calibration (muscle_length_zeros) uses them.
 """
 
 import time
@@ -53,12 +54,12 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
-        # `keep_isolated` is called because the learner's first network after a restart of this node
-        # restores the isolated muscles; later networks must not change them.
+        # After a restart of this node, the learner's first network tells which muscles are
+        # isolated. Later networks must not change that, hence `keep_isolated`.
         self.candidates = Candidates(self, self._use, self.core.keep_isolated)
         self._advertise()
         self.sources.watch(*OWN_TOPICS)
-        # Last values published on the latched topics; None before the first.
+        # Last values published on the latched topics; None if nothing was published yet.
         self.published_anomaly = False
         self.published_isolated: tuple[int, ...] | None = None
         self.published_offsets: LengthOffsets | None = None
@@ -173,7 +174,7 @@ class Estimator(Shell):
         return f'cleared: {cause}' if cause else 'no anomaly was detected'
 
     def _check_health(self, _: Trigger.Request) -> str:
-        """Confirm that no anomaly is detected; other nodes clear their latch only then."""
+        """Confirm that no anomaly is detected; without this, other nodes keep their latch."""
         if cause := self.core.cause:
             raise MusculoskeletalError(f'anomaly detected: {cause}')
         return 'no anomaly is detected'
@@ -198,7 +199,7 @@ class Estimator(Shell):
         try:
             output = self.core.take(message, clock.nanoseconds * 1e-9, now)
         except RejectionError:
-            if self.core.body.isolated != isolated:  # a failed sensor has isolated a muscle
+            if self.core.body.isolated != isolated:  # the core has isolated a muscle with a fault
                 self.get_logger().warning(self.core.suspects.last_verification)
                 self._publish_isolated()
             raise

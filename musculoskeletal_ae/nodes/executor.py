@@ -3,9 +3,9 @@
 
 rclpy's `SingleThreadedExecutor` rebuilds its wait set, in Python, for every message, and runs each
 callback as a task. At 200 Hz this takes half of a node's CPU time. `LeanExecutor` keeps the wait
-set until entities are created or destroyed, and calls callbacks directly. It uses private names of
-rclpy. It is therefore used only with versions of rclpy that it was tested with, and only if all of
-those names exist. Otherwise a stock executor of rclpy runs instead, and the log says so.
+set until entities are created or destroyed, and calls callbacks directly. `LeanExecutor` uses
+private names of rclpy. It therefore runs only with versions of rclpy that it was tested with, and
+only if all of these names exist. Otherwise a stock executor of rclpy runs, and the log says so.
 
 The environment variable MUSCULOSKELETAL_AE_EXECUTOR overrides the choice: lean, events or single.
 """
@@ -39,7 +39,8 @@ VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
 CHOICES = ('lean', 'events', 'single')
 #: first and last version of rclpy that LeanExecutor was tested with
 TESTED = (7, 1, 1), (7, 1, 11)
-#: first version whose EventsExecutor runs asynchronous callbacks; up to 7.1.7 it runs none at all
+#: First version of rclpy whose EventsExecutor runs asynchronous callbacks. Up to 7.1.7,
+#: EventsExecutor runs no callbacks at all.
 EVENTS_SINCE = (7, 1, 11)
 #: undocumented attributes of SingleThreadedExecutor that LeanExecutor uses
 PRIVATE_NAMES = (
@@ -50,19 +51,19 @@ FULL_ROUND_PERIOD = 1.0  # longest time between two full rounds (see `LeanExecut
 
 
 class _Group(NamedTuple):
-    """Entities of one kind, with the functions that add them to a wait set and take from them."""
+    """Entities of one kind, such as all subscriptions of the executor's nodes."""
 
-    kind: str
+    kind: str  # name of the kind in rclpy's wait set
     entities: list[Any]
-    add: Callable[[Any], None]
-    take: Callable[[Any], Any]
+    add: Callable[[Any], None]  # adds the handle of an entity to the wait set
+    take: Callable[[Any], Any]  # takes an entity's message, and returns a call of its callback
 
 
 class LeanExecutor(SingleThreadedExecutor):
     """Runs the callbacks of timers, subscriptions, services and clients with little overhead.
 
     rclpy handles everything else in a *full round*. Asynchronous callbacks, other tasks and actions
-    trigger a full round at once. QoS events wait for the next one, at most a second.
+    trigger a full round at once. QoS events wait until the next full round, at most a second.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
@@ -74,7 +75,10 @@ class LeanExecutor(SingleThreadedExecutor):
         self._next_full_round = 0.0  # time of the next full round on the monotonic clock [s]
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Run all ready callbacks; wait for at most `timeout_sec` or the period of full rounds."""
+        """Wait until a callback is ready, then run all ready callbacks.
+
+        The wait ends after `timeout_sec` [s] and after FULL_ROUND_PERIOD, whichever is shorter.
+        """
         if self._wait_set is None:
             self._build_wait_set()
         wait_set, groups = self._wait_set, self._groups
@@ -164,11 +168,11 @@ class LeanExecutor(SingleThreadedExecutor):
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """Return the executor that the environment selects, or else the best one for this rclpy.
+    """Return the executor that the environment variable selects, or the best one for this rclpy.
 
     Raises:
-        MusculoskeletalError: If the environment selects an unknown executor, or one that does not
-            work with this rclpy.
+        MusculoskeletalError: If the variable selects an unknown executor, or one that does not work
+            with this rclpy.
     """
     choice = os.environ.get(VARIABLE, '')
     if choice not in ('', *CHOICES):

@@ -15,16 +15,20 @@ NAME = 'follow_joint_trajectory'
 
 
 class LateServer(ActionServer):
-    """An action server whose goals need no waiting task; a callback ends them later."""
+    """An action server that runs no task while a goal is active.
+
+    rclpy's server runs `execute_callback` from the start of a goal to its end. This server starts a
+    goal without a callback; a later call of `notify_execute` with one ends the goal.
+    """
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
-        """Start a goal without a task; with a callback, run it to end the goal."""
+        """Run `execute_callback` to end a goal; if it is None, only start the goal."""
         if execute_callback is not None:
             super().notify_execute(goal_handle, execute_callback)
 
 
 class FollowJointTrajectory:
-    """Serves one goal at a time; a new goal replaces it."""
+    """Serves one goal at a time; a new goal replaces the active one."""
 
     def __init__(
         self,
@@ -41,7 +45,8 @@ class FollowJointTrajectory:
             kind: Action type.
             core: The controller.
             start: Starts a JointTrajectory, or raises a MessageError.
-            refuse: Counts a refused goal, from its topic, reason and error text.
+            refuse: Counts a refused goal; called with the action's name, the reason and the text of
+                the error.
         """
         self._kind, self._core, self._start, self._refuse = kind, core, start, refuse
         self._joints = node.robot.joints
@@ -87,7 +92,7 @@ class FollowJointTrajectory:
         """Publish feedback on the active goal, and end the goal when it has an outcome.
 
         Args:
-            get_state: Returns the message of `controller_state`.
+            get_state: Returns the controller's state as a message of `controller_state`.
         """
         if self._handle is None or self._goal is None:
             return

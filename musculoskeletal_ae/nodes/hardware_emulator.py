@@ -44,7 +44,8 @@ class HardwareEmulator(Arm):
         )
         for warning in self.arm.warnings:
             self.get_logger().warning(warning)
-        # Load compiled code by one step now. Otherwise it would delay the first messages.
+        # Simulate one step to load the compiled code, which would otherwise delay the first
+        # messages.
         self.arm.step(0.01)
         self.marker_pose_rate = self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()
@@ -76,7 +77,7 @@ class HardwareEmulator(Arm):
         if self.parameter('clock'):
             self.clock_publisher = self.create_publisher(ClockMessage, '/clock', RELIABLE)
             self.time = time.time_ns()
-        # The timer uses a steady clock, because with use_sim_time this node advances the ROS clock.
+        # The timer uses a steady clock, because this node itself may publish the ROS time (/clock).
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0 / self.rate, self._tick, clock=steady)
 
@@ -91,7 +92,7 @@ class HardwareEmulator(Arm):
     def _tick(self) -> None:
         now = time.monotonic()
         since = now - self.ticked
-        # With parameter `clock` each tick advances one period, however late it is.
+        # With the parameter `clock`, every tick simulates one period, even if the tick is late.
         elapsed = min(since, self.longest_step if self.time is None else 1.0 / self.rate)
         self.pace += min(1.0, since / PACE_TIME) * (elapsed / max(since, 1e-6) - self.pace)
         elapsed += self.remainder

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `learner`: learns the body online, and publishes the network for the estimator.
 
-joint_states or vision_joint_states or neither, imu, muscle_states, anomaly_detected,
+muscle_states, joint_states or vision_joint_states (or neither), imu, anomaly_detected,
 isolated_muscles, muscle_length_zeros → mae_checkpoint.
 """
 
@@ -53,7 +53,8 @@ class Learner(Shell):
         self.troubled = False
         core = self.core
         self._begin()
-        # These setters replace what was learned and cannot be undone, so they need `prepare`.
+        # These setters replace what was learned, which cannot be undone. The function in the third
+        # argument therefore checks each value before any parameter is set.
         self.parameters.on_change('fresh', core.replace, self._afresh)
         self.parameters.on_change('checkpoint', core.replace, self.load_checkpoint)
         self.parameters.on_change('relearn_muscles', core.relearn, self.robot.muscle_indices)
@@ -76,9 +77,10 @@ class Learner(Shell):
     # -- parameters -----------------------------------------------------------------------------
 
     def _begin(self) -> None:
-        """Continue from what was saved, or begin with the network of `checkpoint`.
+        """Continue from the saved state, or begin with the network that `checkpoint` names.
 
-        Nothing is relearned, because a parameter file would cause that at every start.
+        `relearn_muscles` is checked but not obeyed: a parameter file that sets it would otherwise
+        cause the muscles to be relearned at every start.
         """
         if self.parameter('fresh'):
             self.core.replace(None)
@@ -113,8 +115,8 @@ class Learner(Shell):
         self.core.use_body(self.core.body.with_offsets(self.body.offsets))
 
     def _isolate(self) -> None:
-        # An estimator that has just started publishes no isolated muscles, because it does not have
-        # our network yet. Its first message is therefore ignored if it names none.
+        # An estimator that has just started does not have our network yet, and so does not know
+        # which muscles are isolated. Ignore its first message if that names no muscle.
         number = self._reception.numbers['isolated_muscles']
         knows = number > 1 or (number == 0 and self.has_heard_isolated)
         muscles = self.body.isolated
@@ -139,12 +141,12 @@ class Learner(Shell):
         data = self.core.poll(self.now())
         if data is not None:
             self.publisher.publish(bytes_message(data))
-        if bool(self.core.trouble) != self.troubled:  # report the change without delay
+        if bool(self.core.trouble) != self.troubled:  # report a change without delay
             self.troubled = not self.troubled
             self._report()
 
     def clock_jumped_back(self) -> None:
-        """Drop messages that have not become a sample."""
+        """Discard messages that have not become part of a sample yet."""
         self.core.reset()
 
     def report(self) -> Report:

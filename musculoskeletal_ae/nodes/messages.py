@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builds ROS messages from arrays (`validity` reads them), QoS profiles and service answers."""
+"""QoS profiles, functions that build ROS messages from arrays, and responses of services.
+
+The opposite direction, from messages to checked arrays, is in `validity`.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ LATCHED = QoSProfile(
 
 
 def array_message(values: Array, *labels: str) -> Float64MultiArray:
-    """Return a multi-array message of values, with one label for each dimension."""
+    """Return a message that contains the array; `labels` has one name for each dimension."""
     layout = _layout(values.shape, labels)
     return Float64MultiArray(layout=layout, data=array('d', values.tobytes()))
 
@@ -47,19 +50,22 @@ def _layout(sizes: tuple[int, ...], labels: tuple[str, ...]) -> MultiArrayLayout
 
 
 def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointState:
-    """Return a joint state of θ [rad] (D,)."""
+    """Return a JointState with the names and the positions θ [rad], (D,), of joints."""
     message = JointState(name=joints, position=array('d', theta.tobytes()))
     message.header.stamp = stamp
     return message
 
 
 def motor_command(motors: MotorInterface, length: Array) -> Float64MultiArray:
-    """Return the message that commands l_target [m] (M,) to the motors; it has no layout."""
+    """Return the message that commands l_target [m], (M,), to the motors of ros2_control.
+
+    Like other commands to ros2_control, it has no layout.
+    """
     return Float64MultiArray(data=array('d', motors.command(length).tobytes()))
 
 
 def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: Time) -> JointState:
-    """Return the joint state of the muscles' motors for l [m] and T [N], (M,) each."""
+    """Return the JointState of the muscles' motors at l [m], (M,), and T [N], (M,)."""
     names, position, effort = motors.joint_values(length, tension)
     message = joint_message(names, position, stamp)
     message.velocity = array('d', [math.nan] * len(names))
@@ -68,7 +74,7 @@ def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: 
 
 
 def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None:
-    """Append joints at θ [rad] (D,) to a joint state; their velocity and effort are NaN."""
+    """Append joints at positions θ [rad], (D,), to a JointState; their other values are NaN."""
     message.name = [*message.name, *joints]
     message.position.extend(theta.tolist())
     for unknown in (message.velocity, message.effort):
@@ -76,12 +82,12 @@ def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Return whether a publisher has a subscriber; otherwise callers need not build a message."""
+    """Return whether a publisher has a subscriber, so that building a message makes sense."""
     return publisher.get_subscription_count() > 0
 
 
 def bytes_message(data: bytes) -> UInt8MultiArray:
-    """Return a byte array message."""
+    """Return a message that contains the bytes."""
     return UInt8MultiArray(data=array('B', data))
 
 
@@ -104,7 +110,7 @@ def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
 def refuse(request: Any, response: Any, reason: str) -> None:
     """Mark a response as failed, with the reason, if its type has a field for that."""
     refused = SetParametersResult(successful=False, reason=reason)
-    if hasattr(response, 'results'):  # one result for each parameter; the first may have succeeded
+    if hasattr(response, 'results'):  # one for each parameter; the first ones may be there already
         response.results += [refused] * (len(request.parameters) - len(response.results))
     elif isinstance(getattr(response, 'result', None), SetParametersResult):
         response.result = refused

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics that a node needs to work: which are missing, have fallen silent, or are slow."""
+"""Reports which of the topics that a node needs are missing, silent or slow."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from musculoskeletal_ae.report import Report
 if TYPE_CHECKING:
     from musculoskeletal_ae.nodes.shell import Shell
 
-#: needed topics that are published continually, whose silence is therefore an error
+#: needed topics that are published continually, so that silence is an error; with its remedy
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 SILENT_TOPIC = 'silent topic'  # key of a value in reports
 SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
 SLOW = 0.4  # fraction of the expected rate below which messages come too slowly
-SLOW_REPORTS = 3  # number of successive reports with such a rate after which it is reported
+SLOW_REPORTS = 3  # number of successive reports with too low a rate before the node warns of it
 
 
 class NeededTopics:
@@ -41,7 +41,7 @@ class NeededTopics:
         self._topics += topics
 
     def expect_rate(self, topic: str, rate: float) -> None:
-        """Report a topic, too, while its messages come much more slowly than at `rate` [Hz]."""
+        """Warn of a topic while its rate is lower than SLOW times `rate` [Hz]."""
         self._expected_rates[topic] = rate
 
     def remove(self, topic: str) -> None:
@@ -86,7 +86,7 @@ class NeededTopics:
         return report
 
     def _log_missing(self) -> None:
-        """Log the topics without any usable message, with the reason, on any change."""
+        """Log which topics lack a usable message, and why, whenever this changes."""
         reasons = []
         for topic in self._topics:
             if self._reception.was_used(topic):
@@ -105,7 +105,10 @@ class NeededTopics:
             self._node.get_logger().info(text)
 
     def _is_silent(self, topic: str) -> bool:
-        """Return whether no usable messages arrive on a stream that was used or is published."""
+        """Return whether a topic is a stream without usable messages.
+
+        A stream that was never used and has no publisher is missing, not silent.
+        """
         if topic not in STREAMS or self._reception.silence(topic) <= SILENCE:
             return False
         is_published = self._node.count_publishers(self._node.full_name(topic)) > 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of one node: declared from `PARAMETERS`, checked, and followed by setters."""
+"""The parameters of one node: declared from `PARAMETERS`, checked, and passed to setters."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -65,10 +65,11 @@ class NodeParameters:
     ) -> None:
         """Call `setter` with the value of a parameter now, and whenever the parameter is set.
 
-        If a parameter of a request is refused, the setters of the others are called again with the
-        previous values. A setter whose effect cannot be undone in this way needs `prepare`. Such
-        setters are called after all others, in the order of registration, and once if several
-        parameters share a setter. Only the first of them may raise an error.
+        If one parameter of a request is refused, the setters that were already called for this
+        request are called again with the previous values. A setter whose effect cannot be undone in
+        this way needs `prepare`. Setters with `prepare` are called after all setters without it, in
+        the order of registration. A setter that several parameters share is called only once. Only
+        the first of the setters with `prepare` may raise an error.
 
         Args:
             name: Name of the parameter.
@@ -85,14 +86,14 @@ class NodeParameters:
         setter: Callable[[Any], object],
         prepare: Callable[[Any], object] | None = None,
     ) -> None:
-        """Call `setter` as `follow` does, but not now."""
+        """Call `setter` whenever the parameter is set; unlike `follow`, do not call it now."""
         self._setters[name] = setter
         if prepare is not None:
             self._prepare[name] = prepare
 
     def _held(self, name: str) -> Any:
         value = self._node.get_parameter_or(name, RosParameter(name)).value
-        # Return an empty list for None, as which rcl reads an empty list on the command line.
+        # rcl reads an empty list on the command line as None.
         return [] if value is None and isinstance(self._table[name].default, tuple) else value
 
     def _take(self, values: dict[str, Any]) -> None:

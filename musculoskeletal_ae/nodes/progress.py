@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ends a node that hangs, and writes the stacks of its threads to stderr.
 
-A timer callback notes progress ten times a second (`ProgressWatch.note`). A thread checks it twice
-a second. After 10 s without progress it dumps the stacks of all threads to stderr and ends the
-process with status 70. Other nodes have treated its topics as stale long before that.
+A timer callback of the node calls `ProgressWatch.note` ten times a second. A watching thread checks
+twice a second when the last call was. After 10 s without a call, the thread dumps the stacks of all
+threads to stderr and ends the process with status 70. By then, other nodes have long treated the
+topics of this node as stale.
 
-A native call that never returns and holds Python's global interpreter lock blocks that thread, too.
-A CPU-time timer covers this case: it ends the process by SIGVTALRM, after a dump of the stacks.
+A native call that never returns and holds Python's global interpreter lock blocks the watching
+thread as well. A timer of CPU time covers this case: it ends the process by SIGVTALRM, after a dump
+of the stacks.
 
 Time in which the process was suspended does not count, nor does time in a debugger or in numba's
 compiler.
@@ -23,7 +25,7 @@ from collections.abc import Callable
 LONGEST_STALL = 10.0  # longest legal time without progress [s]
 LOOK_PERIOD = 0.5  # time between two checks [s]
 STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
-#: names of modules in which the main thread may stay long
+#: names of modules in which the main thread may stay for more than LONGEST_STALL
 SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
 
@@ -81,7 +83,8 @@ class ProgressWatch:
             if self._is_stopped.wait(self._look_period):
                 return
             now = time.monotonic()
-            # A longer interval means that the process was suspended. Count only a part of it.
+            # If the wait took much longer than the period, the process was suspended. Therefore
+            # count at most two periods.
             self._quiet += min(now - before, 2.0 * self._look_period)
             before = now
             if self._quiet > self._longest:
@@ -91,7 +94,7 @@ class ProgressWatch:
 
 
 def _is_patient() -> bool:
-    """Return whether the main thread is in code that may take long."""
+    """Return whether the main thread is in one of SLOW_MODULES."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
         if frame.f_globals.get('__name__', '').partition('.')[0] in SLOW_MODULES:

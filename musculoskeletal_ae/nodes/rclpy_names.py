@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of rclpy that it defines without a public module. Nothing else imports its implementation.
+"""Names that only the implementation of rclpy defines, because no public module offers them.
+
+No other module of this package imports that implementation.
 
 `RCLError` is the base class of errors that rcl returns, for example for an invalid topic name.
 """

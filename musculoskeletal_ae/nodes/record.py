@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `record`: writes the topics to an mcap bag that `ros2 bag` can read."""
+"""The tool `record`: writes the topics of this package to an mcap bag for `ros2 bag`."""
 
 import math
 import sys
@@ -29,7 +29,7 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.report import load_text
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-#: time between writes to disk [s]; a killed recorder loses the messages of at most this time
+#: time between writes to disk [s]; a killed recorder loses the messages since the last write
 FLUSH_PERIOD = 0.5
 #: QoS that holds one or two seconds of the fastest topic while the disk is busy
 LIVE = QoSProfile(depth=1000)
@@ -95,7 +95,7 @@ class Record(Node):
             self._subscribe(name, qos)
 
     def count_losses(self) -> None:
-        """Count the messages lost since the last call, and warn of the first ones."""
+        """Count the messages lost since the last call; warn when the first ones are lost."""
         had_lost = self.losses.lost.total()
         self.losses.settle(self.count_publishers)
         if self.losses.lost and not had_lost:
@@ -142,7 +142,7 @@ class Record(Node):
         self.writer.write(name, now, info['source_timestamp'], data)
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
-        """Return the QoS that the publishers of a topic offer, except for the unknown depth."""
+        """Return the QoS that the publishers of a topic offer; the depth of a queue is unknown."""
         offered = [
             offered_qos(
                 info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,

@@ -20,7 +20,7 @@ DISCOVERY_TIME = 2.0  # time in which running nodes discover each other [s]
 
 
 def _line(strip: Marker) -> Line:
-    """Return a line strip of a marker array."""
+    """Convert a line-strip marker to a line of a drawing."""
     points, colour = np.array([[p.x, p.y, p.z] for p in strip.points]), strip.color
     return Line(strip.ns, points, strip.scale.x, (colour.r, colour.g, colour.b))
 
@@ -52,7 +52,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
 def _take(drawn: dict[str, list[Line]], topic: str, message: MarkerArray) -> None:
     kind = Marker.LINE_STRIP, Marker.ADD
     lines = [_line(m) for m in message.markers if (m.type, m.action) == kind and m.points]
-    if lines:  # an estimator without a network draws none
+    if lines:  # an estimator without a network publishes no lines
         drawn[topic] = lines
 
 

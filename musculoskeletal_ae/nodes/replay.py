@@ -39,7 +39,7 @@ from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
-#: depth of the QoS, with which a reader that is one second late still receives every message
+#: depth of the QoS; a reader that is one second late still receives every message
 DEPTH = 1000
 SERVICE_PERIOD = 0.02  # longest time between two rounds in which services are answered [s]
 LONGEST_SLEEP = 0.002  # longest wait that uses time.sleep instead of answering services [s]
@@ -47,7 +47,7 @@ LONGEST_SLEEP = 0.002  # longest wait that uses time.sleep instead of answering 
 SETTLE_TIME = 0.3
 LAP_GAP = 10_000_000  # time between the last message of a lap and the first of the next [ns]
 WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
-SEND_WAIT = 10.0  # default of this wait for a trajectory, which needs a subscriber [s]
+SEND_WAIT = 10.0  # default of the same wait for --as-trajectory, which needs a subscriber [s]
 CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
 #: shortest wall time between two messages on /clock that nodes can handle [s]
 SHORTEST_CLOCK_PERIOD = 0.001
@@ -112,7 +112,7 @@ class Replay(Node):
         self._sought = self._start if self._sought is None else self._sought
         while self._sought is not None:
             start, self._sought = self._sought, None
-            # Jump to just before the first message, which is then not due yet if paused.
+            # Jump to just before the first message, so that it is not due while playback is paused.
             self._timeline.jump(start - 1, time.monotonic())
             for message in lap(self._bag, self._names, start, self._stop):
                 if not self._wait(message.log_time, progress):
@@ -130,7 +130,7 @@ class Replay(Node):
             publisher.wait_for_all_acked(Duration(nanoseconds=int(left * 1e9)))
 
     def _wait(self, recorded: int, progress: tqdm) -> bool:
-        """Answer services and publish the clock until a recorded time [ns] is due.
+        """Answer services and publish the clock until the time `recorded` [ns] is due.
 
         Returns:
             False if a seek was requested meanwhile.
@@ -189,7 +189,7 @@ class Replay(Node):
         return f'stepped at {self._position()}'
 
     def _done(self) -> float:
-        """Return the played time [s]."""
+        """Return the recorded time since the start of the played part [s]."""
         return max(0.0, (self._timeline.recorded(time.monotonic()) - self._start) / 1e9)
 
     def _position(self) -> str:
@@ -269,7 +269,7 @@ def parse(arguments: list[str]) -> Namespace:
 
 
 def _check_combination(parser: Parser, options: Namespace) -> None:
-    """Refuse options that have no effect together."""
+    """Exit with an error if options contradict each other or would have no effect."""
     if options.rate != 1 and not options.clock:
         parser.error(
             '--rate other than 1 needs --clock, and nodes with use_sim_time: '
@@ -304,7 +304,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
     try:
         return _replay(options, arguments)
     except KeyboardInterrupt:
-        return 0  # like `ros2 bag play`
+        return 0  # `ros2 bag play` also returns 0 after Ctrl-C
 
 
 main = partial(run_tool, 'replay', parse, _work)

@@ -9,7 +9,8 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from musculoskeletal_ae.nodes.rclpy_names import RCLInvalidROSArgsError, UnknownROSArgsError
 
 NO_REASON = 'error not set'  # the message of rcl for an error without a reason
-#: exceptions of rclpy for a start-up value of the wrong type or out of range
+#: exceptions of rclpy for a wrong ROS argument: an unknown argument, or a parameter value of the
+#: wrong type or out of range
 PARAMETER_ERRORS = (
     InvalidParameterTypeException,
     InvalidParameterValueException,

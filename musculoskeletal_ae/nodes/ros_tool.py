@@ -31,7 +31,7 @@ LONGEST_WAIT = 0.1  # longest time between checks of a condition and of the stop
 
 
 def message_class(type_name: str) -> Any:
-    """Return the ROS class of a message type of ROS 2 Jazzy."""
+    """Return the class of a message type, such as `std_msgs/msg/Float64`."""
     package, _, name = type_name.split('/')
     try:
         return getattr(import_module(f'{package}.msg'), name)
@@ -92,7 +92,8 @@ def run_tool(
     Args:
         name: Name of the executable.
         parse: Parses the arguments that are not for ROS.
-        work: Function of the options and of all arguments that returns the exit status.
+        work: Does the work of the tool. It is called with the options and with all arguments, and
+            returns the exit status.
         argv: Arguments, including those for ROS; by default the arguments of the process.
 
     Returns:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs a node: checks arguments, constructs it, spins it and destroys it.
+"""Runs a node: checks the arguments, then constructs, spins and destroys the node.
 
 While nodes run, SIGINT and SIGTERM only set a flag (`stop_signals`). A timer checks the flag ten
 times a second and makes the executor return. Nodes are then destroyed, and after them the ROS

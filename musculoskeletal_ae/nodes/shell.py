@@ -75,7 +75,7 @@ if TYPE_CHECKING:  # a slow import, because it loads the bag writer
 #: clock for message ages and watchdogs; independent of /clock
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
-LONGEST_LOOK = 0.3  # time between two checks of the graph above which the node has paused [s]
+LONGEST_LOOK = 0.3  # if more time passes between two checks of the graph, the node was paused [s]
 MOST_OFFSET = 10.0  # largest offset of a length sensor [m]
 #: remedies for incompatible QoS, by the side that states the policy and by policy
 QOS_REMEDIES = {
@@ -88,7 +88,7 @@ MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes o
 
 
 class Shell(Node):
-    """A node that knows its robot, counts what it rejects and reports once a second."""
+    """A node that knows its robot, counts the messages it rejects, and reports once a second."""
 
     core: Any = None  # the object that computes, without ROS
     is_time_critical = True  # whether a delay of this node delays commands
@@ -165,7 +165,7 @@ class Shell(Node):
     def clock_jumped_back(self) -> None:
         """Discard buffers, rates and filters after the ROS clock has jumped back.
 
-        Latched anomalies and stops have to stay.
+        Keep latched anomalies and stops.
         """
         if self.core:
             self.core.clock_jumped_back()
@@ -177,7 +177,12 @@ class Shell(Node):
     # -- errors in callbacks --------------------------------------------------------------------
 
     def on_callback_error(self, source: str, error: Exception) -> None:
-        """Count and log an exception that escaped a callback, by topic or service."""
+        """Count and log an exception that escaped a callback.
+
+        Args:
+            source: Topic or service of the callback, or TIMER.
+            error: The exception.
+        """
         if source == TIMER:  # no message caused it
             self._fault = f'internal error: {type(error).__name__}: {error}'
         if self._reception.reject_error(source, error):
@@ -273,9 +278,10 @@ class Shell(Node):
         return self.parameters.value(name)
 
     def state_directory(self) -> Path | None:
-        """Return the directory that `state_directory` names; None if nothing is kept.
+        """Return the directory of the parameter `state_directory`; None if nothing is to be saved.
 
-        `auto` is a directory for each robot and namespace. A ~ is not expanded.
+        The value `auto` stands for a separate directory for each robot and namespace. A ~ in the
+        result is not expanded.
         """
         value = self.parameter('state_directory')
         if value != 'auto':
@@ -298,10 +304,12 @@ class Shell(Node):
     def follow_accepted_checkpoints(
         self, use: Callable[[Mae], None], unfit: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Follow the network that the estimator has accepted; until then, use one from a file.
+        """Use each network that the estimator accepts.
+
+        Until the first one arrives, use the network of the parameter `checkpoint`, if it is set.
 
         Args:
-            use: Puts a network to use.
+            use: Called with each network that this node is to use from now on.
             unfit: Called with the reason if a network is unusable; the previous one stays in use.
         """
         has_accepted = False
@@ -336,7 +344,7 @@ class Shell(Node):
         self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
 
     def load_checkpoint(self, path: str) -> Mae | None:
-        """Return the network of a file for this robot; None if the path is empty."""
+        """Return the network in a file, checked for this robot; None if the path is empty."""
         return checkpoint.load(path, self.robot) if path else None
 
     def checkpoint_queue(
@@ -355,9 +363,10 @@ class Shell(Node):
         return self.get_clock().now().nanoseconds * 1e-9
 
     def full_name(self, topic: str) -> str:
-        """Return the full name of a topic, or of the one that takes its place on ros2_control.
+        """Return the full name of a topic.
 
-        The result is '' for motor commands if there are none.
+        On a ros2_control robot, this is the name of the topic of the motors that replaces `topic`.
+        The result is '' for `motor_command` if the robot has no topic for commands to motors.
         """
         name = self._wires.get(topic, topic)
         return self.resolve_topic_name(name) if name else ''
@@ -435,7 +444,7 @@ class Shell(Node):
         return '; '.join(filter(None, problems))
 
     def on_intruders(self, intruders: str) -> None:
-        """Handle unexpected publishers, ten times a second; '' if there are none."""
+        """Called ten times a second with the value of the property `intruders`."""
 
     def follow_muscles(
         self,
@@ -444,20 +453,24 @@ class Shell(Node):
         rows: int = 1,
         qos: QoSProfile = RELIABLE,
     ) -> None:
-        """Pass arrays from a topic with values for each muscle to `follow`, (M,) or (rows, M)."""
+        """Call `follow` with each array from a topic: (rows, M), or (M,) for a single row."""
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
     def follow_muscle_messages(self, follow: Callable[[Any], object]) -> None:
-        """Pass unchecked messages of muscle_states, or of the ros2_control robot, to `follow`."""
+        """Call `follow` with each message of muscle_states, whose values are not checked yet.
+
+        On a ros2_control robot, the messages of the motors are converted to muscle_states.
+        """
         kind = JointState if self.motors.is_ros2_control else Float64MultiArray
         self.listen(kind, STATES, lambda message: follow(self.motors.reading(message)), SENSOR)
 
     def follow_offsets(self, changed: Callable[[], object]) -> None:
         """Keep the estimator's length offsets in `body`; call `changed` when they change.
 
-        If known offsets replace different known ones, the estimator has restarted and does not know
-        the result of its last calibration. They count as unknown until it has calibrated again.
+        If the estimator publishes known offsets and then other known offsets, it has restarted and
+        has lost the result of its last calibration. The offsets in `body` then count as unknown
+        until the estimator has calibrated again.
         """
         previous = LengthOffsets.unknown(self.robot.muscle_count)
 
@@ -500,13 +513,13 @@ class Shell(Node):
     def follow_posture(
         self, topic: str, follow: Callable[[Array], object], some: bool = False
     ) -> None:
-        """Pass θ [rad] (D,) from a topic of joint states to `follow`.
+        """Call `follow` with θ [rad], (D,), of each message from a topic of joint states.
 
         Args:
             topic: Name of the topic.
-            follow: Function of θ.
-            some: Whether a message may lack joints; those are NaN. Positions that are not finite
-                are then counted, and also NaN.
+            follow: Called with θ.
+            some: Whether a message may lack joints, or have positions that are not finite. These
+                positions are NaN in θ, and those that are not finite are counted as ignored.
         """
         joints = self.robot.joints
 

@@ -101,7 +101,7 @@ class Sim(Arm):
         return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])
 
     def clock_jumped_back(self) -> None:
-        """Measure elapsed time from now; the arm keeps its state."""
+        """Count the elapsed time from now on; the simulated arm keeps its state."""
         self.ticked = self.get_clock().now()
 
     def report(self) -> Report:

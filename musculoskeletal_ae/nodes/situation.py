@@ -2,8 +2,8 @@
 """Summarizes the state of a running arm from the reports of all nodes on /diagnostics.
 
 The level of the whole arm is the worst level of its nodes, and 'error' if a required node stops
-reporting. Decisions compare identifiers only, such as the controller's values `mode` and
-`stop cause`. Sentences are shown unchanged.
+reporting. This module decides only by identifiers in the reports, such as the controller's values
+`mode` and `stop cause`. It shows the sentences in the reports unchanged, and never parses them.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
 from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
 
-LARGEST_AGE = 1.0  # age of a moving value above which it is no longer shown [s]
+LARGEST_AGE = 1.0  # age above which a measured or estimated value is no longer shown [s]
 #: time without a report after which a node counts as silent [s]; nodes report once a second
 SILENCE = 2.0
 TICK = 1.0  # time between two ticks above which this process was paused [s]
@@ -35,17 +35,17 @@ FORGET_TIME = 5.0
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'  # key of the version in reports
-#: Number of reports after which a node's network counts as a mismatch, if the estimator has named
-#: that network in none of its last REPORTS reports. Nodes report once a second.
+#: A node counts as using a wrong network after this number of reports (one a second), if the
+#: estimator's last reports (the same number) do not name the node's network.
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
-#: steps that help against a length calibration that does not end
+#: remedy for a length calibration that does not end
 CALIBRATION_STEPS = Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS
 
 
 def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
-    """Return error and A as text; for NaN, name the topic that is missing.
+    """Return the estimation error and A as text; for NaN, the text names the missing topic.
 
     Args:
         measured: Whether θ is measured.
@@ -84,7 +84,7 @@ class Node:
 
 
 class Situation:
-    """The newest diagnostics of one namespace, and the steps that they call for.
+    """The newest diagnostics of one namespace, and the remedies for the problems in them.
 
     Attributes:
         detected: Whether the estimator has detected an anomaly.
@@ -104,7 +104,7 @@ class Situation:
         self.detected = False
         self.samples = self.checkpoints = self.doing = ''
         self.suspect = self.evidence = ''
-        self._finding = ''  # kind of the estimator's finding or 'none'; '' if it is unknown
+        self._finding = ''  # kind of the estimator's finding; 'none', or '' if it is unknown
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
@@ -153,7 +153,7 @@ class Situation:
             self.limit = float(values.get('d limit', 'nan'))
 
     def _compare_network(self, node: str, version: str) -> None:
-        """Count the reports in which a node uses another network than the estimator."""
+        """Count the successive reports in which a node's network differs from the estimator's."""
         if not version or not self._accepted or version in self._accepted:
             self._other_networks.pop(node, None)
             return
@@ -161,7 +161,7 @@ class Situation:
         self._other_networks[node] = version, reports + 1
 
     def level(self) -> Level:
-        """Return the level of the worst node."""
+        """Return the level of the whole arm."""
         if self.detected or self._silent() or self._mismatches():
             return 'error'
         levels = [node.level for name, node in self._nodes.items() if not _is_own(name)]
@@ -170,7 +170,7 @@ class Situation:
         return 'warn' if DiagnosticStatus.WARN in levels else 'ok'
 
     def trouble(self) -> str:
-        """Return the causes of a stop with their remedies, other errors, and warnings."""
+        """Return, as one text, the causes of a stop with remedies, other errors, and warnings."""
         return ', '.join(trouble.text for trouble in self._troubles())
 
     def steps(self) -> list[str]:
@@ -227,7 +227,7 @@ class Situation:
         is_stopped = mode in (STOPPED, VERIFYING)
         is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
         causes = stops.parse(control.get(stops.STOP_CAUSES, cause))
-        # The remedy of the stop is shown once if the anomaly is one of its causes.
+        # If the anomaly is one of the causes of the stop, the remedy is shown with the stop only.
         is_in_stop = is_stopped and StopCause.ANOMALY in causes
         evidence = f': {self.evidence}' if self.evidence else ''
         of_finding = remedy.parse(estimator.get(REMEDY_STEPS, '')) or REPAIR
@@ -241,7 +241,7 @@ class Situation:
         if is_stopped and not (is_verifying and is_stopped_by_anomaly):
             text, steps = control.get('remedy', ''), remedy.parse(control.get(REMEDY_STEPS, ''))
             if is_in_stop and self._finding:
-                # The estimator knows the kind of the finding, and whether it is over.
+                # The estimator knows the kind of the finding, and whether the anomaly has ended.
                 explored, known = Step.EXPLORE in steps, of_finding if self.detected else ()
                 steps = tuple(stops.remedy_of(causes, explored, known))
                 text = remedy.sentence(steps)
@@ -268,7 +268,7 @@ class Situation:
 
     def _silent(self) -> list[str]:
         silent = self.silent_nodes()
-        if len(silent) > 1:  # one cause is more likely than several nodes that end together
+        if len(silent) > 1:  # several nodes hardly end together, so there is a common cause
             names = ', '.join(silent)
             since = f'no report for {max(silent.values()):.0f} s'
             advice = f'perhaps the computer is overloaded (load {load_text()})'
@@ -305,7 +305,7 @@ class Situation:
         return self._values('controller').get('mode') == STOPPED
 
     def hint(self) -> str:
-        """Return why the error may rise before learning begins; '' once it has begun."""
+        """Return why the error may rise before learning begins; '' once learning has begun."""
         values = self._values('learner')
         if self.samples == '' or values.get('network learned') == 'True':
             return ''

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects topics with several publishers that should have exactly one.
+"""Detects several publishers of a topic that should have exactly one.
 
 A message does not name its sender, so this module looks at the ROS graph. While several nodes
 publish a topic of `AUTHORS`, its messages are rejected, every node that uses it reports an ERROR,
 and the controller stops. Afterwards nodes resubscribe to latched topics to receive the value again.
 
-Two publishers with the same node name are no proof. A killed node stays in the graph for up to 20 s
-beside its successor, but sends no more messages. Three signs distinguish a second running node:
+Two publishers with the same node name do not prove that two nodes run. A killed node stays in the
+graph for up to 20 s beside its successor, but sends no more messages. Any of these signs proves
+that a second node runs:
 
-- Sequence numbers that repeatedly go back: two nodes take turns publishing.
+- Sequence numbers that decrease repeatedly, because messages of two nodes alternate.
 - A report on /diagnostics under our own name with another identity, after our first report. The
   identity is a random number of the reporting node.
 - Two publishers that have both been in the graph for longer than it keeps a killed publisher.
@@ -29,8 +30,8 @@ from musculoskeletal_ae.exceptions import MessageError
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
 MOTOR_COMMAND = 'motor_command'  # stands for the topic of the parameter motor_command_topic
-#: topics that must have one publisher, with the node that publishes them; `Shell.full_name` returns
-#: the topics of a ros2_control robot that take their place
+#: topics that must have one publisher, with the node that publishes them. A ros2_control robot has
+#: other topics for some of these, which `Shell.full_name` returns.
 AUTHORS = {
     'muscle_states': _DRIVER,
     'joint_states': _DRIVER,
@@ -48,8 +49,8 @@ COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CO
 SEVERAL = 'several publishers'  # rejection reason
 
 LOOK_PERIOD = 0.1  # time between checks of the graph [s]
-LOOKS = 20  # number of checks within which turns of two publishers are counted
-TURNS = 3  # number of turns that prove two publishers of one name
+LOOKS = 20  # number of recent checks over which decreases of the sequence number are counted
+TURNS = 3  # number of these decreases that proves two publishers of one name
 LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
 NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
 TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]
@@ -87,7 +88,7 @@ class Authorship:
 
         Args:
             publishers: Publishers of the topic.
-            turns: Number of times so far that two publishers of one name took turns.
+            turns: Number of times so far that the sequence number of the topic has decreased.
             now: Time of the check [s].
         """
         present = list(publishers)
@@ -142,7 +143,7 @@ class Twins:
             self._heard_at = now
 
     def is_alone(self, now: float) -> bool:
-        """Whether no other node has reported under this name for some time."""
+        """Whether no other node has reported under this name for TWIN_SILENCE."""
         return now - self._heard_at > TWIN_SILENCE
 
 
@@ -161,8 +162,9 @@ class Sources:
         Args:
             node: Node whose view of the graph is used.
             resolve: Returns the full name of a topic of `AUTHORS`; '' if there is none.
-            turns: Number of turns that publishers of one name took, by topic.
-            renew: Resubscribes to a topic; called when it has one publisher again.
+            turns: Number of times that the sequence number decreased, by topic. The caller updates
+                it.
+            renew: Resubscribes to a topic; called when the topic has one publisher again.
         """
         self._node, self._resolve = node, resolve
         self._turns, self._renew = turns, renew
@@ -176,10 +178,10 @@ class Sources:
                 self._authorships[topic] = Authorship()
 
     def check(self, topic: str, is_latched: bool) -> None:
-        """Check a message that has just arrived.
+        """Check the publishers of a topic on which a message has just arrived.
 
         Raises:
-            MessageError: If it may come from another node than the intended publisher.
+            MessageError: If the message may come from another node than the intended publisher.
         """
         authorship = self._authorships[topic]
         if is_latched:  # look now, because latched messages are rare and may move the arm at once
@@ -220,7 +222,7 @@ class Sources:
         return f'stop all of them except {" and ".join(sorted(authors))} of this arm'
 
     def _shown(self, topic: str) -> str:
-        """Return the name of a topic, or of the one that replaces it, without our namespace."""
+        """Return the name of a topic without our namespace, as `resolve` returns it."""
         return self._resolve(topic).removeprefix(f'{self._node.get_namespace().rstrip("/")}/')
 
     def _look(self, topic: str) -> None:

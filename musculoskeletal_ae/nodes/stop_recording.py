@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Saves the last seconds before a latched stop as a bag that `replay` plays.
 
-A node keeps the recent messages that it received and published. When it stops, a thread writes them
-to `stop_DATE-TIME/` in ROS's log directory (`log/` under bringup.sh), which does not delay the
-commands of the stop. If there are more recordings than the user wants to keep, the oldest ones are
-deleted.
+The controller keeps the recent messages that it received and published. When it stops the arm, a
+thread writes these messages to `stop_DATE-TIME/` in ROS's log directory (`log/` under bringup.sh).
+The thread does not delay the commands of the stop. If there are more recordings than the user wants
+to keep, the oldest ones are deleted.
 """
 
 import shutil
@@ -57,7 +57,8 @@ class StopRecording:
         self._directory = directory or Path(get_logging_directory())
         self._recent: deque[Heard] = deque()
         self._recent_size = 0  # size of the recent messages [bytes]
-        self._latched: dict[str, Heard] = {}  # last latched messages before `_recent`
+        #: newest message of each latched topic that is too old for `_recent`
+        self._latched: dict[str, Heard] = {}
         self._writing: threading.Thread | None = None
         self.left_out = 0  # number of messages that were too large
         self.problem = ''  # error of the last recording, or ''
@@ -108,7 +109,7 @@ class StopRecording:
             return
         self.saved, self.problem = bag, ''
         for old in sorted(self._directory.glob(NAMES))[:-most]:
-            shutil.rmtree(old, ignore_errors=True)  # a failure does not matter
+            shutil.rmtree(old, ignore_errors=True)  # the next recording tries to delete it again
 
     def _write(self, bag: Path, cause: str, messages: list[Heard]) -> None:
         """Write a bag and the cause of the stop; delete the bag if that fails."""

@@ -33,7 +33,8 @@ def send_taught_motion(bag: Bag, options: Namespace, arguments: list[str]) -> in
     """Publish a hand-guided motion as one trajectory, and return the exit status 0.
 
     Raises:
-        MusculoskeletalError: If the bag has no such motion, or the controller refuses it.
+        MusculoskeletalError: If the bag has no hand-guided motion, or the controller refuses the
+            trajectory.
     """
     names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
     if len(names) > 1:  # with --keep-names, the bag's arms stay separate
@@ -124,7 +125,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
         answers.begin()
         publisher.publish(message)
         is_acknowledged = publisher.wait_for_all_acked(Duration(seconds=ACKNOWLEDGE_TIME))
-        # Wait for two reports: the first may have been on its way when the trajectory arrived.
+        # Wait for two reports: the first may have been sent before the trajectory arrived.
         spinner.spin_until(
             lambda: answers.is_taken or answers.refusal or len(answers.reports) > 1,
             REPORT_TIME if has_reported else 0.0,

@@ -2,8 +2,8 @@
 """The node `view`: shows a running arm on a web page, and moves it on request.
 
 The node subscribes only while somebody views the page. It then takes only the newest message of
-each topic, at the frame rate. An executor would handle every message, which would take a tenth of a
-core.
+each topic, once for each picture. An executor would instead handle every message, which would take
+a tenth of a core.
 """
 
 import math
@@ -156,7 +156,7 @@ class View(Node):
             self.subscribed.append(self.create_subscription(kind, topic, receive, qos))
 
     def _newest(self, what: str, largest_age: float = LARGEST_AGE) -> Any:
-        """Return the newest value; None if it is older than `largest_age` [s]."""
+        """Return the newest value named `what`; None if it is older than `largest_age` [s]."""
         when, value = self.newest.get(what, (-math.inf, None))
         return value if time.monotonic() - when < largest_age else None
 
@@ -185,7 +185,7 @@ class View(Node):
                 self.reported_at = now
                 state = 'viewed' if is_viewed else 'the page has no visitors'
                 self.diagnostics.tell(Report('ok', state, {}), self.reception.take_rates())
-            while not self.requests.empty():  # including the last visitor's requests
+            while not self.requests.empty():  # also after the last visitor has left
                 what, *value = self.requests.get()
                 try:
                     self._do(what, *value)
@@ -212,7 +212,7 @@ class View(Node):
         self.situation.tick()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
         if (measured := posture.get('measured')) is not None and np.isnan(measured).any():
-            # Draw joints without a working sensor at their estimate.
+            # Draw joints without a working sensor at the estimated angle.
             filled = np.where(np.isnan(measured), posture.get('estimated', measured), measured)
             posture['measured'] = filled
             if np.isnan(filled).any():
@@ -255,7 +255,7 @@ class View(Node):
         ]
         trouble = self.page.with_buttons(situation.trouble())
         isolated = f'isolated: {self.robot.names(self._isolated())}'
-        if len(self._isolated()) and isolated not in trouble:  # not part of the estimator's report
+        if len(self._isolated()) and isolated not in trouble:
             lines.append(isolated)
         shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
         values = error, anomaly, situation.distance, situation.limit
@@ -265,7 +265,7 @@ class View(Node):
         self.page.follow(self.payload, self._newest('played', math.inf))
 
     def _show_reset_outcome(self) -> None:
-        """Notify visitors of the outcome of a reset, after the time for a renewed stop."""
+        """Tell visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
         if time.monotonic() > self.reset_at + SETTLE_TIME:
             self.reset_at = math.inf
             trouble = self.page.with_buttons(self.situation.trouble())
