@@ -50,7 +50,7 @@ DETECTION_DELAY = 2.0  # time before a detection in which messages may already b
 class CheckpointValidator:
     """Accepts or rejects candidates, and chooses the network for a rollback.
 
-    Times `now` are of one steady clock [s].
+    All times `now` are readings of one steady clock [s].
 
     Attributes:
         isolated: Indices of the isolated muscles, which are ignored.
@@ -98,10 +98,12 @@ class CheckpointValidator:
 
         Args:
             mae: The candidate.
-            is_chosen: Whether a user has chosen it. It need not agree with the network in use.
+            is_chosen: Whether a user has chosen this network. A chosen network need not agree with
+                the network in use.
 
         Raises:
-            GateError: If it is rejected; the text names each quantity, its value and its limit.
+            GateError: If the candidate is rejected; the text names each quantity that exceeds its
+                limit, the value and the limit.
         """
         try:
             deque(self.trial(mae, is_chosen), maxlen=0)
@@ -128,7 +130,7 @@ class CheckpointValidator:
             raise GateError('; '.join(faults))
 
     def declare_repaired(self, muscles: Iterable[int], now: float) -> None:
-        """Record that a user declares muscles (indices) healthy as they are, after a repair."""
+        """Record that a user has repaired muscles (indices) and declares them healthy."""
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
@@ -149,7 +151,7 @@ class CheckpointValidator:
             return None
         self._is_anomaly = detected
         if not detected:
-            self._messages.clear()  # a repaired arm may differ from them
+            self._messages.clear()  # after a repair, the arm may differ from earlier messages
             return None
         self._messages.drop_after(now - DETECTION_DELAY)
         in_use = self.mae
@@ -162,7 +164,7 @@ class CheckpointValidator:
         return message_errors.message_errors(mae, self._messages, self.isolated)
 
     def agreement(self, mae: Mae) -> list[Comparison]:
-        """Return the comparisons of a network with the one in use; [] without one."""
+        """Return the comparisons of a network with the one in use; [] if none is in use."""
         if self.mae is None:
             return []
         in_use = self.mae.without(self.isolated)
@@ -170,11 +172,14 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def detector_measures(self, mae: Mae) -> Iterator[float]:
-        """Yield d over its threshold: on the recent messages, then with each muscle ruptured."""
+        """Yield d / threshold on the recent messages, then with each muscle ruptured in turn."""
         return detector.measures(mae, self._messages, self.isolated)
 
     def with_detector(self, mae: Mae, now: float) -> Mae:
-        """Return a network that takes over, with the detector in use if it has none of its own."""
+        """Return the network that takes over, with a calibrated detector if there is one.
+
+        If `mae` has no calibrated detector of its own, it inherits the detector in use.
+        """
         statistics = None if self.mae is None else self.mae.anomaly
         has_own = mae.anomaly is not None and mae.anomaly.calibrated
         if has_own or statistics is None or not statistics.calibrated:
@@ -199,6 +204,6 @@ class CheckpointValidator:
 
     @cached_property
     def _likely_cause(self) -> str:
-        """A property of the robot description that may be the cause of a rejection, or ''."""
+        """Text on a property of the robot description that may cause a rejection, or ''."""
         warning = jump_warning(self._robot)
         return f' ({warning})' if warning else ''

@@ -11,8 +11,9 @@ noise. Tendon friction μ has to be known: unknown friction hides a contact forc
 residual torque of the healthy moving arm (`estimation/healthy_torque.py`). F₀ keeps components of
 the force small that produce no joint torque, such as those along a stretched arm.
 
-Torques that press a joint against its stop cannot be measured, because the stop carries them. A
-torque away from the stop is at least as large as the measured one.
+At a joint limit, the unknown torque of the stop is added to τ_ext. A computed torque that points
+away from the stop may be due to the stop alone and therefore counts as 0. If the computed torque
+points towards the stop, the true τ_ext is at least as large.
 """
 
 import math
@@ -44,9 +45,9 @@ class Contact(NamedTuple):
     """External load estimated from one message.
 
     Attributes:
-        torque: τ_ext [N·m], (D,); 0 where a stop carries it.
-        force: Computes F on the origin of the end effector, in the axes of the root link [N], (3,).
-            It is a function, because few callers need the force.
+        torque: τ_ext [N·m], (D,); 0 where a stop may be its only cause.
+        force: Function that returns F [N], (3,), acting on the origin of the end effector, in the
+            axes of the root link. It is a function, because few callers need the force.
         distance: d; NaN if the residual torque of the healthy arm has not been calibrated.
         is_contact: Whether there is contact.
     """

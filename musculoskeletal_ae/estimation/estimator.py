@@ -255,7 +255,7 @@ class Estimator:
         return self._take(partial(self.stream.take, message, time, now), now)
 
     def step(self, states: Array, time: float, now: float) -> Output | None:
-        """Estimate and monitor from raw l [m], T [N] and temperature [°C], (3, M).
+        """Estimate the state from raw l [m], T [N] and temperature [°C], (3, M), and monitor it.
 
         Returns:
             The results; None without a network, or before the first estimate of the length offsets.
@@ -266,13 +266,13 @@ class Estimator:
         return self._take(partial(self.stream.take_states, states, time, now), now)
 
     def posture_of_marker(self, pose: pin.SE3) -> Array:
-        """Return θ that brings the end effector to a pose [rad], (D,).
+        """Return a posture in which the end effector has a given pose.
 
         Args:
             pose: The pose in the frame of the root link.
 
         Returns:
-            θ, with NaN for joints that do not move the end effector.
+            θ [rad], (D,), with NaN for joints that do not move the end effector.
 
         Raises:
             MessageError: If the end effector cannot reach the pose.
@@ -351,13 +351,16 @@ class Estimator:
         return theta
 
     def _handle_jump(self, now: float) -> None:
-        """Handle jumps of lengths while no detector runs."""
+        """Handle a jump of lengths during a calibration or without a network.
+
+        In all other cases, the detector `LengthJump` reports it.
+        """
         if self.stream.jumps == self._jumps:
             return
         self._jumps = self.stream.jumps
         jumped = tuple(sorted(self.stream.displaced))
         if self.calibration is not None:
-            # Readings before the jump have other offsets.
+            # Start again, because readings before and after the jump have different offsets.
             self.calibrate_lengths(self._stated_posture)
         elif self.mae is None and self.body.offsets.known and jumped:
             self._handle(finding_of(jumped), now)
@@ -408,7 +411,7 @@ class Estimator:
         calibration.step(sample.model_tension, sample.length_read, dt, measured)
         guess = calibration.offsets
         if guess is None or (calibration.is_standing and not calibration.is_done):
-            return None  # the arm has to stand until the calibration ends
+            return None  # nothing is estimated while the arm stands in the stated posture
         # Publish the estimate again only after a substantial change.
         difference = np.abs(guess.offset - self.body.offsets.offset).max()
         if guess.known or self.output is None or difference > SHIFTED:

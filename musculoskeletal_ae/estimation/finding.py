@@ -38,7 +38,7 @@ class Kind(Enum):
 REVOKING = frozenset({Kind.LENGTH_JUMP, Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE})
 
 
-#: remedies of findings that no repair of one muscle removes
+#: remedies of findings that do not end with the repair of one muscle
 _REMEDIES = {
     Kind.JOINT_SENSORS_DISAGREE: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
     **dict.fromkeys(REVOKING, (Step.CALIBRATE_LENGTHS,)),
@@ -73,7 +73,7 @@ class Observation:
         sample: The readings.
         estimate: The network's estimate.
         demand: T commanded to the muscle modules [N], (M,); None without a command.
-        dt: Time since the previous message [s]; longer pauses are shortened.
+        dt: Time since the previous message [s], limited by the caller to some maximum.
         lengths_known: Whether the length offsets are known.
         measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
         command: l_target of the muscle modules [m], (M,); None without a command.
@@ -129,10 +129,10 @@ def observe(
 
 
 class Detector:
-    """Base class of the detectors. Each detects one kind of fault; findings are latched elsewhere.
+    """Base class of the detectors. Each detects one kind of fault; `SuspectHandling` latches it.
 
-    A new detector overrides `step` or `read`, and other methods as needed. `HealthMonitor` uses it
-    once it is in its list.
+    A new detector overrides `step` or `read`, and other methods as needed. To use it, add it to the
+    list in `HealthMonitor`.
     """
 
     def use(self, mae: Mae) -> None:

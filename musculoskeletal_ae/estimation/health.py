@@ -41,7 +41,7 @@ class HealthMonitor:
 
         Args:
             robot: The nominal body.
-            preset: Preset that provides the detectors by residual and by physics.
+            preset: Preset that provides the residual-based and physics-based detectors.
             settings: Settings of the detectors.
             heat: Thermal models of the muscle modules, which the caller updates.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures the apparent external torque of a healthy arm in motion.
+"""Measures σ, the root mean square of τ_ext that is estimated for a healthy arm in motion.
 
     σ_j² ← σ_j² + (dt / t) (τ_ext,j² − σ_j²),   t: time of motion so far, MEMORY at most
 
@@ -59,7 +59,7 @@ class HealthyTorque:
         self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Update σ from T_read [N] and l [m], (M,), of a healthy arm, dt [s] after the last."""
+        """Update σ from T_read [N] and l [m], (M,), read dt [s] after the previous message."""
         end = self._direction.end_tension(self._mae.transmission, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._contact.step(theta, end, dt).torque

@@ -23,8 +23,8 @@ ENOUGH = 38.0  # required duration of gentle motion without measured joint angle
 STANDING = 1.0  # required duration of standing in a stated posture [s]
 FIRST_FIT = 0.5  # time until the first fit [s]
 FIT_INTERVAL = 2.0  # time between two later fits [s]
-#: Time for each of the short pieces of work of a fit [s], so that a fit takes equally long at any
-#: rate of the messages. A piece takes 1 to 2 ms.
+#: A fit consists of short pieces of work, each of which takes 1 to 2 ms. One piece is done per this
+#: time between messages [s], so that a fit takes equally long at any rate of the messages.
 PIECE_TIME = 0.005
 MOST_PIECES = 4  # largest number of pieces of work for one message
 #: median residual of a length above which a fit is rejected [m]; correct offsets have 0.0003 m
@@ -163,7 +163,7 @@ class LengthCalibration:
         self.offsets = LengthOffsets(offset, deviation)
 
     def _problem_of(self, fit: Fit, residual: Array) -> str:
-        """Return why a fit is not reliable, or ''; `residual` is the median one of l [m], (M,)."""
+        """Return why a fit is not reliable, or ''; `residual` has the medians for l [m], (M,)."""
         if residual.max() > LARGEST_RESIDUAL:
             name = self._robot.muscles[int(residual.argmax())]
             limit = 1e3 * LARGEST_RESIDUAL
@@ -172,7 +172,7 @@ class LengthCalibration:
                 f'{limit:g} mm'
             )
         cost = self._fit.cost_per_residual(fit)
-        # the fit may have found wrong postures that are similar to the true ones
+        # At a high cost, the fit may have found wrong postures that are similar to the true ones.
         if not cost <= LARGEST_COST:
             problem = 'no offsets explain the lengths and tensions'
             excess = f'the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
@@ -188,7 +188,8 @@ def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
         posture: θ [rad], (D,); () means no posture and is legal.
 
     Raises:
-        MusculoskeletalError: If it is outside the joint limits; the text names the legal ranges.
+        MusculoskeletalError: If the posture is outside the joint limits; the text names the legal
+            ranges.
     """
     if not posture:
         return

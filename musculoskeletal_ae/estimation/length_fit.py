@@ -55,7 +55,7 @@ LEAST_WEIGHT = 0.1
 
 # The search for a start.
 DRAWN_POSTURES = 3200  # number of random first postures that are compared by torque
-FITTED_POSTURES = 400  # number of the best of these, which are fitted coarsely to the lengths
+FITTED_POSTURES = 400  # number of the best drawn postures, which are fitted coarsely to the lengths
 COMPARED_FITS = 30  # number of the best coarse fits, which are compared by torque as well
 REFINED_FITS = 6  # number of the best coarse fits, which are refined
 FEW_MOMENTS = 24  # number of moments that the search uses
@@ -132,13 +132,13 @@ class LengthFit:
 
         Args:
             moments: The moments.
-            before: An earlier fit, from which the fit also starts, or None.
+            before: An earlier fit, whose constants serve as a second start, or None.
         """
         rows = np.unique(np.linspace(0, len(moments.length) - 1, FEW_MOMENTS).astype(np.int64))
         few = moments.rows(rows)
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
-        # A few moments may mislead. All of them decide between the new start and the earlier fit.
+        # A few moments may mislead. All moments decide between the new start and the earlier fit.
         candidates = [likeliest.constants]
         if before is not None:
             candidates.append(before.constants)
@@ -210,7 +210,7 @@ class LengthFit:
     def _residuals(
         self, fit: Fit, moments: Moments, turning: Array, derivatives: bool = False
     ) -> tuple[Array, ...]:
-        """Return the residuals of lengths, torques and joint limits over their noise.
+        """Return the residuals of lengths, torques and joint limits, divided by their noise.
 
         Args:
             fit: Constants and postures.

@@ -8,13 +8,13 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-# With a larger error, the camera sees another marker or is not calibrated.
+# If an error is larger, the camera sees a different marker or is not calibrated.
 MARKER_DISTANCE = 0.05  # largest error of the position [m]
 MARKER_ANGLE = 0.3  # largest error of the orientation [rad]
 
 
 def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
-    """Return θ that brings the end effector to a pose [rad], (D,).
+    """Return a posture in which the end effector has a given pose.
 
     Args:
         robot: The nominal body.
@@ -22,7 +22,7 @@ def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
         start: θ at which the search starts [rad], (D,).
 
     Returns:
-        θ, with NaN for joints that do not move the end effector.
+        θ [rad], (D,), with NaN for joints that do not move the end effector.
 
     Raises:
         MessageError: If the end effector cannot reach the pose.

@@ -7,10 +7,10 @@ muscle stiffness control demands, and with the length l' estimated from the othe
 
     T_ref = T_bias + K (l − l_target)
 
-Position-controlled modules do not regulate tension. Their T_ref is the tension of the series
-elastic element if the suspect is stretched further than before the verification:
+Position-controlled modules do not regulate tension. Their T_ref is the tension that follows from
+the additional stretch of the series elastic element:
 
-    L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T)
+    L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T),   T_0, x_0: before winding in
 
 Their tendons may be slack at first. The suspect is wound in until it has tension, or until it is so
 short that a healthy one would have tension. For these modules, the first row that applies decides:
@@ -179,7 +179,7 @@ class Verification:
 
         Args:
             muscle: Index of the suspect.
-            law: T_ref of its module.
+            law: Computes T_ref of the suspect's module.
         """
         bias = self._bias = law.bias
         self.muscle, self._law = muscle, law

@@ -18,7 +18,7 @@ MOVED = 0.006  # predicted motion of the muscle above which its constant reading
 
 
 class FrozenSensor(Detector):
-    """Predicts the length of a muscle with a constant reading from the other muscles."""
+    """Predicts, from the other muscles, the length of a muscle whose reading is constant."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
@@ -27,7 +27,8 @@ class FrozenSensor(Detector):
         #: time without a change of l and of T [s]
         self._unchanged_time: Array = np.zeros((2, robot.muscle_count))
         self._reduced_mae: Mae | None = None  # network without the observed muscle
-        self._shortest, self._longest = np.inf, -np.inf  # predicted lengths of that muscle [m]
+        #: shortest and longest predicted length of the observed muscle [m]
+        self._shortest, self._longest = np.inf, -np.inf
 
     def use(self, mae: Mae) -> None:
         """Use this network."""
@@ -41,13 +42,12 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle with a constant reading that moves according to the others."""
+        """Report a muscle whose reading is constant although the other muscles show that it moves."""
         sample, robot = observation.sample, self._robot
-        # An unknown tension does not count as frozen.
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)
-        if not robot.tension_source.is_known:
+        if not robot.tension_source.is_known:  # an unknown tension does not count as frozen
             is_same[1] = 0.0
         self._last = readings
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same
@@ -56,7 +56,8 @@ class FrozenSensor(Detector):
             self._stop_observing()
             return None
         assert mae is not None
-        # `slack_tendon.py` handles slack tendons. A simple module may report T_bias exactly.
+        # Slack tendons are left to `slack_tendon.py`. A constant tension of T_bias is no fault,
+        # because a simple module may always report exactly T_bias.
         slack = LIMITS.slack_share * robot.tension.bias
         by_length, by_tension = self._unchanged_time
         differs_from_bias = np.abs(tension - robot.tension.bias) > slack

@@ -75,7 +75,7 @@ class JammedModule(Detector):
 
 
 class JammedPosition(JammedModule):
-    """Does the same for position-controlled modules."""
+    """Measures how long each position-controlled winch has been stationary in the wrong place."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
         """Return which modules have not reached their command, (M,); None without a command."""

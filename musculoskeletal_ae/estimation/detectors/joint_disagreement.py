@@ -5,8 +5,8 @@
     Δ = g − g_usual,       g_usual: median of g in healthy messages
 
 If all joints are measured, g is the error of every muscle's length. On a healthy arm it is small
-and changes little with the posture. When a module loses its length offset, by a jump or a drift,
-g changes by the same amount.
+and changes little with the posture. When the length offset of a module jumps or drifts, g changes
+by as much as the offset.
 
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ. Because
 muscles outnumber joints, arbitrary errors of lengths rarely have this form. If a δθ explains most
@@ -36,20 +36,21 @@ class Largest(NamedTuple):
     all: float  # largest root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return a change [m] (M,) relative to the limits; above 1 it exceeds one of them."""
+        """Return the largest ratio of a change [m] (M,) to the limits; above 1, one is exceeded."""
         size = float(np.sqrt(np.square(change[used]).mean())) if used.any() else 0.0
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
 
-# Largest values on healthy exploring Musashi arms, half of them of emulator model `foreign`, some
-# with a load of 3.6 kg and pushes; first of a single muscle, then the root mean square of all:
+# Largest values on healthy exploring Musashi arms. Half of the arms were of emulator model
+# `foreign`, and some had a load of 3.6 kg and were pushed. The first value of each pair is the one
+# of a single muscle, and the second is the root mean square over all muscles:
 #
 #     initial networks                     Δ 0.036 m, 0.019 m     g 0.051 m, 0.029 m
 #     after 20 to 60 s of learning         Δ 0.032 m, 0.013 m
 #     networks with a calibrated detector  Δ 0.013 m, 0.006 m     g 0.013 m, 0.006 m
 #
-# With the limits of calibrated networks, an error of 0.05 m of a single muscle is detected in every
-# posture.
+# With the limits for calibrated networks, an error of 0.05 m of a single muscle is detected in
+# every posture.
 CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with networks that are not calibrated
 GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with networks that are not calibrated
 CHANGE_LEARNED = Largest(0.035, 0.016)  # limits of Δ with calibrated networks
@@ -65,7 +66,7 @@ UNEXPLAINED = 0.5
 
 
 class JointDisagreement(Detector):
-    """Compares the lengths with those at the measured posture.
+    """Compares measured muscle lengths with those that the network computes at the measured θ.
 
     Attributes:
         gap: g [m], (M,); None without measurements.

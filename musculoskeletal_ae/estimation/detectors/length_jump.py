@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects lengths that jumped and stayed there, for example because modules lost their offsets.
+"""Detects lengths that jumped to new values and kept them, as when modules lose their offsets.
 
 `signals/muscle_stream.py` rejects messages with a jump. If the new lengths persist, it accepts them
 and names the muscles in the sample.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a muscle whose sensors report NaN for some time.
 
-Messages with NaN are rejected, so that nothing is estimated meanwhile. If only one muscle has NaN,
-its sensor is faulty, and a verification is not necessary.
+Messages with NaN are rejected, so nothing is estimated while they arrive. If only one muscle has
+NaN, its sensor is faulty, and a verification is not necessary.
 """
 
 import math
@@ -25,7 +25,10 @@ class MissingValues(Detector):
         self._since = self._last = -math.inf  # times of the first and the last message with NaN [s]
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Report a muscle that alone has reported NaN for SILENT; see `Detector`."""
+        """Report the only muscle with NaN in a message, if it has had NaN for SILENT seconds.
+
+        `Detector.read` describes the arguments.
+        """
         known = self._robot.tension_source.measured(states[:2])
         is_missing = ~np.isfinite(known).all(axis=0) & usable
         muscle = int(is_missing.argmax()) if np.count_nonzero(is_missing) == 1 else None

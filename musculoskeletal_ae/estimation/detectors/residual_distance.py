@@ -9,16 +9,17 @@ statistics μ and Σ have to be measured on the real arm: with statistics of the
 model, most healthy postures would count as anomalous. Without calibrated statistics, d is not
 evaluated.
 
-Threshold. It grows with the distance to the nearest calibrated posture (`unfamiliarity`), where the
-network is less accurate, and in proportion to a tension above T_limit, which networks have rarely
-learned. While a tendon is slack the threshold does not grow, because a ruptured muscle has no
-tension in any posture.
+Threshold. Far from calibrated postures, the network is less accurate, so the threshold grows with
+the distance to the nearest one (`unfamiliarity`). It also grows in proportion to a tension above
+T_limit, because networks have learned few tensions that are so high. While a tendon is slack the
+threshold does not grow, because a ruptured muscle has no tension in any posture.
 
 Suspect. An anomaly affects the residuals of all muscles. The suspect is the muscle without which
 the remaining residual is most likely.
 
-Slack. While a slack tendon is being wound in, its length reads longer than ② restores it, and
-messages do not count. The length of a ruptured tendon reads shorter.
+Slack. While a slack tendon is being wound in, its measured length is longer than the length that ②
+restores, and messages do not count. The measured length of a ruptured tendon is shorter than the
+restored one, so its messages do count.
 
 If the parameter `anomaly_threshold` is set, A is compared with it, and d is not used.
 """
@@ -137,7 +138,8 @@ class ResidualDistance(Detector):
         evidence = ''
         if observation.lengths_known:
             evidence = self._evidence(observation, distance, slack_count > 0, waits)
-        # After a rupture, another tendon may be slack for a moment.
+        # A tendon that alone is slack stays the suspect. If several are slack, some of them may be
+        # healthy tendons that a rupture has made slack for a moment, so likelihood decides.
         is_first = evidence and self._beyond == IN_A_ROW
         if is_first and self.is_calibrated and slack_count != 1:
             candidates = is_slack if slack_count else self._robot.used
@@ -146,7 +148,7 @@ class ResidualDistance(Detector):
         return Finding(suspect, Kind.RESIDUAL_DISTANCE, evidence) if evidence else None
 
     def unfamiliarity(self, theta: Array) -> float:
-        """Return the distance of θ [rad] (D,) to the nearest calibrated posture, over NEAR.
+        """Return the distance of θ [rad] (D,) to the nearest calibrated posture, divided by NEAR.
 
         A posture with a value above 1 is unfamiliar.
         """
@@ -157,7 +159,7 @@ class ResidualDistance(Detector):
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
     def limit(self, theta: Array, tension: Array) -> float:
-        """Return the threshold of d at θ [rad] (D,) and T [N] (M,); ∞ without one."""
+        """Return the threshold of d at θ [rad] (D,) and T [N] (M,); ∞ if it is not calibrated."""
         used = self._robot.used
         highest = float((tension[used] / self._robot.tension.limit[used]).max(initial=0.0))
         factor = np.clip(max(self.unfamiliarity(theta), highest), 1.0, WIDEST)

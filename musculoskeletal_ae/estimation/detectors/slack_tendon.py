@@ -7,16 +7,16 @@ The rule needs no statistics, because a healthy module maintains at least T_bias
 time to wind in slack. The detector waits while the winch moves at `slack_speed` or faster, until it
 has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count.
 
-A position-controlled module maintains no tension, and a tendon may be slack because its command
-is long. The rule then looks for a tendon that is stretched, but has no tension:
+A position-controlled module maintains no tension, so a healthy tendon is slack if a long length is
+commanded. For these modules, the rule is that a tendon is stretched, but has no tension:
 
     T < slack_share · T_bias for DEAD_TIME, and x and x − x₀ > STRETCH · L_e(T_bias)
     x = l(θ, 0) − l,   x₀ = x − L_e(T) when the tendon was last taut
 
 θ is estimated from the tendons that are not slack. x contains the error of the network, which may
-be centimetres before it has learned the arm. Readings just before the tension was lost reveal this
-error, x₀. Both x and x − x₀ must be large. A rupture of a tendon without load is detected as soon
-as the tendon should carry load.
+be centimetres before the network has learned the arm. The readings just before the tension was lost
+reveal this error, x₀. Both x and x − x₀ must be large. If a tendon ruptures while it carries no
+load, the rupture is detected as soon as the tendon should carry load.
 """
 
 from collections import deque
@@ -38,7 +38,9 @@ STRETCH = 1.5
 UNCALIBRATED_STRETCH = 3.0
 #: STRETCH with motor currents, whose tensions are uncertain because of drive friction
 CURRENT_STRETCH = 2.0
-RECENT = 5  # number of messages that are kept; the oldest of them is from before a rupture
+#: number of messages that are kept; when a tendon has lost its tension, the oldest kept message is
+#: from the time before
+RECENT = 5
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
 
@@ -126,9 +128,10 @@ class SlackTendon(Detector):
 
 
 class StretchedTendon(SlackTendon):
-    """Measures how long each tendon of position-controlled modules has been stretched, but slack.
+    """Measures how long each tendon has been stretched without tension.
 
-    Such modules do not wind in slack by themselves, so `is_winding_in` stays False.
+    This class is for position-controlled modules. They do not wind in slack by themselves, so
+    `is_winding_in` stays False.
     """
 
     def __init__(self, robot: Robot, settings: Detection) -> None:
@@ -164,11 +167,11 @@ class StretchedTendon(SlackTendon):
         return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched, but has no tension')
 
     def _is_stretched(self, sample: MuscleSample, slack: tuple[int, ...]) -> Bools:
-        """Return which slack muscles are so short that healthy ones would have tension, (M,)."""
+        """Return a mask (M,) of slack muscles so short that a healthy tendon would have tension."""
         robot, mae = self._robot, self._mae
         isolated = tuple(sorted({*robot.isolated, *slack}))
         if robot.muscle_count - len(isolated) <= robot.joint_count:
-            return np.zeros(robot.muscle_count, dtype=bool)  # the others do not determine θ
+            return np.zeros(robot.muscle_count, dtype=bool)  # the other muscles do not determine θ
         if isolated not in self._reduced:
             self._reduced[isolated] = mae.without(isolated)
         is_calibrated = mae.anomaly is not None and mae.anomaly.calibrated

@@ -7,14 +7,14 @@ Three quantities are compared:
     lengths   l through ① at the same posture
     shape     the change of l through ① from posture to posture, on the fixed states
 
-If joint sensors measured the postures, they are the reference. The median error of each joint and
-muscle may then be ANGLE_WORSE times the error of the network in use, or ANGLE_FLOOR and
-LENGTH_FLOOR if that is more. The shape is compared only if the candidate's mean error of length is
-the larger one.
+If joint sensors measured the postures, they are the reference. The limit of the median error of
+each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
+ANGLE_FLOOR or LENGTH_FLOOR. The shape is compared only if the candidate's mean error of length is
+larger than that of the network in use.
 
-Without joint sensors, the network in use is the reference. The median differences may be up to
-ANGLE_MOVED and LENGTH_MOVED, and the relative difference in shape up to SHAPE_MOVED. With too few
-messages, T and l of the fixed states take their place, with the lengths of the network in use.
+Without joint sensors, the network in use is the reference. The limits of the median differences are
+ANGLE_MOVED and LENGTH_MOVED, and that of the relative difference in shape is SHAPE_MOVED. If there
+are too few messages, the fixed states replace them, with lengths by the network in use.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ from musculoskeletal_ae.estimation.validation.recent_messages import LEAST, Rece
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-# Limits relative to joint sensors. Good learned networks differed from joint sensors by up to 0.29
-# rad after a network that differed by 0.18 rad, and their lengths by up to 0.03 m.
+# Limits relative to joint sensors. A good learned network differed from joint sensors by 0.29 rad
+# although the network before it differed by 0.18 rad. Lengths of good learned networks differed by
+# up to 0.03 m.
 ANGLE_FLOOR = 0.35  # error of a joint that is always permitted [rad]
 LENGTH_FLOOR = 0.06  # error of a length that is always permitted [m]
 ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
@@ -107,7 +108,14 @@ class AgreementCheck:
         return self._with_network(mae, new, old, tension)
 
     def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Comparison]:
-        """Compare with the network in use; θ of the candidate and of that network, (N, D)."""
+        """Compare a candidate with the network in use.
+
+        Args:
+            mae: The candidate.
+            new: θ that the candidate estimates [rad], (N, D).
+            old: θ that the network in use estimates [rad], (N, D).
+            tension: T_end [N], (N, M).
+        """
         angle = ANGLE_MOVED if self._has_learned else ANGLE_MOVED_INITIAL
         limit = angle * self._robot.kinematics.radian
         change = self._length_error(mae, old, tension, self._in_use.lengths(old, tension))
@@ -119,7 +127,14 @@ class AgreementCheck:
         ]
 
     def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Comparison]:
-        """Compare with joint sensors, which measured these rows of the messages."""
+        """Compare a candidate and the network in use with joint sensors.
+
+        Args:
+            mae: The candidate.
+            new: θ that the candidate estimates [rad], (N, D).
+            old: θ that the network in use estimates [rad], (N, D).
+            rows: Indices of the messages in which all joints were measured.
+        """
         measured = self._messages.theta[rows]
         error, error_in_use = (_median(theta[rows] - measured) for theta in (new, old))
         least = ANGLE_FLOOR * self._robot.kinematics.radian

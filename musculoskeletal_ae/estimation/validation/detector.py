@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks the calibrated detector of a candidate network, or give it the detector in use.
+"""Checks the calibrated detector of a candidate network, or gives it the detector in use.
 
 A calibrated detector must stay below its threshold on the recent messages, and must respond to
 a ruptured muscle. The measure is the median over the messages of d divided by its threshold.
@@ -39,7 +39,7 @@ def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Ite
         return float(np.median(statistics.distances(error) / threshold))
 
     yield measure(tension, length)
-    #: LEAST of the messages suffice for each muscle
+    # For each ruptured muscle, LEAST messages suffice.
     rows = np.linspace(0, len(length) - 1, LEAST).astype(int)
     is_intact = 1.0 - np.eye(tension.shape[1])
     for factors in np.delete(is_intact, tuple(isolated), axis=0):
@@ -67,9 +67,9 @@ def faults(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Itera
 def with_detector_of(
     statistics: AnomalyStatistics, mae: Mae, messages: RecentMessages, isolated: tuple[int, ...]
 ) -> Mae:
-    """Return a network with the detector of another one.
+    """Return the network that takes over, with the detector of the network in use.
 
-    The threshold is raised if the messages require it.
+    The threshold is at least WIDENED times the highest d of the recent messages.
 
     Args:
         statistics: The calibrated detector of the network in use.

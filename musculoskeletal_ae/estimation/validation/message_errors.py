@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks how well a candidate network explains recent messages of the arm.
 
-Three errors are compared: T and l through ②, and l through ① at the θ that ② estimates. The median
-error of each muscle may be WORSE times the median error of the network in use, or FLOOR if that is
-more.
+Three errors are compared: T and l through ②, and l through ① at the θ that ② estimates. The limit
+of the median error of each muscle is WORSE times that of the network in use, but at least FLOOR.
 """
 
 from collections.abc import Iterable, Iterator

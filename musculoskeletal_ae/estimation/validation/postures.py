@@ -8,7 +8,8 @@ The lengths of a real arm differ from the model's by centimetres, so ② and ③
 lengths of ① rather than with the model's. Most of the difference is elongation, because a series
 elastic element may be much softer than its model. ① is therefore compared with softened lengths of
 the model: the elongation of each muscle is multiplied by one factor, which is fitted to the
-differences between ① and the model. Differences that are the same in all states do not change it.
+differences between ① and the model. Differences that are the same in all states do not change the
+factor.
 
 A further check is the *scale*. It removes the elongations and fits one factor between all route
 lengths by ① and those of the model. Errors of single muscles average out: the scale was 0.84 to
@@ -56,12 +57,14 @@ LIMITS = {
 }
 LEAST_SPREAD = 0.04  # smallest standard deviation by which errors of lengths are divided [m]
 LEAST_ARM = 0.01  # smallest size of the moment arms by which errors of G are divided [m]
-# Constants of elastic elements differ from the model's by factors of e^±1.5.
+# Constants of real elastic elements may differ from the model's by factors of e^±1.5.
 STIFFEST = 0.2  # smallest factor of a muscle's elongation
 SOFTEST = 4.5  # largest factor of a muscle's elongation
-INELASTIC = 1e-12  # smallest divisor of a slope over the elongation [m²]
-UNDETERMINED = 1.2  # largest error of a poorly determined joint, relative to the affine map
-AFFINE = 1000  # number of states to which the affine map is fitted; as many others give its error
+INELASTIC = 1e-12  # smallest divisor of a slope, for muscles without elongation [m²]
+#: largest error of a poorly determined joint, relative to the error of the best affine map
+UNDETERMINED = 1.2
+#: number of states to which the affine map is fitted; its error is measured on as many other states
+AFFINE = 1000
 
 
 class PostureCheck:
@@ -130,20 +133,23 @@ class PostureCheck:
         yield 'G by ①', size / np.maximum(moment_arm, LEAST_ARM)
 
     def _slope_over_elongation(self, length: Array) -> Array:
-        """Return the slopes of lengths (N, M) over the elongation of each muscle, (M,)."""
+        """Return the regression slope of each length (N, M) over the muscle's elongation, (M,)."""
         products = (length * self._centred).sum(axis=0)
         squares = np.square(self._centred).sum(axis=0)
         slope: Array = products / np.maximum(squares, INELASTIC)
         return slope
 
     def _softened(self, length: Array) -> Array:
-        """Return l of the model with the elongations that lengths (N, M) indicate [m], (N, M)."""
+        """Return the model's l [m] (N, M) with elongations multiplied by fitted factors.
+
+        The factors are fitted to the lengths [m] (N, M) of a network.
+        """
         factor = 1.0 - self._slope_over_elongation(length - self.length)
         factor = np.clip(factor, STIFFEST, SOFTEST)
         return self.length - (factor - 1.0) * self._elongation
 
     def _scale(self, length: Array) -> float:
-        """Return the common factor of all route lengths in lengths (N, M)."""
+        """Return the factor between the route lengths in lengths (N, M) and those of the model."""
         routes, read = (
             part - part.mean(axis=0) - self._slope_over_elongation(part) * self._centred
             for part in (self.length + self._elongation, length)
