@@ -42,7 +42,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle whose reading is constant although the other muscles show that it moves."""
+        """Report a muscle that has a constant reading although the other muscles say it moves."""
         sample, robot = observation.sample, self._robot
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])
