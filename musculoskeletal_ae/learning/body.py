@@ -69,14 +69,14 @@ class Layout:
 
 
 class ResidualModel(NamedTuple):
-    """ψ of one muscle: K random Fourier features, projected onto the F directions that vary.
+    """ψ of one muscle: K random Fourier features, projected onto the F directions that vary most.
 
-    It uses single precision, in which cosines take a seventh of the time.
+    ψ uses single precision, in which cosines take a seventh of the time of double precision.
     """
 
     frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
     phase: Singles  # phases of the cosines [rad], (K,)
-    basis: Singles  # directions that vary, (K, F)
+    basis: Singles  # directions in the space of the features that vary most, (K, F)
 
     @classmethod
     def drawn(
@@ -155,7 +155,7 @@ class CalibratedBody:
         for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
-            weights = np.zeros(len(points) - 1)  # 0 between the end of a branch and the next one
+            weights = np.zeros(len(points) - 1)  # remains 0 between the end and start of branches
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, own.basis.shape[1], self._has_drive))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
@@ -218,7 +218,7 @@ class CalibratedBody:
 
     @property
     def transmission(self) -> Transmission:
-        """What lies between readings of tension and T_end."""
+        """The fitted relation between tension readings and the bone-side tension T_end."""
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
@@ -242,7 +242,7 @@ class CalibratedBody:
         return end, np.stack(slopes, axis=1) * np.append(1.0, self.drive_units[:, m])
 
     def crept(self, age: Array) -> Array:
-        """Return the creep of each muscle since each sample [m], (N, M), for ages a (N,)."""
+        """Return how much each muscle has crept since each sample [m], (N, M); `age` is a, (N,)."""
         rates = [p[at.creep] for p, at in zip(self.parameters, self.layouts, strict=True)]
         return age[:, None] * np.array(rates)
 

@@ -3,7 +3,7 @@
 
 Every update fits the body to all samples and starts from the last fit. The prior is the geometric
 model. If a network has already learned a real arm, a body fitted to that network is the prior
-instead (`fit_to_network`), unless the first samples show that it learned another arm.
+instead (`fit_to_network`), unless the first samples show that the network learned another arm.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 PROBES = 200  # number of postures over which the mean length of each muscle is computed
-# A muscle has changed if its newest LEAST_NEWEST samples or more contradict the body, all in the
-# same direction, and at least LEAST_BEFORE samples came before them.
+# A muscle has changed if at least its LEAST_NEWEST newest samples contradict the body, all with
+# residuals of the same sign, and at least LEAST_BEFORE samples came before them.
 LEAST_NEWEST = 4
 LEAST_BEFORE = 8
 LEAST_CHANGE = 0.004  # smallest residual of a sample that contradicts the body [m]
@@ -87,7 +87,7 @@ class BodyFit:
 
 
 def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
-    """Return the muscles whose newest samples contradict the body, all in the same direction.
+    """Return the muscles whose newest samples contradict the body with residuals of the same sign.
 
     Returns:
         Index of each such muscle, and the number of its newest samples that contradict the body.

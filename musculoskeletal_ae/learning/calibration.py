@@ -6,8 +6,8 @@
 
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
-because friction gives d heavy tails. That maximum includes messages that were not used to
-compute Σ. Sensor glitches are excluded: at most a few messages, far beyond all others.
+because friction gives d heavy tails. This maximum includes messages that were not used to
+compute Σ. Sensor glitches are excluded, which are a few messages far beyond all others.
 
 Where joint sensors read all angles, the network also learns from every second message (`update`).
 The other messages, which are not used for training, serve to validate its estimates.
@@ -29,8 +29,9 @@ from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, 
 
 CAPACITY = 4000  # default of the largest number of kept messages
 SPACING = 0.1  # time between kept messages [s]
-LEAST_TIME = 60.0  # duration of the healthy messages that calibrate a detector [s]
-#: number of distinct rests in the messages that calibrate a detector, and of learned samples
+LEAST_TIME = 60.0  # healthy time that is required to calibrate a detector [s]
+#: number of distinct rests in the healthy time, and of learned samples, that are required to
+#: calibrate a detector
 LEAST_SAMPLES = 20
 #: Threshold relative to the largest healthy d, once the body is well known. An unknown load of
 #: 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
@@ -42,7 +43,7 @@ FEW_SAMPLES = 20.0
 #: occur in the messages would look impossible.
 DIAGONAL_SHARE = 0.1
 GLITCH_SHARE = 0.002  # largest share of the messages that is excluded as glitches
-GLITCH_RATIO = 3.0  # smallest distance of a glitch, relative to the largest of all other messages
+GLITCH_RATIO = 3.0  # smallest d of a glitch, relative to the largest d of all other messages
 POSTURES = 200  # number of stored postures that show where the detector was calibrated
 # Messages from which the network learns must be recent, because tendons creep and bed in.
 RECENT_TIME = 3600.0  # largest age of a recent message [s]
@@ -78,7 +79,7 @@ class Reservoir:
             seed: Seed of the random selection.
             settings: Thresholds by which rests count as distinct.
             capacity: Largest number of messages.
-            radian: As for `SampleStore`.
+            radian: Displacement of each joint that counts as one radian [rad or m], (D,).
         """
         self._rng = np.random.default_rng([seed, 0x4E])
         self._muscles, self._capacity = muscles, capacity
@@ -89,9 +90,11 @@ class Reservoir:
         self._rests = SampleStore(settings, radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
-        """Offer a message, `dt` [s] after the previous one, with NaN for unmeasured θ.
+        """Consider a message for the selection, at most one every SPACING seconds.
 
-        At most one message every SPACING seconds is considered.
+        Args:
+            reading: The message, with NaN for unmeasured θ.
+            dt: Time since the previous message [s].
         """
         self._since += dt
         if self._since < SPACING - 1e-9:

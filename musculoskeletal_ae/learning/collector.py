@@ -226,7 +226,7 @@ class SampleCollector:
         return False
 
     def accept(self, sample: Sample) -> None:
-        """Store a sample of the muscles that are not isolated."""
+        """Store a sample as one that describes the muscles that are not isolated."""
         self.samples.add(sample, self.body.used.copy())
 
     # -- changes of state -----------------------------------------------------------------------
@@ -238,7 +238,10 @@ class SampleCollector:
         self.reset()
 
     def set_anomaly(self, is_anomaly: bool) -> None:
-        """Collect nothing from just before an anomaly until some time after its reset."""
+        """Set whether an anomaly is present.
+
+        No samples are collected from shortly before an anomaly until shortly after its reset.
+        """
         if lost := self._margin.set_anomaly(is_anomaly):
             self.rejected['anomaly'] += lost
 

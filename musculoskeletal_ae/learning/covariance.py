@@ -75,7 +75,7 @@ def estimate_covariance(
 def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
     """Return the posterior covariances of γ, b and F of motor currents, (M, 3, 3).
 
-    What the samples say counts as INDEPENDENT_SAMPLES samples if there are more of them, because
+    The information of all samples counts as that of at most INDEPENDENT_SAMPLES samples, because
     errors of the body model are common to all samples.
 
     Returns:
@@ -153,12 +153,12 @@ def _excess(covariance: Array, error: Array) -> float:
 
 
 def ellipsoids(covariance: Array, error: Array) -> Array:
-    """Return, for each error, the factor of the covariance whose ellipsoid passes through it, (N,).
+    """Return by which factor the covariance must grow for its ellipsoid to reach each error, (N,).
 
     The ellipsoid of a covariance contains the share CONTAINED_SHARE of its normal distribution.
 
     Args:
-        covariance: [rad²], (D, D).
+        covariance: A covariance [rad²], (D, D).
         error: Errors [rad], (N, D).
     """
     squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)

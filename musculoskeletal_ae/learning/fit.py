@@ -7,6 +7,9 @@ how accurately attachments are placed by hand, and how much elastic elements of 
 With known postures, each muscle is fitted separately:
 
     min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k ((w_k − w̄_k) / s_k)²
+
+w are the parameters of the muscle with prior mean w̄, σ is the noise of its lengths, and ω_n are
+robust weights of the samples.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from musculoskeletal_ae.mae.mae import Mae
 ROUNDS = 30  # largest number of Gauss–Newton iterations for one muscle
 LEAST_DECREASE = 1e-11  # decrease of the cost per length below which the iterations end
 LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
-#: smallest number of samples from before the change of a muscle from which its new prior is derived
+#: number of samples from before the change of a muscle that are required to derive a new prior
 LEAST_BEFORE_CHANGE = 8
 
 
@@ -58,8 +61,8 @@ def fit_body(
     """Fit the parameters of a body in place, together with the samples' postures.
 
     The fit starts from the present parameters. A muscle counts as changed if some samples no
-    longer describe it although it was not isolated when they were taken. In that case the body is
-    first fitted to these samples, and the result is the prior mean of the muscle's new parameters.
+    longer describe it although it was not isolated when they were taken. In that case the muscle is
+    first fitted to these samples, and the result is the prior mean of its new parameters.
 
     Args:
         body: The body.
@@ -203,9 +206,9 @@ FIXED = 1e-6  # prior spread of a parameter that a fit must not change
 def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     """Fit a body in place to the muscle lengths of a network that has learned a real arm.
 
-    A checkpoint does not contain the samples from which it was learned (`train --from-bag`, another
-    machine, a lost state). With this fit as prior, the first samples refine the learned body
-    instead of starting from the geometric model.
+    The samples from which the network was learned may be missing (after `train --from-bag`, on
+    another machine, or if the state was lost). With this fit as prior, learning still continues
+    from the learned body and does not start again from the geometric model.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
     theta = robot.random_postures(NETWORK_STATES, rng)
@@ -218,8 +221,10 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     poses = body.poses(theta)
     for m, layout in enumerate(body.layouts):
         mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
-        spread[layout.drive] = FIXED  # these lengths carry no information about the drive either
-        if mae.touch is not None:  # these lengths carry no information about friction
+        # The network's lengths contain no information about friction and drive, because its input
+        # is T_end. Their prior means are therefore the values that were learned with the network.
+        spread[layout.drive] = FIXED
+        if mae.touch is not None:
             mean[layout.friction] = mae.friction[m]
             if mae.touch.drive is not None:
                 mean[layout.drive] = mae.touch.drive[:, m] / body.drive_units[:, m]

@@ -133,7 +133,7 @@ class CheckpointKeeper:
     # -- networks -------------------------------------------------------------------------------
 
     def check(self, mae: Mae) -> None:
-        """Validate a network that a user has chosen on recent messages of the arm.
+        """Validate a network, which a user has chosen, on recent messages of the arm.
 
         Raises:
             GateError: If the validation rejects the network.

@@ -121,8 +121,8 @@ class Learner:
         if saved is not None:
             self._start(saved)
             return
-        # The saved network was damaged or rejected, or the robot had fewer muscles. Repeat as many
-        # updates as the samples caused when they were collected.
+        # There is no usable saved network, but there may be saved samples. Repeat as many updates
+        # as the samples caused when they were collected.
         self.scheduler.restart(updates_to_repeat=len(self.samples))
         if mae is not None:
             self.begin(mae)
@@ -174,7 +174,7 @@ class Learner:
     def _believes_offsets(self, paired: Paired[MuscleSample]) -> bool:
         """Compare the length offsets with a message; return whether they are plausible.
 
-        They are not if a length has jumped since their calibration.
+        Offsets are not plausible if a length has jumped since their calibration.
         """
         check, measured = self.offset_check, paired.theta
         was_believed = check.is_believed
@@ -254,7 +254,7 @@ class Learner:
             self.use_body(body)
 
     def anomaly(self, detected: bool) -> None:
-        """Stop learning when an anomaly is detected, resume when it is reset.
+        """Stop learning if an anomaly is `detected`; resume learning otherwise.
 
         On detection, the keeper returns to the last network that was in use long enough without an
         anomaly.
@@ -272,7 +272,7 @@ class Learner:
             self.keeper.use(mae)
 
     def relearn(self, muscles: Iterable[int]) -> None:
-        """Relearn muscles from samples that are still to come.
+        """Relearn muscles (indices) from samples that will be collected from now on.
 
         The detector is uncalibrated until there are enough messages of the changed arm.
         """

@@ -61,9 +61,13 @@ class OffsetCheck:
         self._now.clear()
 
     def step(self, mae: Mae | None, message: MuscleSample, theta: Array | None, dt: float) -> None:
-        """Compare a message, `dt` [s] after the previous one, with θ [rad] (D,) if measured.
+        """Record a message. After COUNT messages, new offsets are accepted or rejected.
 
-        After COUNT messages, the new offsets are accepted or rejected.
+        Args:
+            mae: The network in use; None before the first.
+            message: The message.
+            theta: Measured θ [rad], (D,), or None.
+            dt: Time since the previous message [s].
         """
         self._since += dt
         if self._since < SPACING - 1e-9 or mae is None or not self._offsets.known:

@@ -26,7 +26,7 @@ from musculoskeletal_ae.learning.samples import SampleStore, StoredSample
 from musculoskeletal_ae.signals.limits import LIMITS
 
 HELD_TIME = 5.0  # time before a finding in which samples may be wrong [s]
-#: jump of a length between two messages that is always detected [m]
+#: smallest jump of a length between two messages that is always detected [m]
 DETECTED_JUMP = LIMITS.step + LIMITS.speed * LIMITS.longest_step
 
 

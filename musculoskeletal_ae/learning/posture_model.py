@@ -8,7 +8,8 @@
 
 Here w are the parameters of the body, θ_n the postures of the samples and z the joint-sensor
 offsets (`postures`). K and b describe the joints' springs (`springs`). y_nj are measured angles and
-u_ni measured directions of gravity.
+u_ni measured directions of gravity in the frame of joint i. R_i is the rotation of this frame, and
+ĝ is the direction of gravity in the frame of the root link.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class Residuals(NamedTuple):
     torque: Array  # residuals of the torques τ [N·m], (N, D)
     torque_by_body: Array  # −∂τ/∂w, (N, D, W)
     torque_by_springs: Array  # −∂τ/∂(α, β) of the S joints with springs, (N, D, 2S)
-    load: Array  # sum of the muscles' absolute torques at each joint, median [N·m], (D,)
+    #: median over the samples of the sum of the muscles' absolute torques at each joint [N·m], (D,)
+    load: Array
     angle: Array  # residuals of the angles [rad], (N, D); 0 where no angle was measured
     gravity: Array  # residuals of the directions of gravity, (N, 3J)
     gravity_by_posture: Array  # derivative of the directions of gravity by θ, (N, 3J, D)
@@ -92,7 +94,7 @@ class PostureModel:
         #: positions of each muscle's parameters in w
         self.columns = [slice(*pair) for pair in pairwise(ends.tolist())]
         nominal, radian = self._kinematics.elasticity, self._kinematics.radian
-        #: prior spread of α and β of these joints, (2, S)
+        #: prior spread of α and β of the joints in `sprung`, (2, S)
         self.spring_spread = springs.prior_spread(nominal, radian)[:, self.sprung]
         self._crossed = self.body.robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
@@ -118,7 +120,8 @@ class PostureModel:
         )
         own = at.theta[:, self.joints]
         count, places = own.shape
-        # The postures, followed by all of them with each joint moved by DIFFERENCE.
+        # The postures, followed by D copies of them. In each copy, one joint is moved by
+        # DIFFERENCE.
         flat = np.concatenate([own[None], own + DIFFERENCE * np.eye(places)[:, None]])
         poses = body.poses(flat.reshape(-1, places))
         length, end = np.empty_like(observed.length), np.empty_like(observed.length)

@@ -90,7 +90,7 @@ class GroupFit:
     Attributes:
         noise: σ of each muscle's length [m], (M,).
         weight: ω of each length in (0, 1]; 0 where a sample does not describe a muscle, (N, M).
-        usual: Inverse squares of typical steps of θ (D,) and of (w, z).
+        usual: Inverse squares of typical steps of θ (D,) and of (w, z, e).
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class GroupFit:
         the samples determine. If the samples show that an arm differs from its model more than the
         prior expects, it is expected to differ as much in properties that they do not show, such as
         offsets of joint sensors. With a learned prior the ratio is at least 1: an arm that agrees
-        with such a prior may still differ in those properties.
+        with a learned prior may still differ in properties that the samples do not show.
         """
         prior = self.prior
         # Errors of the body model are common to all samples, so all samples together count as at

@@ -7,9 +7,9 @@ than θ from a joint sensor. A rest is averaged until it ends, or in parts of `L
 arm without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
 measured.
 
-The slow start and end of a motion cannot be distinguished from rest, but it disturbs the direction
-of gravity that an accelerometer measures. Therefore gravity is used only if the whole windows
-before and after a reading were still.
+The slow start and end of a motion cannot be distinguished from rest, but they disturb the direction
+of gravity that an accelerometer measures. Therefore gravity is used only if the arm was still in
+the whole windows before and after a reading.
 """
 
 from bisect import bisect_right
@@ -26,8 +26,8 @@ from musculoskeletal_ae.learning.settings import Settings
 LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]
 #: largest number of readings in a rest, which bounds the memory if the clock stands still
 MOST_READINGS = 20_000
-#: Smallest number of readings in each half of the window. Fewer readings could hide a drift; the
-#: window is longer than `rest_time` if messages are slow.
+#: Smallest number of readings in each half of the window. With fewer, noise could hide a drift. If
+#: messages are slow, the window is therefore longer than `rest_time`.
 LEAST_READINGS = 4
 NOISE_FACTOR = 3.0  # largest difference of means that counts as noise, in standard errors
 
@@ -121,7 +121,7 @@ class RestDetector:
         Args:
             settings: Thresholds for rest.
             blind: Whether the arm has no joint sensors.
-            radian: As for `SampleStore`.
+            radian: Displacement of each joint that counts as one radian [rad or m], (D,).
         """
         self.settings, self.blind, self._radian = settings, blind, radian
         self._window = ReadingWindow()

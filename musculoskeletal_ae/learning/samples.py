@@ -108,7 +108,7 @@ class Observations:
         """Return the tension at the elastic elements [N], (N, M), which a network takes as input.
 
         Args:
-            transmission: What lies between the readings and the elastic elements.
+            transmission: Relation between the readings and the tension at the elastic elements.
         """
         return transmission.end(self.tension, self.direction)
 
@@ -151,8 +151,8 @@ class SampleStore:
 
         Args:
             sample: The sample.
-            known: Whether it describes each muscle, (M,); by default all of them.
-            number: Its number if it is restored from disk; by default the next one.
+            known: Whether the sample describes each muscle, (M,); by default, it describes all.
+            number: Number of a sample that is restored from disk; by default the next number.
         """
         self.accepted = number or self.accepted + 1
         self.samples.append(sample)
@@ -216,7 +216,8 @@ class SampleStore:
         theta, tension, length, direction = map(np.array, columns[:4])
         spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)
         known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
-        # Do not estimate creep without joint angles, because a drift of the postures looks alike.
+        # Do not estimate creep without joint angles, because a drift of the estimated postures
+        # would look like creep.
         read = np.isfinite(theta).all(axis=1).mean()
         if self.accepted <= CREEP_SHARE * self.capacity or read < CREEP_SHARE:
             age[:] = 0.0

@@ -26,7 +26,7 @@ class UpdateScheduler:
         updates: Number of finished updates.
         last_update: The last finished update, if any.
         statistics_hold: Whether the detector's statistics are valid for the present arm. After a
-            muscle has changed they are not, until the detector has been calibrated again.
+            muscle has changed, they are invalid until the detector has been calibrated again.
     """
 
     def __init__(self, least_samples: int, steps: int) -> None:

@@ -3,10 +3,10 @@
 
     K = S K̄ S,  S = diag(e^{α/2}),      b = e^α b̄ + β
 
-α are logarithmic errors of the stiffnesses, and β errors of the torques at θ = 0 [N·m]. With this
-form, K keeps no negative eigenvalue whatever α is. Only joints with their own spring in
-muscles.yaml have these two parameters. They follow from the torque balance of rest samples
-(`posture_model`), and therefore only from samples with tensions.
+K̄ and b̄ are the stated stiffness and preload. α are logarithmic errors of the stiffnesses, and β
+errors of the torques at θ = 0 [N·m]. In this form, K has no negative eigenvalue for any α. Only
+joints with their own spring in muscles.yaml have these two parameters. They follow from the torque
+balance of rest samples (`posture_model`), and therefore only from samples with tensions.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def prior_spread(nominal: JointElasticity, radian: Array) -> Array:
 
 
 def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
-    """Return the springs of muscles.yaml, `nominal`, with corrections α and β (2, D)."""
+    """Return the springs `nominal` of muscles.yaml, corrected by α and β in `springs` (2, D)."""
     if not nominal.is_present:
         return nominal
     log = np.clip(springs[0], -LARGEST_LOG, LARGEST_LOG)

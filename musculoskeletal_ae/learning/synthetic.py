@@ -64,7 +64,11 @@ def synthetic_samples(
 
 
 def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Draw T [N] (count, M): uniform up to the highest tensions, or mostly near T_bias."""
+    """Draw random tensions [N], (count, M).
+
+    In a share HELD_SHARE of the samples, most tensions are near T_bias. In all others, tensions are
+    uniform up to `highest_tensions`.
+    """
     shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
     anywhere = rng.uniform(0.0, 1.0, shape) * highest
     lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)

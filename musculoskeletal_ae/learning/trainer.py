@@ -57,7 +57,8 @@ class Update(NamedTuple):
     mae: Mae  # the trained network
     loss: float  # training loss
     noise: Array = np.empty(0)  # σ of each length, as far as the body does not explain it [m], (M,)
-    #: a muscle whose newest samples contradict all older ones, and their number; at most one entry
+    #: index of a muscle whose newest samples contradict all older ones, and the number of these
+    #: newest samples; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
     #: several muscles that the newest samples contradict at once, which indicates a wrong θ
     contradicted: tuple[int, ...] = ()
@@ -92,7 +93,7 @@ class Trainer:
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
-        """Start a job."""
+        """Run a job; `poll` then returns its update."""
         assert self._updater is not None
         self._update = self._updater.update(job)
 
@@ -213,7 +214,8 @@ class TrainerProcess(Trainer):
         self._pause = min(2.0 * self._pause, LONGEST_PAUSE)
 
     def _end(self) -> None:
-        # The process may be killed at once, because this object keeps a copy of all that it knows.
+        # The process may be killed at once, because this object can repeat the job and keeps the
+        # last network.
         if self._process is not None:
             self._process.kill()
             self._process.join(LONGEST_ENDING)
@@ -234,11 +236,12 @@ class TrainerProcess(Trainer):
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Start child processes with SIGINT blocked.
+    """Block SIGINT within a `with` block; child processes that are started there inherit this.
 
     Ctrl-C sends SIGINT to the whole process group, but only the node may end the child.
     """
-    # Start the resource tracker now. If it started with the first child, it would unblock SIGINT.
+    # The resource tracker unblocks SIGINT when it starts. Start it before SIGINT is blocked,
+    # because the first child would otherwise start it afterwards.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

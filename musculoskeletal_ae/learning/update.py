@@ -4,13 +4,13 @@
 1. Fit the calibrated body to the samples (`body`). Shift the network's lengths by the mean change
    of each muscle's length, so that length offsets and creep need no training.
 2. Draw synthetic samples of the body, and replace some of them by real ones: rest samples and
-   motion samples. There are many more motion samples, and they contain what rest samples and the
-   body model lack, such as tendon sliding.
+   motion samples. There are many more motion samples than rest samples. They also contain what rest
+   samples and the body model lack, such as tendon sliding.
 3. Train the network on these samples for a bounded number of steps.
 4. Compute the statistics of the residuals on healthy messages (`calibration`).
 
-The body needs few samples, because the geometric model and its tolerances are known. The network
-needs many, which the body provides.
+The body can be fitted to few samples, because the geometric model and its tolerances are known. The
+network needs many samples, which are drawn from the body.
 """
 
 from __future__ import annotations
@@ -120,7 +120,10 @@ class BodyUpdater(Updater):
         )
 
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
-        """Replace the training samples at `places` by random real ones, with bone-side tension."""
+        """Replace the training samples at `places` by random real samples.
+
+        The tension of real samples is converted to the bone-side tension.
+        """
         if len(real) == 0:
             return
         real = real[self._rng.integers(len(real), size=len(data.entered[places]))]

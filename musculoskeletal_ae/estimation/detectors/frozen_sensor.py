@@ -42,7 +42,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has a constant reading although the other muscles say it moves."""
+        """Report a muscle with a frozen sensor, if it moves according to the other muscles."""
         sample, robot = observation.sample, self._robot
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])
