@@ -2,17 +2,18 @@
 """A clock that excludes the pauses of this process.
 
 A process pauses while it is suspended, or while a busy computer gives it no time. Messages that
-arrive meanwhile wait unread, so their absence proves nothing about their sender. Whoever decides
-from the age of messages measures it on an `AwakeClock`. All of them follow one rule: of the time
-between two ticks, only the first `longest` counts. They differ in how often they tick:
+arrive during a pause wait unread, so their absence proves nothing about their sender. Code that
+decides by the age of messages therefore measures the age on an `AwakeClock`. Of the time between
+two ticks of such a clock, at most `longest` counts:
 
-    user                           ticks                        longest
+    user                           calls `tick`                 longest
     controller (`DataAge`)         in every step of control     0.3 s
     any node (`Shell`)             ten times a second           0.3 s
     status line (`Situation`)      about once a second          1.0 s
     check_driver (`Pace`)          every 0.02 s                 0.07 s
 
-A process that is always late still notices a silent sender, but `longest` a tick only.
+In a process that is always late, this clock advances by only `longest` for each tick. The process
+still notices a silent sender, but later.
 """
 
 import math
@@ -25,10 +26,10 @@ class AwakeClock:
     """
 
     def __init__(self, longest: float) -> None:
-        """Count at most `longest` [s] between two ticks; it must exceed their usual distance."""
+        """Count at most `longest` [s] between two ticks; ticks must usually be less far apart."""
         self._longest = longest
         self._ticked_at = math.inf  # steady time of the last tick [s]
-        self._paused = 0.0  # total duration of the pauses until then [s]
+        self._paused = 0.0  # total duration of the pauses until the last tick [s]
 
     def tick(self, now: float) -> None:
         """Record that this process runs at `now` on the steady clock [s]."""

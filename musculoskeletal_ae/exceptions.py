@@ -9,7 +9,7 @@ LONGEST_TEXT = 4000
 
 
 def printable(text: object) -> str:
-    """Return a text with non-printable characters escaped, at most LONGEST_TEXT of its characters.
+    """Return the first LONGEST_TEXT characters of a text, with non-printable ones escaped.
 
     Texts from files and messages could otherwise control the user's terminal.
     """
@@ -44,7 +44,7 @@ class CheckpointError(MusculoskeletalError):
 
 
 class GateError(CheckpointError):
-    """A checkpoint failed checkpoint validation, and the current one stays in use.
+    """A checkpoint has failed checkpoint validation; the present network stays in use.
 
     `estimation/checkpoint_validation.py` defines the validation.
     """

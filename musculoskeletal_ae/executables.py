@@ -21,9 +21,10 @@ from musculoskeletal_ae.stop_signals import INTERRUPTED, STOP, Reaction
 
 
 def _prepare_process() -> None:
-    """Print a stack trace on a native crash, and keep MuJoCo from loading a graphics library.
+    """Prepare terminal output, crash reports and the import of MuJoCo.
 
-    Importing MuJoCo with glfw would start processes that look for a display.
+    A native crash prints the stacks of all threads. MuJoCo is kept from loading a graphics library,
+    because importing it with glfw would start processes that look for a display.
     """
     replace_unprintable()
     os.environ.setdefault('MUJOCO_GL', 'disable')
@@ -58,7 +59,10 @@ def _end_process(status: int) -> None:
 
 
 def _node_help(name: str) -> str:
-    """Return the docstrings and parameters of the nodes without importing the nodes."""
+    """Return the help of an executable: docstrings and parameters of its nodes.
+
+    The nodes are not imported, because that would take too long.
+    """
     from musculoskeletal_ae.nodes.parameters import COMBINED, help_text
 
     parts = []
@@ -69,7 +73,7 @@ def _node_help(name: str) -> str:
 
 
 def _run_tool(module: str) -> int:
-    """Run the `main` function of a tool and return its exit status."""
+    """Run the function `main` of a tool's module and return the exit status."""
     _prepare_process()
     STOP.install(Reaction.EXIT)
     main = import_module(f'musculoskeletal_ae.{module}').main

@@ -95,7 +95,7 @@ def read_csv(
 
 
 def read_table(code: str, name: str, kind: type[T]) -> T:
-    """Return the content of a YAML file that lies beside the Python file `code`."""
+    """Return, as a `kind`, the content of the YAML file `name` beside the Python file `code`."""
     return msgspec.yaml.decode(Path(code).with_name(name).read_bytes(), type=kind)
 
 
@@ -103,7 +103,7 @@ def parse_yaml(text: str) -> Any:
     """Return the content of one YAML document: strings, numbers, lists, mappings, dates.
 
     Raises:
-        ValueError: If it is not valid YAML, repeats a key, or exceeds MOST_ENTRIES or DEEPEST
+        ValueError: If the text is not valid YAML, repeats a key, or exceeds MOST_ENTRIES or DEEPEST
             after aliases are expanded.
     """
     try:
@@ -118,8 +118,8 @@ def parse_yaml(text: str) -> Any:
 class _Collection:
     """A list or mapping whose end has not been reached yet."""
 
-    anchor: str
-    first: int  # number of entries before it
+    anchor: str  # '' if the collection has none
+    first: int  # number of entries before the collection
     is_mapping: bool
     keys: set[str] = field(default_factory=set)
     at_key: bool = True  # whether the next entry is a key
@@ -132,7 +132,7 @@ def _check(text: str) -> None:
     memory, and of a repeated key it silently keeps the last value.
     """
     count = 0
-    sizes: dict[str, int] = {}  # entries that each anchor holds
+    sizes: dict[str, int] = {}  # number of entries that an alias of each anchor stands for
     within: list[_Collection] = []
     for event in yaml.parse(text, Loader=_Loader):
         where = f'line {event.start_mark.line + 1 if event.start_mark else 0}'

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust Gauss–Newton fit with a prior, which eliminates the unknowns of individual samples.
+"""Robust Gauss–Newton fit with a prior, for unknowns of single samples and shared unknowns.
 
     min over w, θ_1 … θ_N of   Σ_nr ω_nr ρ_nr(θ_n, w)² / σ_r²  +  Σ_k ((w_k − w̄_k) / s_k)²
 
 w are the P unknowns that all samples share, such as the parameters of a body. θ_n are the D
-unknowns of sample n alone, such as the posture in which it was taken. With D = 0 this is an
-ordinary robust fit.
+unknowns of sample n alone, such as the posture in which it was taken. ρ_nr is residual r of sample
+n, ω_nr its weight, and σ_r the noise of residual r. The prior of w_k has the mean w̄_k and the
+standard deviation s_k. With D = 0 this is an ordinary robust fit.
 
 Weights. The residuals ρ have a Student distribution with ν = `FREEDOM` degrees of freedom, which
 gives outliers little weight. Weights and noise come from the EM algorithm (Lange, Little and Taylor
@@ -24,8 +25,9 @@ sample. Eliminating θ therefore leaves a system of the size of w (Schur complem
 A is (N, D, D), B is (N, D, P), C is (P, P) and contains the prior. The inverse of the Schur
 complement is the covariance of w at the solution.
 
-Damping. A + λ diag(e_θ), C + λ diag(e_w), where e is 1 over the square of a typical step. Each
-round takes the smallest λ in `DAMPING` that lowers the cost. It starts one level below that of the
+Damping. A + λ diag(e_θ) replaces A, and C + λ diag(e_w) replaces C, where e is 1 over the square of
+a typical step. Each round tries the values of λ in `DAMPING` in ascending order, and takes the
+first one with which the step lowers the cost. The first value tried is one level below the λ of the
 previous round.
 
 Stopping. The fit ends after a number of rounds, or when a step lowers the cost, or is predicted to
@@ -43,14 +45,14 @@ from scipy.linalg import cho_solve, cholesky
 from musculoskeletal_ae.arrays import Array
 
 FREEDOM = 4.0  # ν of the Student distribution
-PRIOR_COUNT = 4.0  # number of residuals that the prior at σ₀ is worth
+PRIOR_COUNT = 4.0  # number of residuals that count as much as the prior at σ₀
 WEIGHTINGS = 3  # steps of the EM algorithm in each round
 DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # λ
-SMALL = 1e-6  # added to the diagonal of C
+SMALL = 1e-6  # added to the diagonal of C, so that the Schur complement is positive definite
 
 
 def student(score: Array) -> Array:
-    """Return the weights ω of residuals ρ/σ, of the same shape."""
+    """Return the weights ω for scaled residuals ρ/σ, in the same shape."""
     weight: Array = (FREEDOM + 1.0) / (FREEDOM + score**2)
     return weight
 
@@ -141,8 +143,9 @@ class Eliminated:
         samples, mixed, common = equations
         eye = np.eye(samples.shape[-1])
         damped = samples + np.asarray(sample_damping)[..., None] * eye
-        # A⁻¹ = Lᵀ L. Products with the explicit inverse L are cheaper than triangular solves.
-        self._inverse = np.linalg.inv(np.linalg.cholesky(damped))
+        # L is the inverse of the Cholesky factor of A, so that A⁻¹ = Lᵀ L. Products with L are
+        # cheaper than triangular solves.
+        self._inverse = np.linalg.inv(np.linalg.cholesky(damped))  # L
         self._reduced = self._inverse @ mixed  # L B
         tall = self._reduced.reshape(-1, len(common))
         diagonal = np.broadcast_to(common_damping, len(common))
@@ -180,7 +183,11 @@ class Problem(Protocol[Point]):
         ...
 
     def right_sides(self, point: Point) -> RightSides:
-        """Return the right sides at a point; derivatives may be those of the last `equations`."""
+        """Return the right sides at a point.
+
+        They may use the derivatives of the last call of `equations`, even if that was at another
+        point.
+        """
         ...
 
     def moved(self, point: Point, step: Step) -> Point:
@@ -221,7 +228,8 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
     for _ in range(rounds):
         problem.weigh(fit.point)
         if fit.eliminated is not None and fit.level == 0:
-            # The equations of the previous round predict the decrease well enough.
+            # The equations of the previous round predict the decrease well enough to end the fit
+            # without solving new ones.
             right = problem.right_sides(fit.point)
             if fit.eliminated.solve(right).decrease < enough:
                 break

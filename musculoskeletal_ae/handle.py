@@ -2,9 +2,9 @@
 """Pass many arrays to compiled code as one argument.
 
 At every call, numba unpacks each array of each argument. An emulated arm has about sixty arrays;
-unpacking them took longer than its physics. A compiled function creates the `Handle`; it belongs in
-the file that defines the types of the arrays. numba discards cached code only when the file of that
-code changes.
+unpacking them would take longer than computing its physics. A compiled function creates the
+`Handle`. This function belongs in the file that defines the types of the arrays: numba discards the
+cached code of a function only when the file of the function changes.
 """
 
 from typing import Any

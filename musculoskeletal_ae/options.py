@@ -55,9 +55,9 @@ def _listed(text: str) -> list[str]:
 
 not_negative = _type(float, lambda value: 0.0 <= value < math.inf, 'a number of at least 0')
 positive = _type(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
-minutes = number(0.2, 600.0)  # of robot time
+minutes = number(0.2, 600.0)  # duration in robot time [min]
 seed = whole(0, 2**63 - 1)
-# Lists separated by commas.
+# `seeds`, `numbers` and `names` are lists separated by commas.
 seeds = _type(
     lambda text: tuple(map(int, _listed(text))),
     lambda values: min(values) >= 0 and len(set(values)) == len(values),
@@ -97,7 +97,12 @@ class Parser(argparse.ArgumentParser):
         sys.exit(2)
 
     def add_robot(self, flag: str = '--robot', default: str | None = DEFAULT_ROBOT) -> None:
-        """Add the robot: required without a default; positional if the flag is 'robot'."""
+        """Add the argument that names the robot.
+
+        Args:
+            flag: Name of the argument; without a leading "-", the argument is positional.
+            default: The default; None makes the argument required.
+        """
         text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
         kind: dict[str, Any] = {'metavar': 'NAME|DIR', 'required': default is None}
         self.add_argument(
@@ -136,7 +141,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:
-        """Add `--minutes` of robot time; the text is its help."""
+        """Add `--minutes`, a duration in robot time [min]; the text is its help."""
         self.add_argument('--minutes', type=minutes, default=default, help=text)
 
     def add_quick(self, text: str) -> None:
@@ -162,7 +167,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:
-    """Save the figure that `draw` returns and print its file; does nothing without a file."""
+    """Save the figure that `draw` returns, and print the file's name; do nothing without a file."""
     if file is not None:
         save_figure(draw(), file)
         print(f'plot: {file}')
@@ -183,7 +188,7 @@ def save_figure(figure: Any, file: Path) -> None:
 def exit_status(work: Callable[[], int | None], *also: type[Exception]) -> int:
     """Run a tool's work and return its exit status; None counts as 0.
 
-    MusculoskeletalError, OSError and the exceptions in `also` print one line and give status 1.
+    For MusculoskeletalError, OSError and the exceptions in `also`, print one line and return 1.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     try:

@@ -65,7 +65,7 @@ class Parameter:
         return field(default=self.default, metadata={'parameter': self})
 
     def checked(self, value: Any) -> Any:
-        """Return a legal value with lists as tuples and without empty names.
+        """Return a value if it is legal; a list becomes a tuple without empty names.
 
         Raises:
             MusculoskeletalError: If the value is not legal.

@@ -2,9 +2,10 @@
 """Prefer the pinocchio wheel of a virtual environment to the pinocchio of a sourced ROS.
 
 A sourced ROS may provide its own pinocchio (apt package ros-jazzy-pinocchio), compiled for NumPy 1.
-With the NumPy 2 of a virtual environment, it crashes the process with a segmentation fault. It
-takes precedence in two places. PYTHONPATH lists its bindings before the wheel. LD_LIBRARY_PATH
-lists its libraries before those of the wheel, which have the same names.
+In a virtual environment with NumPy 2, the pinocchio of ROS crashes the process with a segmentation
+fault. Without this module it would be imported instead of the wheel: PYTHONPATH lists its bindings
+before those of the wheel, and LD_LIBRARY_PATH lists its libraries before the libraries of the
+wheel, which have the same names.
 """
 
 import ctypes
@@ -33,11 +34,12 @@ def prefer_wheel() -> None:
     if bindings is None:
         return
     sys.path.remove(bindings)
-    sys.path.insert(0, bindings)  # this folder contains only bindings
+    sys.path.insert(0, bindings)  # affects pinocchio only: this folder has no other packages
     prefix = Path(bindings).parents[2]
     searched = filter(None, os.environ.get('LD_LIBRARY_PATH', '').split(os.pathsep))
     if any(Path(folder, name).exists() for folder in searched for name in LIBRARIES):
-        # The dynamic loader reuses a loaded library of the same name instead of searching again.
+        # Load the wheel's libraries first: the dynamic loader then reuses them instead of searching
+        # for libraries of the same names.
         for name in LIBRARIES:
             if (prefix / 'lib' / name).exists():
                 ctypes.CDLL(str(prefix / 'lib' / name))

@@ -24,8 +24,8 @@ class Reception:
         """Start with empty counters.
 
         Args:
-            warn: Receives the first rejection for each reason.
-            clock: Returns the time on which silence is measured [s].
+            warn: Called with a text at the first rejection for each reason.
+            clock: Returns the time by which the silence of topics is measured [s].
         """
         self._warn, self._clock = warn, clock
         self.last_rejected = ''  # source and fault of the last rejected message

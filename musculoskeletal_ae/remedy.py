@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declares the steps of remedies: identifiers for programs, and texts for users.
 
-A remedy is a sequence of steps, to be taken in order. It is declared where the problem is: for stop
-causes in `control/stops.py`, for findings in `estimation/finding.py`. /diagnostics contains it
-twice: the value `remedy` is a text for users, and `remedy steps` lists the identifiers.
+A remedy is a sequence of steps, to be taken in order. Remedies are declared with the problems: for
+stop causes in `control/stops.py`, for findings in `estimation/finding.py`. /diagnostics contains a
+remedy twice: the value `remedy` is a text for users, and `remedy steps` lists the identifiers.
 """
 
 from collections.abc import Iterable
@@ -55,7 +55,7 @@ class Step(Enum):
     REPORT_LOG = 'report_log', 'report the error with the log of the controller'
 
 
-STEPS = {step.identifier: step for step in Step}  # by identifier
+STEPS = {step.identifier: step for step in Step}  # all steps by identifier
 REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics
 #: remedy for an anomaly
 REPAIR = Step.REPAIR_MUSCLE, Step.RESET_ESTIMATOR

@@ -6,7 +6,8 @@ import os
 from typing import Literal, NamedTuple
 
 MOST_DIGITS = 17  # significant digits that identify a double
-#: key in /diagnostics of what a component waits for, and its value during an anomaly
+#: key in /diagnostics that tells what a component waits for, and the value of this key if the
+#: component waits for the end of an anomaly
 WAITS_FOR, ANOMALY = 'waits for', 'anomaly'
 Level = Literal['ok', 'warn', 'error']
 
@@ -19,7 +20,7 @@ class Report(NamedTuple):
     values: dict[str, str]
 
     def with_warning(self, warning: str) -> 'Report':
-        """Return a report with one more warning; an error is returned unchanged."""
+        """Return a report with one more warning; a report of an error is returned unchanged."""
         if self.level == 'error':
             return self
         return Report('warn', f'{self.message}; {warning}', self.values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File formats as types, which msgspec checks, and readable texts for msgspec's errors.
+"""Checks the content of files against types (by msgspec), and explains msgspec's errors.
 
 A format is a class derived from `Strict`, with ranges and lengths in its annotations. Its
 `__post_init__` checks rules that annotations cannot express and raises a ValueError.
@@ -103,7 +103,7 @@ def _legal_words(kind: Any, steps: list[dict[str, str | None]]) -> list[str]:
 
 
 def _inner_types(kind: inspect.Type, step: dict[str, str | None]) -> Iterator[inspect.Type]:
-    """Yield the legal types of a field or item of a type."""
+    """Yield the types that a type allows for the field or item to which `step` leads."""
     if isinstance(kind, inspect.StructType):
         yield from (field.type for field in kind.fields if field.encode_name == step['field'])
     elif isinstance(kind, inspect.ListType | inspect.VarTupleType):

@@ -20,15 +20,17 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 
-MOST_ENTRIES = 10_000  # far more than any arm needs; longer messages are rejected unread
-MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)  # [N], [N·m] at the end effector
-MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)  # commanded [m/s], [rad/s] of the end effector
+MOST_ENTRIES = 10_000  # largest number of entries that are read, far more than any arm needs
+#: largest force [N] and torque [N·m] of a wrench, for each axis
+MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
+#: largest commanded linear [m/s] and angular velocity [rad/s] of the end effector, for each axis
+MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)
 #: range of plausible accelerometer readings on an arm [m/s²]
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
 LAST_VELOCITY = 1e-6  # highest velocity at the end of a trajectory [rad/s]
 MOST_EFFORT = 1000.0  # highest torque that may be requested of one joint [N·m]
-MOST_ISOLATED = 1e6  # highest value of an isolated muscle; powers of larger ones overflow
-UNIT_TOLERANCE = 0.01  # deviation of a quaternion's norm from 1
+MOST_ISOLATED = 1e6  # largest value kept of an isolated muscle; powers of larger values overflow
+UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
 QUANTITIES = ('length', 'tension', 'temperature')
 
 
@@ -51,12 +53,12 @@ def read_muscle_states(
     unknown: float = 0.0,
     source: TensionSource = TENSION_SENSOR,
 ) -> Array:
-    """Return length [m], tension T_read [N] and temperature of a Float64MultiArray, (3, M).
+    """Return l [m], T_read [N] and temperature [°C] of a Float64MultiArray, (3, M).
 
-    A temperature of NaN means that it is not measured. Isolated muscles may have any values:
-    those not finite or beyond ±MOST_ISOLATED are replaced by `unknown`, temperatures by NaN.
-    Motor currents are converted to T_read. If `source` knows no tension, tensions may have any
-    values as well, and are returned as NaN.
+    Motor currents are converted to T_read. A temperature that is not measured is NaN. Values of
+    isolated muscles are not checked: lengths and tensions that are not finite or beyond
+    ±MOST_ISOLATED are replaced by `unknown`, and such temperatures by NaN. If `source` knows no
+    tension, tensions are not checked either, and are returned as NaN.
     """
     values = _values(message, len(QUANTITIES), muscles)
     usable = np.isfinite(values)
@@ -99,12 +101,12 @@ def _values(message: Any, rows: int, columns: int) -> Array:
 
 
 def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
-    """Return θ [rad] (D,) of a measured JointState.
+    """Return θ [rad], (D,), from a measured JointState.
 
-    Joints are matched by name, and unknown joints are ignored. All listed joints need a finite
-    position; with `some`, one is enough and the others are NaN (`joints_not_finite` lists those
-    present but not finite). Velocities and efforts are not checked, because drivers publish NaN for
-    quantities that they do not measure.
+    Joints are matched by name, and joints of the message that are not in `joints` are ignored.
+    Every joint in `joints` must have a finite position. With `some`, one finite position is enough,
+    and θ of all other joints is NaN. Velocities and efforts are not checked, because drivers
+    publish NaN for quantities that they do not measure.
     """
     names = joint_names(message)
     index = {name: i for i, name in enumerate(names)}
@@ -126,7 +128,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
 
 
 def joints_not_finite(message: Any, joints: Sequence[str]) -> list[str]:
-    """Return the listed joints whose position in a JointState is not finite."""
+    """Return the names in `joints` that have a position in a JointState that is not finite."""
     return [
         name
         for name, position in zip(message.name, message.position)
@@ -139,9 +141,9 @@ def _positions_of(names: Sequence[str]) -> str:
 
 
 def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return name → (position, effort) of a JointState that commands some of the joints.
+    """Return position [rad] and effort [N·m], by joint name, of a JointState that is a command.
 
-    A message without efforts gives efforts of 0.
+    The message need not contain all joints. Without efforts in the message, efforts are 0.
     """
     names = joint_names(message)
     listed = set(joints)
@@ -189,7 +191,10 @@ def read_names(message: Any) -> list[str]:
 
 
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
-    """Return the link of an Imu, which is its frame, and its acceleration [m/s²] (3,)."""
+    """Return the link that carries the IMU and the acceleration [m/s²], (3,), of an Imu message.
+
+    The frame of the message names the link, after `prefix`.
+    """
     link, vector = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
     if link not in links:
         problem = f'{message.header.frame_id!r}; legal: {", ".join(links)}'
@@ -205,9 +210,9 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
 
 
 def read_wrench(message: Any, root_link: str) -> Array:
-    """Return force [N] and torque [N·m] (6,) of a WrenchStamped in the root link's frame.
+    """Return force [N] and torque [N·m], together (6,), of a WrenchStamped.
 
-    An empty frame means the root link.
+    The frame of the message must be `root_link`, or empty, which means the same.
     """
     if message.header.frame_id not in ('', root_link):
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
@@ -272,7 +277,7 @@ def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:
 
 
 def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:
-    """Return one quantity of all points (K, joint_count); None if no point has it."""
+    """Return one quantity of all K points, (K, joint_count); None if the points do not state it."""
     rows = [getattr(point, what) for point in points]
     lengths = {len(row) for row in rows}
     legal = {joint_count} if what == 'positions' else {0, joint_count}
@@ -283,7 +288,10 @@ def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:
 
 
 def read_twist(message: Any, frame: str) -> Array:
-    """Return linear [m/s] and angular velocity [rad/s] (6,) of a TwistStamped in `frame`."""
+    """Return linear [m/s] and angular velocity [rad/s], together (6,), of a TwistStamped.
+
+    The frame of the message must be `frame`.
+    """
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
     twist = message.twist
@@ -291,13 +299,16 @@ def read_twist(message: Any, frame: str) -> Array:
 
 
 def without_orientation(message: Any) -> bool:
-    """Return whether a PoseStamped commands a position only: its quaternion is all zeros."""
+    """Return whether a PoseStamped commands a position only, which a quaternion of zeros means."""
     turn = message.pose.orientation
     return not any((turn.x, turn.y, turn.z, turn.w))
 
 
 def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
-    """Return the pose of a PoseStamped in `frame`; with `position_only`, without its rotation."""
+    """Return the pose of a PoseStamped, whose frame must be `frame`.
+
+    With `position_only`, the rotation in the message is ignored, and that of the result is 0.
+    """
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
     position, turn = message.pose.position, message.pose.orientation

@@ -4,9 +4,9 @@
     T = T_end e^{μ s},   s ← w + (s − w) e^{−|Δl|/b},   w = −sign Δl
 
 T is the motor-side tension and T_end the bone-side tension. s is 1 after winding in, when T is
-higher than T_end, and −1 after paying out. In between, friction reverses gradually. The network
-models the body without friction. Therefore its tension is T_end, into which measured values of T
-have to be converted (`Transmission`).
+higher than T_end, and −1 after paying out. When a tendon slides by Δl, s approaches w over the
+distance b (REVERSAL), so that friction reverses gradually. The network models the body without
+friction, so its tension is T_end. `Transmission` converts measured values of T to T_end.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 
 REVERSAL = 0.0004  # b: sliding distance over which friction reverses [m]
-#: noise of a length [m]; a mean deviation ē of this size is as likely due to sliding as due to
-#: noise
+#: noise of a length [m]; a mean deviation ē of this size (`FrictionDirection`) is as likely due to
+#: sliding as due to noise
 NOISE = 0.00013
 LATEST = 0.07  # weight a of the newest deviation in the running mean ē
-SPIKE = 0.0002  # distance to which a reading outside the range of the last two is limited [m]
+SPIKE = 0.0002  # a reading is limited to this distance outside the range of the last two [m]
 LARGEST_GAIN = 1.5  # largest |γ| of `Transmission`
-#: what is known of γ, b and F of a motor current before anything is learned: standard deviations of
-#: γ, b/T_limit and F/T_limit, and the mean of F/T_limit; the means of γ and b are 0
+#: prior of γ, b and F of a motor current: standard deviations of γ, b/T_limit and F/T_limit, and
+#: the mean of F/T_limit; the means of γ and b are 0
 DRIVE_SPREAD = 0.2, 0.05, 0.1
 DRIVE_FRICTION_MEAN = 0.08
 
@@ -34,7 +34,7 @@ def slid(direction: Array, way: Array, moved: Array) -> Array:
     """Return s after tendons have slid.
 
     Args:
-        direction: s before, (..., M).
+        direction: s before the sliding, (..., M).
         way: Direction of sliding, (..., M): 1 when winding in, −1 when paying out.
         moved: Sliding distance [m], (..., M).
     """
@@ -44,16 +44,17 @@ def slid(direction: Array, way: Array, moved: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """What lies between the reading of a module and the bone-side tension.
+    """Conversion between the reading of a muscle module and the bone-side tension.
 
         T = max(0, e^γ T_read − b − F s),   T_end = T e^{−μ s}
 
     A tension sensor reads T itself. A motor current, converted to T_read [N] by
-    `robot.tension_source`, has an error of scale γ and an offset b. Part of the current overcomes
-    the friction F of motor and gear, which opposes the motion (s: module docstring). The converted
+    `robot.tension_source`, has a scale error γ and an offset b. Part of the current overcomes the
+    friction F of motor and gear, which opposes the motion (s: module docstring). The converted
     current can be negative, but T cannot, because a tendon does not push.
 
-    γ, b and F are uncertain. So is the direction of friction while it reverses (|s| < 1):
+    γ, b and F are uncertain. While the friction reverses (|s| < 1), its direction is uncertain as
+    well. The standard deviation σ_T of T follows from both:
 
         σ_T² = aᵀ C a + F² (1 − s²),   a = (e^γ T_read, −1, −s)
 
@@ -69,9 +70,12 @@ class Transmission:
 
     @classmethod
     def unknown(cls, limit: Array) -> Transmission:
-        """Return that of motor currents of which nothing has been learned, for T_limit [N] (M,).
+        """Return the transmission of motor currents before anything is learned.
 
-        F counts as 0, and its mean adds to its uncertainty.
+        F is assumed to be 0, and its prior mean is added to its uncertainty.
+
+        Args:
+            limit: T_limit [N], (M,).
         """
         nothing = np.zeros_like(limit)
         spread = np.array([np.ones_like(limit), limit, limit]).T * DRIVE_SPREAD  # (M, 3)
@@ -79,7 +83,7 @@ class Transmission:
         return cls(nothing, np.zeros((3, len(limit))), np.eye(3) * np.square(spread)[:, None])
 
     def motor(self, read: Array, direction: Array) -> Array:
-        """Return T [N] (..., M) from T_read [N] and s, (..., M) each."""
+        """Return T [N] for T_read [N] and s, (..., M) each."""
         if self.drive is None:
             return read
         gain, offset, friction = self.drive
@@ -87,7 +91,7 @@ class Transmission:
         return np.maximum(tension, 0.0)
 
     def spread(self, read: Array, direction: Array) -> Array:
-        """Return σ_T [N] (M,) for T_read [N] and s, (M,) each; 0 for tension sensors."""
+        """Return σ_T [N] for T_read [N] and s, (M,) each; σ_T is 0 for tension sensors."""
         if self.drive is None or self.drive_covariance is None:
             return np.zeros_like(read)
         gain, _, friction = self.drive
@@ -97,12 +101,12 @@ class Transmission:
         return np.sqrt(variance)
 
     def end(self, read: Array, direction: Array) -> Array:
-        """Return T_end [N] (..., M) from T_read [N] and s, (..., M) each."""
+        """Return T_end [N] for T_read [N] and s, (..., M) each."""
         end: Array = self.motor(read, direction) * np.exp(-self.friction * direction)
         return end
 
     def reading(self, motor: Array, direction: Array) -> Array:
-        """Return T_read [N] (..., M) from T [N] and s, (..., M) each."""
+        """Return T_read [N] for T [N] and s, (..., M) each."""
         if self.drive is None:
             return motor
         gain, offset, friction = self.drive
@@ -111,7 +115,7 @@ class Transmission:
 
 
 class FrictionDirection:
-    """Estimates the direction s in which each tendon slid last, from muscle lengths alone.
+    """Estimates s, the direction in which each tendon slid last, from muscle lengths alone.
 
         L ← L + g e,   g = (a + k) / (1 + k),   k = (ē / NOISE)⁴,   e = l − L
 
@@ -136,7 +140,7 @@ class FrictionDirection:
         off = limited - self._mean
         self._read = last, length
         self._off = self._off + LATEST * (off / NOISE - self._off)  # ē / NOISE
-        sliding = np.square(np.square(self._off))
+        sliding = np.square(np.square(self._off))  # k
         share = sliding + LATEST  # g (1 + k)
         self._mean = self._mean + share / (1.0 + sliding) * off
         dead_band = NOISE * np.sqrt(share / (sliding + 2.0 - LATEST))
@@ -147,7 +151,7 @@ class FrictionDirection:
         return self._direction
 
     def end_tension(self, transmission: Transmission, read: Array, length: Array) -> Array:
-        """Update s with the next l [m] (M,); return T_end [N] (M,) for T_read [N] (M,)."""
+        """Update s with the next l [m], and return T_end [N] for T_read [N], (M,) each."""
         return transmission.end(read, self.step(length))
 
     def reset(self) -> None:

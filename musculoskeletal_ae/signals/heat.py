@@ -5,14 +5,18 @@ The motor's winding heats its housing, which the air cools (arXiv 2407.08055):
 
     C₁ ċ₁ = k T² − (c₁ − c₂)/R₁,   C₂ ċ₂ = (c₁ − c₂)/R₁ − (c₂ − c_a)/R₂
 
-The temperature c₂ of the housing is measured; c₁ of the winding is not. An extended Kalman filter
-estimates c₁ − c₂, c₂, the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and the air temperature
-c_a while the arm operates. Each is modelled as a random walk. The ratio r = R₁/R₂ cannot be
-estimated (doc/explanation/control_and_safety.md).
+c₁, c₂ and c_a are the temperatures of winding, housing and air. C₁ and C₂ are the heat capacities
+of winding and housing, R₁ and R₂ the thermal resistances from winding to housing and from housing
+to air. Holding the tension T heats the winding with the power k T².
 
-The highest permitted tension of a muscle is the one that brings its winding to the temperature
-limit if it is held for a certain time. If an estimated constant departs from its initial estimate,
-the module has changed: its motor drags, its housing is covered, or its tension sensor is faulty.
+c₂ is measured, c₁ is not. While the arm operates, an extended Kalman filter estimates c₁ − c₂, c₂,
+the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a. Process noise lets the constants
+change slowly. The ratio r = R₁/R₂ cannot be estimated (doc/explanation/control_and_safety.md).
+
+The highest permitted tension of a muscle is the tension that brings the winding to the temperature
+limit if it is held for a certain time. If an estimated constant departs from the value at which it
+was first known, the module has changed: its motor drags, its housing is covered, or its tension
+sensor is faulty.
 """
 
 import numpy as np
@@ -24,8 +28,8 @@ HELD = 60.0  # duration for which planned tensions must be permissible [s]
 MOMENT = 5.0  # duration for which every commanded tension must be permissible [s]
 EVERY = 1.0  # time between two updates [s]
 LONGEST = 10.0  # longest time that one update may cover [s]
-#: change of a housing's temperature between two updates that the motor cannot cause [°C]; the
-#: sensor or another source of heat has caused a larger one
+#: largest change of a housing's temperature between two updates that the motor can cause [°C]; a
+#: larger change is due to the sensor or to another source of heat
 JUMP = 5.0
 NOISE = 0.1  # standard deviation of the mean of c₂ over EVERY [°C]
 RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
@@ -36,12 +40,12 @@ HOUSING_TIME = 800.0  # initial estimate of the housing's time constant τ₂ [s
 AIR = 25.0  # initial estimate of the air temperature c_a [°C]
 #: initial standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C]
 SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
-#: standard deviations of the random walks of the same quantities, per √s
+#: standard deviations of the process noise of the same quantities, per √s
 WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
 FAR = 2.5  # largest change of the logarithm of a constant from its initial estimate
 SLOPE = 1e-4  # step of numerical derivatives
 LEARNED = 1200.0  # time of learning before a constant can count as known [s]
-KNOWN = 0.2  # largest standard deviation of the logarithm of a known constant
+KNOWN = 0.2  # standard deviation of a constant's logarithm below which the constant is known
 CHANGED = 1.5  # factor by which a known constant must change to be reported
 
 
@@ -82,7 +86,7 @@ class Heat:
 
     @property
     def core(self) -> Array:
-        """Estimated winding temperatures [°C] (M,); NaN where the housing's is unknown."""
+        """Estimated winding temperatures [°C], (M,); NaN where no housing temperature is known."""
         return np.where(self._known, self._state[0] + self._state[1], np.nan)
 
     def accept(self, *muscles: int) -> None:
@@ -115,12 +119,12 @@ class Heat:
         return self._limits[highest]
 
     def step(self, tension: Array, housing: Array, dt: float) -> None:
-        """Process measurements.
+        """Process one measurement of all modules.
 
         Args:
             tension: T [N], (M,).
             housing: Temperatures of the housings [°C], (M,); unknown where not finite.
-            dt: Time since the last measurements [s].
+            dt: Time since the previous measurement [s].
         """
         known = np.isfinite(housing)
         if dt > LONGEST:
@@ -144,7 +148,7 @@ class Heat:
         self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
 
     def _miss(self, housing: Array, known: Bools, dt: float) -> None:
-        """Continue after dt [s] without measurements, which leaves the constants unchanged."""
+        """Continue after a gap of dt [s] in the measurements; the constants stay as they were."""
         self._state[0] *= np.exp(-dt / np.exp(self._state[3]))
         self._state[1] = np.where(known, housing, self._state[1])
         self._interrupted |= known
@@ -176,9 +180,11 @@ class Heat:
         }
 
     def _look_ahead(self) -> list[tuple[Array, Array]]:
-        """Return predicted winding temperatures after HELD and after MOMENT.
+        """Predict the winding temperatures after HELD and after MOMENT.
 
-        Each is a pair: c₁ without tension [°C] and its increase per T² [K/N²], (M,) each.
+        Returns:
+            Two pairs, for HELD and for MOMENT: c₁ without tension [°C], and the increase of c₁ per
+            T² [K/N²], (M,) each.
         """
         squares = np.array([0.0, 1.0])[:, None] * self._tension.limit**2
         state = np.repeat(self._state[:, None], 2, axis=1)

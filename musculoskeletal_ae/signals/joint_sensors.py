@@ -6,13 +6,14 @@ The geometric model states how every l changes with each joint. For N messages o
     l(t) − l̂(t) ≈ c + Σ_j a_j (l_j(t) − l̂(t)),    l̂: model at the median posture
                                                   l_j: the same with the measured θ_j of joint j
 
-is fitted by least squares, with a constant c for each muscle and segment of the recording. It does
-not depend on length offsets. For a correct sensor a_j is about 1. If the sign of θ_j is wrong, a_j
-is about −1. Leaving out one muscle at a time gives the standard error of a_j (jackknife).
+is fitted by least squares, with a constant c for each muscle and segment of the recording. Because
+of c, the fit does not depend on length offsets. For a correct sensor a_j is about 1. If the sign of
+θ_j is wrong, a_j is about −1. Leaving out one muscle at a time gives the standard error of a_j
+(jackknife).
 
-A sign cannot be judged if the joint hardly moves, or if the lengths of its muscles are the same at
-θ and −θ. Such a joint reads a position beyond its limits if its sign is wrong, because its limits
-are on one side of 0.
+A sign cannot be judged from lengths if the joint hardly moves, or if the lengths of its muscles are
+the same at θ and −θ. In the second case, the limits of the joint are on one side of 0, so that a
+reading with the wrong sign is beyond these limits.
 """
 
 from collections.abc import Iterator
@@ -24,20 +25,21 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.robot import Robot
 
-LEAST_MOTION = 0.05  # range of θ from which a joint is judged [rad]
+LEAST_MOTION = 0.05  # smallest range of θ of a joint that is judged [rad]
 #: smallest |a_j| by which a sign is judged. On the emulated individuals 0–4 of both shipped arms
 #: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
 BEYOND = 0.3  # distance by which a correct θ may exceed the joint limits [rad]
-#: fraction of the misfit of l that remains if another unit or order of θ is right
+#: Another unit or order of θ is assumed if it reduces the misfit of l to less than this fraction.
 BETTER = 0.8
-MOST_SAMPLES = 600  # messages that are used, evenly distributed
-LEAST_SAMPLES = 20
+MOST_SAMPLES = 600  # largest number of messages that are used, evenly distributed
+LEAST_SAMPLES = 20  # smallest number of messages by which sensors are judged
 STUCK_TIME = 5.0  # shortest time for which a stuck sensor repeats its reading [s]
-STUCK_MOTION = 0.2  # motion of the joint according to the lengths meanwhile [rad]
-#: distance of the joint from a stuck reading, according to lengths of an arm that rests [rad]
+#: A repeated reading is stuck if the lengths show that the joint moves by more than this [rad],
+STUCK_MOTION = 0.2
+#: or that the joint is further from the reading than this [rad].
 STUCK_OFFSET = 0.5
-STUCK_EXPLAINED = 0.5  # fraction of the misfit of l that this motion must explain
+STUCK_EXPLAINED = 0.5  # fraction of the misfit of l that the motion or distance must explain
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 
 
@@ -111,10 +113,10 @@ def stuck_sensors(
     tension: Array,
     used: Bools | None = None,
 ) -> list[JointFault]:
-    """Return the joint sensors that repeat one reading where the lengths show another angle.
+    """Return the joint sensors that repeat one reading although the lengths show another angle.
 
-    Either the lengths show a motion meanwhile, or they differ from the model by more than in the
-    rest of the recording, as if the joint were elsewhere.
+    During the repeated reading, the lengths either show that the joint moves, or differ from the
+    model by more than they do in the rest of the recording, as if the joint were elsewhere.
 
     Args:
         robot: The geometric model.
@@ -152,14 +154,14 @@ def stuck_sensors(
 class _Hypothesis(NamedTuple):
     """An interpretation of the measured angles."""
 
-    fault: JointFault | None  # the fault that it assumes
-    theta: Array  # θ that follows from it [rad], (N, D)
+    fault: JointFault | None  # the fault that is assumed; None if the angles are taken as they are
+    theta: Array  # θ [rad], (N, D), corrected for this fault
 
 
 class _Signs(NamedTuple):
     """Signs of the joints, each (D,)."""
 
-    sign: Array  # by which θ must be multiplied, 1 or −1
+    sign: Array  # factor by which θ must be multiplied, 1 or −1
     is_known: Bools  # whether the lengths show the sign
 
 
@@ -184,7 +186,10 @@ class _Lengths:
         return centred
 
     def misfit(self, theta: Array) -> float:
-        """Return the root mean square of l − l̂(θ) without its mean [m], or ∞ beyond the limits."""
+        """Return the root mean square of l − l̂(θ) [m], or ∞ if θ is beyond the joint limits.
+
+        The mean of the differences in each segment is subtracted first.
+        """
         robot = self.robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta)
         if (beyond > BEYOND * robot.kinematics.radian).any():
@@ -206,7 +211,8 @@ class _Lengths:
             wrong = known & (scale < 0.0)
             if not wrong.any():
                 break
-            # The others are judged again, because the model was evaluated at a wrong posture.
+            # Change one sign only, then judge all joints again, because the wrong sign has put the
+            # model into a wrong posture.
             sign[np.where(wrong, scale, 0.0).argmin()] *= -1.0
         return _Signs(sign, known & (scale > 0.0))
 
@@ -226,7 +232,8 @@ class _Lengths:
             changes.append(self._centred(self._model(posture) - base))
         change = np.stack(changes, axis=-1)  # (N, M, joints)
         measured = self._centred(self._length[:, self._used] - base)
-        # Each muscle adds one term to the normal equations; without its term, it is left out.
+        # Each muscle adds one term to the normal equations. Subtracting this term leaves the muscle
+        # out of the fit.
         products = np.einsum('nmj,nmk->mjk', change, change)
         rights = np.einsum('nmj,nm->mj', change, measured)
         scale[moved] = _solve(products.sum(axis=0), rights.sum(axis=0))
@@ -253,7 +260,7 @@ def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
     most = BEYOND * robot.kinematics.radian
     is_beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0) > most
     far = np.flatnonzero(is_beyond).tolist()
-    if far:  # a reading that is legal with the other sign or in degrees
+    if far:  # readings beyond the limits may be legal with the other sign, or as degrees
         changed = theta.copy()
         changed[:, far] *= -1.0
         yield _Hypothesis(JointFault(SIGN, tuple(far)), changed)
@@ -263,7 +270,7 @@ def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
             changed[:, joints] = np.radians(changed[:, joints])
             yield _Hypothesis(JointFault(DEGREES, tuple(joints)), changed)
     pairs = list(combinations(np.flatnonzero(lengths.moved(theta)).tolist(), 2))
-    if pairs:  # only the best exchange is examined further, because signs take time
+    if pairs:  # yield only the best exchange, because the caller's search for signs takes time
         misfits = [lengths.misfit(_exchanged(theta, pair)) for pair in pairs]
         pair = pairs[int(np.argmin(misfits))]
         yield _Hypothesis(JointFault(ORDER, pair), _exchanged(theta, pair))

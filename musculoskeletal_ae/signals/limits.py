@@ -2,9 +2,9 @@
 """Limits of plausible sensor values, and checks that use them.
 
 The limits leave a margin to the extremes of five healthy arms that each explored for a minute, with
-and without an unknown payload of 3.6 kg, under the initial network of preset `default`. Lengths
-changed by up to 0.9 mm in 10 ms, estimates exceeded a joint's range by up to 0.13 of the range, and
-tensions reached 343 N.
+and without an unknown payload of 3.6 kg, under the initial network of preset `default`. On these
+arms, lengths changed by up to 0.9 mm in 10 ms, estimates exceeded a joint's range by up to 0.13 of
+the range, and tensions reached 343 N.
 """
 
 import math
@@ -27,9 +27,11 @@ class Limits(NamedTuple):
     estimate_outside: float = 0.5
     lowest_tension: float = -0.1  # lowest tension, as a fraction of `tension.max`
     highest_tension: float = 1.1  # highest tension, as a fraction of `tension.max`
-    #: lowest motor current as a tension, as a fraction of `tension.max`; it includes drive friction
+    #: lowest motor current, converted to a tension, as a fraction of `tension.max`; it is negative,
+    #: because a part of the current overcomes the friction of motor and gear
     lowest_current: float = -1.0
-    #: highest motor current as a tension, as a fraction of `tension.max`; its scale is uncertain
+    #: highest motor current, converted to a tension, as a fraction of `tension.max`; it exceeds 1,
+    #: because the scale of currents is uncertain
     highest_current: float = 3.0
     lowest_temperature: float = -40.0  # lowest temperature of a muscle module [°C]
     highest_temperature: float = 200.0  # highest temperature of a muscle module [°C]
@@ -38,13 +40,15 @@ class Limits(NamedTuple):
     # have agreed with it to within `temperature_step` for `glitch`.
     temperature_step: float = 5.0  # constant part of the largest change of a temperature [°C]
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
-    #: largest excess of a length over its range within the joint limits [m]: tendons wrap, are
-    #: wound in with slack, or are attached elsewhere than modelled
+    #: largest excess of a length over its range within the joint limits [m]; lengths exceed this
+    #: range if tendons wrap, are wound in with slack, or are attached elsewhere than modelled
     length_margin: float = 0.1
-    slack_length_margin: float = 1.0  # distance by which a slack tendon can be shorter still [m]
+    #: distance by which a slack tendon can be shorter than `length_margin` permits [m]
+    slack_length_margin: float = 1.0
     slack_share: float = 0.2  # tension below which a tendon is slack, as a fraction of T_bias
-    # Between two messages, a length changes by at most `step + speed · dt`, where the time dt
-    # counts up to `longest_step`. A new level is accepted after it has lasted for `settled`.
+    # Between two messages, a length changes by at most `step + speed · dt`, where dt is the time
+    # between them, but at most `longest_step`. A length that has jumped is accepted after it has
+    # stayed at the new level for `settled`.
     step: float = 0.02  # constant part of the largest change of a length [m]
     speed: float = 1.0  # largest speed of a length [m/s]
     longest_step: float = 0.05  # longest time that counts for the change of a length [s]
@@ -97,7 +101,10 @@ def longest_lengths(robot: Robot) -> Array:
 
 
 def share_outside(robot: Robot, theta: Array) -> Array:
-    """Return how far each joint exceeds its range, as a fraction of the range, (D,)."""
+    """Return how far each joint exceeds its range, as a fraction of the range, (D,).
+
+    The fraction is negative for a joint within its range.
+    """
     low, high = robot.lower, robot.upper
     share: Array = np.maximum(theta - high, low - theta) / (high - low)
     return share
@@ -134,5 +141,5 @@ class Persistence:
         self._problem = problem
 
     def lasting(self, now: float) -> str:
-        """Return the fault if there has been one for longer than a glitch, else ''."""
+        """Return the newest fault if faults have lasted for longer than a glitch, else ''."""
         return self._problem if now - self._since > LIMITS.glitch else ''

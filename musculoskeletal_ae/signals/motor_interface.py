@@ -49,7 +49,7 @@ class MotorInterface:
         settings: The parameters.
         is_ros2_control: Whether states arrive as JointState; otherwise as muscle_states.
         state_topic: Topic of the states.
-        state_type: Type of its messages.
+        state_type: Type of the messages on `state_topic`.
         command_topic: Topic of the motor commands, or '' if there are none.
     """
 
@@ -84,7 +84,7 @@ class MotorInterface:
             legal = f'each of {", ".join(self._motors)} once'
             problem = f'{wrong[0]!r} is missing, unknown or repeated; expected {legal}'
             raise _refused('motor_command_order', problem)
-        #: muscle of each value of a command, (M,)
+        #: index of the muscle to which each value of a command belongs, (M,)
         self._order: Ints = np.array([self._motors.index(name) for name in order])
         each = {
             name: _each(name, getattr(settings, name), count)
@@ -133,7 +133,7 @@ class MotorInterface:
             raise MessageError('repeated stamp', detail)
         position = np.array(message.position, dtype=float)[self._places]
         rows = np.full((3, len(position)), np.nan)
-        with np.errstate(over='ignore'):  # values that large are rejected as not finite
+        with np.errstate(over='ignore'):  # a result that overflows is later rejected as not finite
             rows[0] = self._length_per_position * (position - self._zero)
             if len(message.effort):
                 effort = np.array(message.effort, dtype=float)[self._places]
@@ -141,13 +141,13 @@ class MotorInterface:
         return MuscleReading(rows.ravel())
 
     def command(self, length: Array) -> Array:
-        """Return the motor command for l_target [m] (M,): positions in the controller's order."""
+        """Return the motor positions for l_target [m], (M,), in the order of the motor commands."""
         return self._position(length)[self._order]
 
     # -- the reverse conversion, for emulated arms -----------------------------------------------
 
     def take_command(self, follow: Callable[[Array], object]) -> Callable[[Any], None]:
-        """Return a callback for motor commands that passes on l_target [m], (M,)."""
+        """Return a callback that converts motor commands, and calls `follow` with l_target [m]."""
 
         def take(message: Any) -> None:
             position = np.empty(len(self._order))
@@ -157,7 +157,7 @@ class MotorInterface:
         return take
 
     def joint_values(self, length: Array, tension: Array) -> tuple[tuple[str, ...], Array, Array]:
-        """Return the motors' names, positions and efforts for l [m] and T [N], (M,) each."""
+        """Return names, positions and efforts of the motors for l [m] and T [N], (M,) each."""
         effort = tension / self._tension_per_effort + self._effort_zero
         return tuple(self._motors), self._position(length), effort
 

@@ -36,7 +36,7 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Pairs two streams; returns each muscle message when the next one has arrived."""
+    """Pairs messages of muscles with θ; a message is returned when the next one has arrived."""
 
     def __init__(self, period: float) -> None:
         """Start; `period` is the period of the muscle messages [s]."""
@@ -45,12 +45,12 @@ class Pairing(Generic[Message]):
 
     def reset(self) -> None:
         """Discard all messages, for example after a backward jump of the clock."""
-        # For each joint, time [s] and θ (2, D) of the last value before the pending muscle message,
-        # of the first one after it, and of the latest one; NaN if there is none.
+        # Time [s] and value of θ for each joint, (2, D), NaN if there is none: the last θ before
+        # the pending muscle message, the first θ after it, and the latest θ of all.
         self._last = self._next = self._latest = np.full((2, 1), np.nan)
-        self._came = -math.inf
-        self._pending: tuple[float, Message] | None = None
-        self._before: float | None = None
+        self._came = -math.inf  # time of the latest message with θ [s]
+        self._pending: tuple[float, Message] | None = None  # its time [s], and the message
+        self._before: float | None = None  # time of the muscle message before the pending one [s]
 
     def joints(self, time: float, theta: Array) -> None:
         """Record θ [rad] (D,) received at `time` [s]; NaN for joints that are not included."""
@@ -62,12 +62,11 @@ class Pairing(Generic[Message]):
         self._next = np.where(np.isnan(self._next), new, self._next)
 
     def muscles(self, time: float, message: Message | None) -> Paired[Message] | None:
-        """Record a message received at `time` [s], and return the previous message with its θ.
+        """Record a muscle message received at `time` [s]; return the previous one with its θ.
 
         At the end of a recording, pass None at time ∞ to get the last message.
         """
-        # The clock has gone back or been replaced.
-        if self._pending is not None and time < self._pending[0]:
+        if self._pending is not None and time < self._pending[0]:  # the clock has gone back
             self.reset()
         pending = self._pending
         self._pending = None if message is None else (time, message)
@@ -81,7 +80,15 @@ class Pairing(Generic[Message]):
         return paired
 
     def _nearest(self, came: float, following: float) -> Array | None:
-        """Return the θ nearest to the pending message, without values nearer to a neighbour."""
+        """Return the θ nearest to the pending muscle message; NaN for joints without a match.
+
+        A value that is nearer to the muscle message before or after does not match. The result is
+        None if no joint has a match.
+
+        Args:
+            came: Time of the pending message [s].
+            following: Time of the muscle message after it [s].
+        """
         before = -math.inf if self._before is None else self._before
         time, theta = np.stack(np.broadcast_arrays(self._last, self._next), axis=1)
         distance = np.abs(time - came)
