@@ -72,7 +72,8 @@ URDF = """<robot name="own">
 </robot>
 """
 
-# The same arm: frames of links at their centres of mass, joints given in their child's frame.
+# The same arm as URDF, but with links whose frames are at their centres of mass, and joints that
+# are given in the frame of their child link.
 SDF = """<sdf version="1.6"><model name="own">
   <link name="base"><pose>0 0 0 0 0 0</pose>
     <inertial><pose>0 0.01 0.1 0 0 0</pose><mass>2</mass><inertia><ixx>0.02</ixx>

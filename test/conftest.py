@@ -15,15 +15,17 @@ from hypothesis import settings
 
 import musculoskeletal_ae  # noqa: F401  # chooses the pinocchio that tests import
 
-# Each of pytest-xdist's processes has a ROS graph of its own.
+# Each process of pytest-xdist has its own ROS domain, so that their nodes do not meet.
 if worker := os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw'):
     os.environ['ROS_DOMAIN_ID'] = str(int(os.environ.get('ROS_DOMAIN_ID', '1')) + int(worker))
 
-# A shell makes its background processes ignore Ctrl-C; processes of tests would inherit this.
+# A shell lets background processes ignore SIGINT, and the processes that tests start would inherit
+# this. Restore the default.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The first example loads compiled code, so examples have no deadline. Every run tries the same
-# examples; `./test.sh --hypothesis-profile search` tries new ones.
+# Hypothesis allows 200 ms for an example by default, but the first one loads compiled code, which
+# takes longer. Every run tries the same examples; `./test.sh --hypothesis-profile search` tries new
+# ones.
 settings.register_profile('search', deadline=None)
 settings.register_profile('repeatable', deadline=None, derandomize=True)
 settings.load_profile('repeatable')
@@ -41,7 +43,7 @@ def pytest_collection_modifyitems(items: list[Any]) -> None:
 @contextmanager
 def _alone(factory: pytest.TempPathFactory, what: str) -> Iterator[Path]:
     folder = factory.getbasetemp()
-    folder = folder.parent if worker else folder  # the common folder of pytest-xdist's processes
+    folder = folder.parent if worker else folder  # a folder that all processes of the run share
     with (folder / f'{what}.lock').open('w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield folder
@@ -69,7 +71,7 @@ def both_cores(alone) -> Iterator[None]:
 @pytest.fixture(scope='session')
 def trained_files(alone) -> dict[str, Path]:
     """Return the files of briefly trained networks of arm26 by preset, trained once per run."""
-    # Load torch only for tests that need a network.
+    # These imports load torch, which only tests with a network need.
     from musculoskeletal_ae.mae import checkpoint
     from musculoskeletal_ae.mae.training import initial_mae
     from musculoskeletal_ae.presets.registry import PRESETS

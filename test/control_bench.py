@@ -60,7 +60,8 @@ class Bench:
     """A controller with healthy sensor data, unless a test changes them."""
 
     def __init__(self, mae=None, **chosen):
-        # Ramps of lengths do not need a moving arm.
+        # The bench's arm does not move. With a duration of 0, targets are reached by ramps of
+        # lengths, which do not need a moving arm.
         self.core = Controller(ROBOT, Settings(**{'target_duration': 0.0, **chosen}))
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)

@@ -12,7 +12,7 @@ from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.validity import read_array, read_muscle_states
 
-RATE_LIMIT = 0.2  # [m/s]
+RATE_LIMIT = 0.2  # rate limit of length commands [m/s]
 #: the longest legal max_age [s], so that a loaded machine does not stop the arm
 PATIENT = 10.0
 IMPATIENT = 1.0  # max_age while a test waits for a stop because of missing data [s]
@@ -45,7 +45,7 @@ class ControlledArm:
         self.estimator = self.start('estimator', checkpoint=checkpoint)
         self.controller = self.start_controller()
         self.targets = graph.publisher(JointState, 'target_joint_states')
-        self.says('no target')  # it has received posture and network
+        self.says('no target')  # the controller reports this once it has a posture and a network
 
     def start(self, name, **parameters):
         if name in self.processes:

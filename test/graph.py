@@ -65,10 +65,11 @@ class Process:
         """Yield the lines of the output as they are written, until the command ends."""
         count, deadline = 0, time.monotonic() + PATIENCE
         while True:
-            has_ended = not self.alive()  # checked first, because nothing is written after the end
+            # Check this before reading the output, so that no line written in between is missed.
+            has_ended = not self.alive()
             lines = self.output.splitlines(keepends=True)
             if lines and not has_ended and not lines[-1].endswith('\n'):
-                lines.pop()  # the rest of this line is still to come
+                lines.pop()  # the process has not finished writing this line
             for line in lines[count:]:
                 count += 1
                 deadline = time.monotonic() + PATIENCE
@@ -118,9 +119,9 @@ class Graph:
         self.namespace = namespace
         self.received: dict[str, list[Any]] = defaultdict(list)
         self.processes: list[Process] = []
-        self.tools: list[Process] = []  # unlike `processes`, these may end by themselves
+        self.tools: list[Process] = []  # processes that may end by themselves, unlike `processes`
         self.hosted: list[Node] = []
-        self.networks: dict[str, Any] = {}  # their publishers, by topic
+        self.networks: dict[str, Any] = {}  # publishers of networks, by topic
 
     def start(self, name: str, **parameters: Any) -> Process:
         """Start a node with parameters, in this graph's namespace."""
@@ -247,7 +248,7 @@ class Graph:
         """Leave the graph, and end all processes that were started."""
         for process in (*self.processes, *self.tools):
             process.end()
-        self.executor.shutdown()  # before nodes are destroyed
+        self.executor.shutdown()  # it must not use nodes that are destroyed next
         for node in (*self.hosted, self.node):
             node.destroy_node()
         rclpy.shutdown(context=self.context)

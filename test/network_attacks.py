@@ -78,7 +78,7 @@ def _shifted(quantity: int, scaled: float) -> Attack:
 
 ATTACKS: Mapping[str, Attack] = {
     **{f'weights × {k:g}': _weights(lambda w, k=k: k * w) for k in (1.5, 1.7, 2.0, -1.0)},
-    'noise of 100 %': _noise,  # 50 % is close to the limits, and sometimes passes
+    'noise of 100 %': _noise,  # a network with 50 % noise sometimes passes the checks
     'lengths × 10': _lengths(10.0),
     'lengths × 2': _lengths(2.0),
     'two joints swapped': _last(0, _swap),
@@ -90,8 +90,8 @@ ATTACKS: Mapping[str, Attack] = {
     'one length 0.2 m off': _shifted(2, 2.0),
     'standardisation × 2': _scaled_std(2.0, slice(None)),
 }
-SCALED = 10.0  # scaled units of a length of a metre
-#: networks that only the arm's own messages reveal
+SCALED = 10.0  # the network scales lengths: units per metre
+#: bad networks that only a comparison with the arm's own messages reveals
 ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 
 
@@ -117,7 +117,7 @@ def _other_joint(mae: Mae) -> Mae:
     return replace(mae, std=std)
 
 
-#: consistent networks that do not agree with the arm
+#: networks that are consistent in themselves, but describe another arm
 CONSISTENT: Mapping[str, Attack] = {
     'all lengths × 0.5': _other_lengths(0.5),
     'all lengths × 1.5': _other_lengths(1.5),

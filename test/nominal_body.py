@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control of the nominal body. Without mismatch and friction, all errors are the network's.
+"""Measures control of the nominal body, where all errors are those of the network.
 
-1. posture: error and ‖T‖ where the arm settles under each method's lengths, beside the bound: T by
-   QP on the true G, lengths by the true body.
-2. stiffness: the deflection of a push at a stiffness in the lower and the upper quarter of the
-   reported reachable range, and the ratio of both beside the predicted one.
+1. posture: error and ‖T‖ where the arm settles under the lengths of each method. The bound is that
+   of lengths by the true body, with T by QP on the true G.
+2. stiffness: deflections by a push at a low and at a high stiffness (the lower and the upper
+   quarter of the reported reachable range). Their ratio is compared with the predicted one.
 """
 
 import numpy as np
@@ -19,9 +19,10 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.paper.control import proposed as proposed_as_printed
 from musculoskeletal_ae.robot.robot import Robot
 
-SETTLING, PERIOD = 3.0, 0.02  # [s]
-QUARTERS = (0.125, 0.875)  # middles of the lower and the upper quarter of the reachable range
-PUSH = 1.0  # torque at the joint [N·m]
+SETTLING, PERIOD = 3.0, 0.02  # time until the arm rests, and between two commands [s]
+#: low and high stiffness, as shares of the reachable range: middles of its outer quarters
+QUARTERS = (0.125, 0.875)
+PUSH = 1.0  # torque of the push at the joint [N·m]
 
 
 def nominal_arm(robot: Robot) -> EmulatedArm:
@@ -73,8 +74,8 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
     """Return the deflection by a small push, (K_θ + ∂g/∂θ)⁻¹ Jᵀ F [rad], shape (D,).
 
     Args:
-        robot: For its weight and hand.
-        theta: Where it rests [rad], shape (D,).
+        robot: The geometric model.
+        theta: θ at which the arm rests [rad], shape (D,).
         stiffness: K_θ [N·m/rad], shape (D, D).
         wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
     """
@@ -86,10 +87,10 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
 def stiffness_ratios(
     robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None = None, push: float = PUSH
 ) -> Array:
-    """Return (measured, predicted) ratio of deflection, lower over upper quarter, (N, 2).
+    """Return the measured and predicted ratio of the deflections at low to high stiffness, (N, 2).
 
-    Each posture stiffens one joint, in turn; the push is the wrench that comes nearest to a torque
-    [N·m] on that joint alone.
+    In each of `count` postures, one joint is stiffened, in turn. The push is the wrench that comes
+    nearest to a torque `push` [N·m] on that joint alone.
     """
     arm = arm or nominal_arm(robot)
     ratios = []

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compares the rest of the simulator, and its response to pushes, with the nominal body.
 
-(Paper, section "Simulation".) On a network trained on the geometric model, against that model as a
-body: the emulated arm without individual differences and friction, and the equations of its rest,
+The simulator (paper, section "Simulation") uses a network trained on the geometric model. The
+nominal body is that model: either the emulated arm without individual differences and friction, or
+a solution of the equations of its rest,
 
     T = T_bias + max(0, K_stiff (l(θ, T) − l_target)),   g(θ) − JᵀF + Gᵀ T = τ_stop
 
-which, unlike the emulated arm, can hold joints fast.
+The equations are needed to hold joints at an angle, which the emulated arm cannot.
 """
 
 from typing import NamedTuple
@@ -23,13 +24,13 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.01  # [s]
-STILL = 1e-4  # [rad/s]
-LONGEST_WAIT = 20.0  # [s]
-TENSION_UNIT = 100.0  # unit of the unknown tensions [N], so that all unknowns are of one size
+STEP = 0.01  # time step of the simulator [s]
+STILL = 1e-4  # joint speed below which the arm counts as still [rad/s]
+LONGEST_WAIT = 20.0  # longest time until the arm is still [s]
+TENSION_UNIT = 100.0  # unit of the unknown tensions [N], which makes them as large as the angles
 FLEXED, FLEXION = 'elbow_pitch', np.radians(-90.0)
 FORCED, FORCED_TO = 'shoulder_pitch', np.radians(30.0)
-#: motion of a joint of the nominal body above which it is compared with that of the simulator [rad]
+#: motion of a joint of the nominal body [rad]; smaller ones are not compared with the simulator's
 NOTICEABLE = 0.05
 
 
@@ -75,7 +76,7 @@ def rest_errors(
         arm = EmulatedArm(robot, 0, body)
         true.append(settle_arm(arm, command))
     theta, tension = (np.stack(part) for part in zip(*true, strict=True))
-    # Start like the emulated arms: hanging, with the command of the posture.
+    # Simulated and emulated arms start hanging, and follow the same command.
     simulated.command = commands
     rest = simulated.settle()
     drift, tension_drift = np.zeros((2, len(commands)))
@@ -103,15 +104,15 @@ def nominal_rest(
     wrench: Array,
     fixed: Array,
 ) -> Rest:
-    """Return the rest reached from (θ, T).
+    """Return the solution of the equations of rest that the search finds from θ and T.
 
     Args:
         robot: The geometric model.
         command: l_target [m], shape (M,).
-        theta: Where to start [rad], shape (D,).
-        tension: Where to start [N], shape (M,).
-        wrench: On the end effector, axes of the root link, shape (6,).
-        fixed: Angles of joints held fast [rad], shape (D,); nan for a free joint.
+        theta: θ at which the search starts [rad], shape (D,).
+        tension: T at which the search starts [N], shape (M,).
+        wrench: F on the end effector [N, N·m], axes of the root link, shape (6,).
+        fixed: Angles of joints that are held [rad], shape (D,); nan for a free joint.
     """
     from scipy.optimize import least_squares
 

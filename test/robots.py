@@ -12,8 +12,8 @@ import yaml
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 
-# Written from the hand inwards, with a fixed link and a rotated frame in between, so that
-# no test passes only because of the order or of identity rotations.
+# The chain is listed from the hand to the base, and contains a fixed joint and a rotated frame.
+# Tests therefore cannot pass only because elements are in order or rotations are identities.
 URDF = """<?xml version="1.0"?>
 <robot name="other">
   <link name="base"/>
@@ -64,7 +64,7 @@ FINGER = """
     <inertial><origin xyz="0.02 0 0"/><mass value="0.1"/>
       <inertia ixx="0.0001" ixy="0" ixz="0" iyy="0.0001" iyz="0" izz="0.0001"/></inertial>
   </link>"""
-JOINTS = ('bend', 'lift', 'swing')  # the chain is lift, swing, bend
+JOINTS = ('bend', 'lift', 'swing')  # order of θ; from the base, the order is lift, swing, bend
 Route = Sequence[tuple[str, Sequence[float]]]
 MUSCLES: dict[str, Route] = {
     'pull_front_out': [('pillar', (0.06, 0.05, 0.02)), ('upper', (0.04, 0.03, -0.12))],
@@ -139,7 +139,8 @@ DRUM = {
     'wrap': 'cylinder', 'link': 'upper', 'axis': [0.1, 2.0, 0.0], 'xyz': [0.0, 0.0, -0.3],
     'radius': 0.03, 'side': [-0.2, 0.0, -0.3],
 }  # fmt: skip
-#: ends with which the tendon stays on its side of the drum, and slips over its end
+#: two ends of a route: with the first, the tendon stays on the drum; with the second, it slips over
+#: the end of the drum
 DRUM_ENDS = {'stays': (0.035, 0.0, -0.008), 'jumps': (0.035, 0.0, 0.0)}
 
 

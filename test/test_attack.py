@@ -11,7 +11,7 @@ from bench import attack
 from bench.attack_graph import digest, filled
 from bench.attack_kinds import KINDS, all_attacks
 
-RATE = 0.1  # [m/s]
+RATE = 0.1  # largest legal rate of length commands [m/s]
 TIME = np.arange(50) * 0.01
 NUMBER = np.arange(50)
 NEVER = np.zeros((50, 2), dtype=bool)
@@ -31,7 +31,8 @@ def test_commands_that_change_too_fast_are_found():
     (violation,) = steps(jump).too_fast
     assert 'muscle 1 changed by -11.0 mm' in violation
     assert steps(jump).largest_in == pytest.approx(0.011)
-    # After a missed message the change is known, but not that of a single tick.
+    # `largest_in` is the change in a single tick. Where a message is missing, only the change over
+    # two ticks is known, so it does not count.
     assert steps(jump, NUMBER + (NUMBER >= 20)).largest_in == pytest.approx(0.001)
     assert steps(np.where(TIME[:, None] > 0.2, np.nan, ramp)).too_fast
 

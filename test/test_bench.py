@@ -19,7 +19,8 @@ def test_every_bench_is_listed_with_what_it_measures(capsys):
 
 
 def test_every_bench_is_explained():
-    # Otherwise a bench without `main` would silently be missing.
+    # `benches` finds modules by their function `main`. A bench that lacks it is noticed here,
+    # because the table in README.md names it.
     text = (Path(__file__).parents[1] / 'bench' / 'README.md').read_text(encoding='utf-8')
     assert {line.split('`')[1] for line in text.splitlines() if line[:3] == '| `'} == set(benches())
 

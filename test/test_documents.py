@@ -19,7 +19,8 @@ REMEDY = 'run: python doc/make.py'
 sys.path.insert(0, str(DOC))
 import make  # noqa: E402 - the script that generates pages
 
-#: compared in full; the command line takes a process for each executable
+#: generated pages that are compared in full. Generating command_line.md starts a process for each
+#: executable, which takes too long for a test.
 GENERATED = ('api.md', 'parameters.md', 'stops.md')
 
 
@@ -88,7 +89,7 @@ print(*joint_angles(np.array({tension.tolist()}), np.array({length.tolist()})))
     )
     assert done.returncode == 0, done.stderr
     estimated = np.array(done.stdout.split(), dtype=float)
-    # Networks of this brief training are within 0.1 rad on their own geometry.
+    # After this brief training, networks have errors below 0.1 rad on their own geometry.
     assert np.linalg.norm(estimated - theta) < 0.3
 
 
@@ -135,7 +136,7 @@ def test_parameters_that_the_documents_name_exist():
     assert all(f' {name}: ' in parameters for name in named)
 
 
-#: commands of the documents that make a new file or directory
+#: part of a command that names the new file or directory which it makes
 MAKES = re.compile(r'(?:\brecord (?!-)|\bcp -r \S+ |--record |--out |-o )([\w./]+)')
 
 
@@ -143,7 +144,7 @@ def test_no_two_commands_of_the_documents_write_to_the_same_place():
     makers = {}
     for page in PAGES:
         for command in commands(ROOT / page):
-            if command.line.startswith('[ -d '):  # it keeps an existing file
+            if command.line.startswith('[ -d '):  # this command does not replace what exists
                 continue
             for made in MAKES.findall(command.line):
                 makers.setdefault(made.rstrip('/'), []).append((page, command.line))

@@ -29,8 +29,8 @@ TOOLS = {
     'train': ['--robot', 'arm26', '--out', '{folder}/mae.safetensors'],
     'view': ['--robot', 'arm26', '--port', '8765'],
 }
-#: signals and moments [s] after the start: while modules are imported, while nodes are constructed,
-#: later
+#: signals, and their times after the start [s]: while modules are imported, while a node is
+#: constructed, and while it runs
 MOMENTS = [(signal.SIGINT, 0.3), (signal.SIGTERM, 0.9), (signal.SIGINT, 2.0), (signal.SIGTERM, 2.0)]
 
 
@@ -65,7 +65,8 @@ def test_there_is_an_executable_for_every_node_and_tool():
 
 @pytest.mark.parametrize('name', [*NODES, *TOOLS])
 def test_help_loads_nothing_that_takes_long(name):
-    # Each takes 0.1 to 0.4 s of CPU time. Some terminals cannot show all letters.
+    # Help takes 0.1 to 0.4 s of CPU time, because no large module is imported. It must also work on
+    # terminals that cannot show all letters, hence ASCII.
     heavy = "{'numba', 'torch', 'scipy', 'matplotlib'} & set(sys.modules)"
     done = run(
         name,
@@ -93,7 +94,7 @@ def test_ctrl_c_ends_a_tool_without_a_traceback(name, tmp_path):
     done = signalled(name, signal.SIGINT, 0.9, *arguments)
     output = done.stdout + done.stderr
     assert not any(word in output for word in ('Traceback', 'Exception ignored')), output
-    # Some have ended before, and some have nothing to do.
+    # Status 0: the tool had finished before the signal. Status 1: it had nothing to do.
     assert done.returncode in (0, 1, 130), output
 
 
@@ -146,7 +147,7 @@ def test_what_a_terminal_cannot_show_is_replaced(encoding):
     done = run('check_robot', 'arm26', PYTHONIOENCODING=f'{encoding}:strict')
     assert done.returncode == 0, done.stderr
     assert 'arm26: sound' in done.stdout
-    assert ('?' in done.stdout) == (encoding == 'ascii')  # UTF-8 has all of these letters
+    assert ('?' in done.stdout) == (encoding == 'ascii')  # only ASCII lacks some of the letters
 
 
 def test_the_experiments_are_those_that_the_help_names():

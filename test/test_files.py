@@ -44,7 +44,7 @@ def latin(file):
 
 
 def large(file):
-    file.write_bytes(b'a,b\n' + b'1,2\n' * 1_750_000)  # 7 MB
+    file.write_bytes(b'a,b\n' + b'1,2\n' * 1_750_000)  # 7 MB, which is larger than is legal
 
 
 def forbidden(file):

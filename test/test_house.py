@@ -44,8 +44,9 @@ def test_only_the_presets_import_the_paper() -> None:
 
 
 def test_outside_its_folder_the_paper_is_only_cited() -> None:
-    chosen = 'paper', 'presets', 'experiments'  # the experiments compare with it
-    offered = 'parameters.py', 'train.py', 'experiment.py'  # their options name it
+    # Folders that implement the paper or compare with it, and files whose options name its preset.
+    chosen = 'paper', 'presets', 'experiments'
+    offered = 'parameters.py', 'train.py', 'experiment.py'
     for file in sources(PACKAGE):
         if file.parent.name in chosen or file.name in offered:
             continue
@@ -121,8 +122,8 @@ def test_ament_pep257() -> None:
 
 
 def test_ament_copyright() -> None:
-    # It knows long headers only; ours are the SPDX lines above. What it can judge is the licence
-    # and the terms of contributions.
+    # ament_copyright does not know short SPDX headers, which a test above checks. Let it judge the
+    # licence and the terms of contributions.
     parser = pytest.importorskip('ament_copyright.parser', reason='only a sourced Jazzy has it')
     for kind, name in (
         ('LicenseDescriptor', 'LICENSE'),

@@ -23,7 +23,7 @@ def test_bindings_and_libraries_of_another_pinocchio_are_passed_over(tmp_path):
         (tmp_path / package).mkdir()
         (tmp_path / package / '__init__.py').write_text('raise SystemExit(139)')
     for library in LIBRARIES:
-        (tmp_path / library).touch()  # the loader fails on it
+        (tmp_path / library).touch()  # an empty file, on which the dynamic loader fails
     variables = {
         name: os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get(name)])])
         for name in ('PYTHONPATH', 'LD_LIBRARY_PATH')

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 'musculoskeletal_ae'
-#: folders whose imports come with an extra, or with ROS
+#: folders of the package, and the extra of setup.cfg that installs what they import
 EXTRAS = {'view': 'view', 'experiments': 'experiments', 'importing': 'experiments'}
 
 
@@ -38,7 +38,7 @@ def extra_of(file):
     return 'experiments' if 'mujoco' in imported([file]) else EXTRAS.get(file.parent.name, '')
 
 
-distributions = cache(packages_distributions)  # takes a second per call
+distributions = cache(packages_distributions)  # cached, because a call takes a second
 
 
 def distribution(module):
@@ -85,7 +85,7 @@ def test_the_tests_import_only_what_the_requirements_of_the_tests_bring():
     own = {path.stem for path in (*tests.rglob('*.py'), *(ROOT / 'doc').glob('*.py'))}
     own |= {path.name for path in tests.iterdir()} | {'bench'}
     brought = {module: distribution(module) for module in imported(tests.rglob('*.py')) - own}
-    # Message packages and what rclpy depends on come with the wheels of ROS, or with Jazzy.
+    # Message packages and rclpy are not listed: the wheels of ROS, or Jazzy, bring them.
     of_ros = ('_msgs', '_srvs', '_interfaces', 'rclpy')
     missing = {m for m, name in brought.items() if name not in listed and not m.endswith(of_ros)}
     assert missing == set()
@@ -112,7 +112,7 @@ def test_the_example_learns_without_ros(tmp_path):
 
 
 def test_bringup_and_the_recordings_are_installed_with_the_package(monkeypatch):
-    import_module('setuptools')  # provides distutils where Python has none
+    import_module('setuptools')  # provides `distutils`, which Python 3.12 and later lack
     core = import_module('distutils.core')
     monkeypatch.chdir(ROOT)
     files = dict(core.run_setup('setup.py', stop_after='init').data_files)

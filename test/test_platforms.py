@@ -8,7 +8,7 @@ import pytest
 
 from bench import platforms
 
-VARIABLE = 'MUSCULOSKELETAL_AE_PLATFORMS'  # such as "3.12 3.13"
+VARIABLE = 'MUSCULOSKELETAL_AE_PLATFORMS'  # lists versions of Python, such as "3.12 3.13"
 VERSIONS = os.environ.get(VARIABLE, '').split()
 
 
@@ -20,7 +20,7 @@ def test_the_core_and_a_node_work_on_another_interpreter(version, trained_files,
     try:
         line = platforms.check_node(f'wheels-{version}', tmp_path, trained_files['default'])
     finally:
-        shutil.rmtree(tmp_path)  # pytest would keep its 650 MB
+        shutil.rmtree(tmp_path)  # 650 MB, which pytest would keep
     assert f'Python {version}.' in line
 
 

@@ -47,12 +47,12 @@ def test_messages_of_two_publishers_are_all_used():
 @pytest.mark.parametrize(
     ('time', 'number', 'late'),
     [
-        (100 * SECOND, 7, True),  # twice
-        (100 * SECOND - 1, 6, True),  # reordered
+        (100 * SECOND, 7, True),  # the same message a second time
+        (100 * SECOND - 1, 6, True),  # an earlier message that arrives later
         (100 * SECOND + 1, 8, False),
         (100 * SECOND - 1, 8, False),  # the publisher's clock stepped back
-        (99 * SECOND, 6, False),  # another publisher's clock
-        (0, 0, False),  # not known
+        (99 * SECOND, 6, False),  # a message of another publisher, whose clock differs
+        (0, 0, False),  # the middleware states neither time nor number
     ],
 )
 def test_only_what_was_sent_no_later_than_the_last_message_is_late(time, number, late):

@@ -11,7 +11,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mujoco_version import RANGE, check_mujoco
 
 ROOT = Path(__file__).parents[1]
-BUILD_TOOLS = {'colcon-common-extensions'}  # pinned, and needed by no installed package
+BUILD_TOOLS = {'colcon-common-extensions'}  # pinned, but only needed to build the package
 
 
 def ranges():

@@ -104,7 +104,8 @@ def test_values_of_isolated_muscles_are_ignored(unknown):
 
 def test_measured_joints_are_matched_by_name_and_foreign_ones_ignored():
     message = JointState(name=['b', 'x', 'a'], position=[2.0, math.nan, 1.0])
-    message.velocity, message.effort = [math.nan] * 3, [math.nan] * 3  # not measured
+    # The sensors measure neither velocity nor effort.
+    message.velocity, message.effort = [math.nan] * 3, [math.nan] * 3
     assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
 
 
@@ -263,7 +264,7 @@ def test_a_pose_may_contain_a_position_only_and_needs_the_right_frame():
     with pytest.raises(MessageError, match='wrong frame'):
         read_pose(message, 'hand', position_only=True)
     turn = message.pose.orientation
-    turn.z = turn.w = 1.005 * math.sqrt(0.5)  # nearly of unit length
+    turn.z = turn.w = 1.005 * math.sqrt(0.5)  # a norm of 1.005 is accepted, and normalised
     np.testing.assert_allclose(
         read_pose(message, 'base').rotation @ [1, 0, 0], [0, 1, 0], atol=1e-9
     )

@@ -9,7 +9,7 @@ from bags.bag_samples import encode, message_class
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 JOINTS = 'sensor_msgs/msg/JointState'
 STRING = 'std_msgs/msg/String'
-PERIOD = 0.01  # [s]
+PERIOD = 0.01  # time between two messages [s]
 
 
 def array(values):

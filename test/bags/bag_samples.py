@@ -16,8 +16,8 @@ from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import DIAGNOSTICS, TOPICS, interface_name
 from musculoskeletal_ae.bags.writer import BagWriter
 
-START = 1_800_000_000_000_000_000  # [ns]
-PERIOD = 10_000_000  # [ns]
+START = 1_800_000_000_000_000_000  # time of the first message [ns]
+PERIOD = 10_000_000  # time between two messages [ns]
 
 
 class Sample(NamedTuple):
@@ -90,7 +90,10 @@ def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
 def write_ours(
     path: Path, content: list[Sample], compression: str = 'zstd', finish: bool = True
 ) -> None:
-    """Write a bag with our writer, in chunks of ten messages, finished or as after SIGKILL."""
+    """Write a bag with our writer, in chunks of ten messages.
+
+    Without `finish`, it is left as a recorder that is killed by SIGKILL leaves it.
+    """
     writer = BagWriter(path, compression)
     for i, sample in enumerate(content):
         if sample.topic not in writer.topics:

@@ -12,7 +12,7 @@ from bags.bare_file import FLOAT, ONE, write
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 
-TRIALS = 30  # of each kind of bag
+TRIALS = 30  # number of damaged copies of each kind of bag
 NUMBERS = (0, 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1)
 
 
@@ -48,7 +48,7 @@ def damage(data, rng):
         del changed[at : at + size]
     elif kind == 4:
         changed[at:at] = rng.randbytes(size)
-    else:  # a length or a time
+    else:  # replace 8 bytes that may be a length or a time by an extreme value
         changed[at : at + 8] = struct.pack('<Q', rng.choice(NUMBERS))
     return bytes(changed)
 
@@ -77,7 +77,7 @@ def test_damage_is_never_read_without_a_word(recording, content, tmp_path):
             continue
         if all(file.has_checksums for file in bag.files):
             assert messages == (expected[: len(messages)] if bag.unfinished else expected), trial
-        else:  # without checksums, data may be changed but not lost
+        else:  # without checksums, changed data cannot be noticed, but no message may be missing
             assert bag.unfinished or len(messages) == len(expected), trial
 
 
@@ -91,7 +91,7 @@ def test_a_truncated_file_is_read_up_to_its_end_and_reported(content, tmp_path):
         bag, messages = read(file)
         assert f'at byte {size}' in bag.unfinished[0]
         assert messages == expected[: len(messages)]
-    assert len(messages) == len(expected)  # only the summary was cut off
+    assert len(messages) == len(expected)  # the longest piece lacks only the summary of the file
 
 
 def test_no_flipped_bit_changes_what_is_read(content, tmp_path):

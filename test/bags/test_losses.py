@@ -13,7 +13,7 @@ def counted(numbers, publishers=1):
 
 
 def test_gaps_in_the_numbers_of_a_publisher_are_lost_messages():
-    assert counted([7, 8, 9]) == 0  # it began before the recording
+    assert counted([7, 8, 9]) == 0  # messages 1 to 6 were sent before the recording began
     assert counted([1, 2, 5, 6, 10]) == 5
     assert counted([1, 2, 2, 3]) == 0
 

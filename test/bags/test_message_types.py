@@ -29,7 +29,8 @@ def test_our_types_are_those_of_the_installed_ros_messages(end):
         file = share / package / 'msg' / f'{name}.msg'
         if not file.exists():
             continue
-        # As rosbag2 writes it: with comments, constants, defaults and unqualified names.
+        # rosbag2 writes the .msg file itself: with comments, constants, defaults and type names
+        # without their package.
         text = file.read_text()
         for line in message_types.definition(type_name).splitlines():
             if line.startswith('MSG: '):
@@ -93,7 +94,8 @@ def test_no_code_is_made_of_a_definition(tmp_path, monkeypatch):
     for library in ('codegen.gen_code', 'store.Typestore.register'):
         name = f'rosbags.typesys.{library}'
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail('compiled'), raising=False)
-    monkeypatch.delitem(sys.modules, 'rosbags.usertypes', raising=False)  # another test's
+    # Another test may have created this module.
+    monkeypatch.delitem(sys.modules, 'rosbags.usertypes', raising=False)
     bag = Bag.open(write(tmp_path / 'a.mcap', text=text))
     assert [bag.decode(message).data for message in bag.messages()] == [1.0]
     assert 'rosbags.usertypes' not in sys.modules

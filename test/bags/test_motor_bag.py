@@ -17,7 +17,7 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 ROBOT = Robot.load('arm26')
 MOTORS = tuple(f'{muscle}_motor' for muscle in ROBOT.muscles)
-RADIUS = 0.01  # [m]
+RADIUS = 0.01  # radius of the spools [m]
 COUNT = 40
 
 

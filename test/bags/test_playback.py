@@ -83,7 +83,7 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
     last = [next(s for s in content[39::-1] if s.topic.endswith(name)) for name in names]
     played = list(lap(opened, opened.topics, content[40].log_time, opened.end))
     assert sorted(m.data for m in played[: len(names)]) == sorted(sample.data for sample in last)
-    # They are due at once, and do not turn back recorded time.
+    # These messages are due at the start, so that the recorded time does not run backwards.
     assert {m.log_time for m in played[: len(names)]} == {content[40].log_time - 1}
     assert [m.data for m in played[len(names) :]] == [sample.data for sample in content[40:]]
 
@@ -124,6 +124,6 @@ def test_a_motion_that_no_controller_could_follow_is_refused(tmp_path, times, pr
 def test_a_steady_motion_is_smoothed_to_itself(tmp_path):
     times = [0.01 * k for k in range(1, 1001)]
     taught = motion(tmp_path, times)
-    middle = slice(10, -10)  # near its ends the mean is one-sided
+    middle = slice(10, -10)  # near the ends, the running mean has samples on one side only
     expected = 0.5 + 0.1 * (taught.time - taught.time[0] + times[0])
     np.testing.assert_allclose(taught.theta[middle, 1], expected[middle], atol=1e-6)

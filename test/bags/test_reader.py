@@ -66,7 +66,8 @@ def test_records_that_a_reader_must_skip_are_skipped(tmp_path, content):
     """The specification reserves opcodes from 0x80 for private records."""
     samples.write_mcap(tmp_path / 'a.mcap', content, enable_data_crcs=False)
     data = (tmp_path / 'a.mcap').read_bytes()
-    head = 8 + 9 + struct.unpack_from('<Q', data, 9)[0]  # the magic and the header
+    # length of the magic (8 bytes) and of the header record (opcode, length, content)
+    head = 8 + 9 + struct.unpack_from('<Q', data, 9)[0]
     private = b'\x80' + struct.pack('<Q', 5) + b'hello'
     (tmp_path / 'b.mcap').write_bytes(data[:head] + private + data[head:])
     assert read(tmp_path / 'b.mcap') == expected(content)
@@ -124,7 +125,8 @@ def test_only_files_of_the_directory_itself_are_read(bag, tmp_path):
 def test_a_bag_that_was_split_is_read_in_order(tmp_path, content):
     bag = tmp_path / 'bag'
     samples.write_ours(bag, content)
-    # The times of the two files overlap, as if the recorder had split while messages waited.
+    # The times of both files overlap, as if messages had been waiting when the recorder began the
+    # second file.
     samples.write_mcap(bag / 'a.mcap', content[:20] + content[30:40])
     samples.write_mcap(bag / 'b.mcap', content[20:30] + content[40:])
     change(bag, relative_file_paths=['b.mcap', 'a.mcap'])
@@ -149,7 +151,7 @@ def test_messages_are_ordered_by_time_and_equal_times_as_in_the_file(
     samples.write_mcap(tmp_path / 'a.mcap', disordered)
     in_order = sorted(disordered, key=lambda sample: sample.log_time)
     assert read(tmp_path / 'a.mcap') == expected(in_order)
-    # The order is not exact, because memory is bounded.
+    # A reader that may hold only a few messages returns them all, but not in exact order.
     monkeypatch.setattr(reader, 'MOST_HELD', 1000)
     assert sorted(read(tmp_path / 'a.mcap')) == sorted(expected(disordered))
 

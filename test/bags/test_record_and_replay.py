@@ -59,7 +59,7 @@ def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
         assert 'Traceback' not in output
     first = messages(tmp_path / 'first', '/left_arm')
     second = messages(tmp_path / 'second', graph.namespace)
-    # DDS pads messages to whole words.
+    # DDS pads serialized messages with zeros to a multiple of four bytes.
     assert second == [(topic, data + bytes(-len(data) % 4)) for topic, data in first]
     assert messages(tmp_path / 'third', graph.namespace) == second
 
@@ -107,14 +107,14 @@ def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
     assert match, output
     bag = Bag.open(tmp_path / 'bag')
     assert bag.start == bag.end == 1000 * 10**9
-    # A busy recorder may receive the clock late, and miss some messages.
+    # 31 messages were sent. A busy recorder may receive /clock late, or miss some messages.
     assert 2 <= bag.message_count <= 31 - int(match[1]), output
 
 
 def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp_path):
     wanted = 'anomaly,muscle_states'
     recorder = record(tool, graph, tmp_path / 'bag', '--topics', wanted)
-    graph.publisher(Float64MultiArray, 'muscle_states')  # waits for the recorder
+    graph.publisher(Float64MultiArray, 'muscle_states')  # returns when the recorder has subscribed
     graph.spin(1.0)
     output, ns = recorder.end(signal.SIGINT), graph.namespace
     assert re.search('^0 messages recorded to .*, 0 lost$', output, re.MULTILINE)
@@ -127,7 +127,7 @@ def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp
 @pytest.mark.parametrize('is_late', [False, True])
 def test_a_publisher_that_offers_less_than_usual_is_recorded(tool, graph, tmp_path, is_late):
     topics = {'muscle_states': Float64MultiArray, 'isolated_muscles': String}
-    qos = {  # unreliable, and not latched
+    qos = {  # the usual publishers are reliable, and that of isolated_muscles is latched
         'muscle_states': QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT),
         'isolated_muscles': QoSProfile(depth=5),
     }
@@ -165,7 +165,8 @@ def test_messages_that_a_recorder_misses_are_counted(tool, graph, tmp_path):
     recorder = record(tool, graph, tmp_path / 'bag', '--topics', 'muscle_states')
     publisher = graph.publisher(Float64MultiArray, 'muscle_states', QoSProfile(depth=1))
     topic, count = f'{graph.namespace}/muscle_states', 0
-    large = Float64MultiArray(data=array('d', bytes(8 * 6000)))  # no socket holds 200 of these
+    # A burst of 200 of these messages overflows the buffer of a socket.
+    large = Float64MultiArray(data=array('d', bytes(8 * 6000)))
 
     def publish():
         nonlocal count
@@ -192,7 +193,7 @@ def test_messages_that_a_recorder_misses_are_counted(tool, graph, tmp_path):
     assert f', {lost} lost' in output
     text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
     assert f"lost messages of {topic}: '{lost}'" in text
-    with AnyReader([tmp_path / 'bag']) as reader:  # a reader that others wrote
+    with AnyReader([tmp_path / 'bag']) as reader:  # the reader of the library rosbags
         assert reader.message_count == kept
 
 
@@ -222,7 +223,9 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
     assert not graph.call(Trigger, 'replay/step').success
     length = content[-1].log_time - content[0].log_time
 
-    def has_looped():  # a busy machine may miss the last or first messages of a lap
+    # The clock need not go back by the whole length, because on a busy machine its first or last
+    # messages of a lap may be missing.
+    def has_looped():
         times = [c.clock.sec * 10**9 + c.clock.nanosec for c in clock]
         return np.diff(times).min() < -0.9 * length
 
@@ -233,7 +236,7 @@ def test_a_paused_replay_steps_resumes_and_loops_its_clock(tool, graph, tmp_path
 
 
 def test_a_replay_publishes_its_position_and_follows_requests(tool, graph, tmp_path):
-    start = 0.25  # share of the recording
+    start = 0.25  # start of the replay, as a share of the recording
     samples.write_ours(tmp_path / 'bag', samples.samples(252, ''), 'zstd', finish=True)
     length = (Bag.open(tmp_path / 'bag').end - Bag.open(tmp_path / 'bag').start) / 1e9
     positions = graph.listen(Float64MultiArray, 'replay/position')
@@ -241,7 +244,7 @@ def test_a_replay_publishes_its_position_and_follows_requests(tool, graph, tmp_p
     begin = '--start', str(start * length)
     tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *begin, *ros(graph))
     graph.wait(lambda: positions, 'where it is')
-    where, whole = read_array(positions[-1], 1, 2)  # as the page's timeline does
+    where, whole = read_array(positions[-1], 1, 2)  # the timeline of the page reads it like this
     assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
     graph.wait(lambda: graph.report('replay').message == 'paused', 'its diagnostics')
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)

@@ -74,7 +74,7 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     arm.add('/muscle_states', ARRAY, 0.0051, array(bad))
     arm.add('/muscle_states', ARRAY, 0.0052, array(bad[1:]))
     arm.add('/joint_states', JOINTS, 0.0053, joints(['other'], [0.0]))
-    # Joints of another arm on the same topic, and any order, are legal.
+    # A message may also name joints of another arm, and its joints may have any order.
     names = ['other', *reversed(robot.joints)]
     arm.add('/joint_states', JOINTS, 0.0054, joints(names, [9.0, *arm.theta[0, ::-1]]))
     result = streams(arm, robot, tmp_path)
@@ -113,7 +113,8 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
         rows = [arm.length[i // 2], arm.tension[i // 2].copy(), np.full(count, 30.0)]
         rows[1][lost] = np.nan
         arm.content[i] = arm.content[i]._replace(data=array(rows))
-    arm.add('/isolated_muscles', STRING, 0.501, string(first))  # a latched message may arrive late
+    # The first message arrives after the first muscle states, as a latched message may.
+    arm.add('/isolated_muscles', STRING, 0.501, string(first))
     arm.add('/isolated_muscles', STRING, 0.999, string(second))
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
@@ -122,7 +123,8 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
     assert (pairs.tension[:100, 0] == 0.0).all() and (pairs.tension[100:, 1] == 0.0).all()
     assert_array_equal(pairs.tension[:100, 1:], arm.tension[:100, 1:])
     swapped = pairs._replace(length=pairs.length[:, [1, 0, *range(2, count)]])
-    assert misplaced_muscles(swapped, robot) == []  # too little data
+    # Muscles that were isolated at any time are not compared, so no column counts as misplaced.
+    assert misplaced_muscles(swapped, robot) == []
 
 
 def test_isolated_muscles_are_unknown_if_the_bag_does_not_contain_them(arm, robot, tmp_path):
@@ -138,7 +140,7 @@ def test_some_joint_sensors_will_do(robot, tmp_path):
     pairs = streams(arm, robot, tmp_path).pairs()
     assert_array_equal(pairs.theta[:, 1:], arm.theta[:, 1:])
     assert np.isnan(pairs.theta[:, 0]).all()
-    assert misplaced_muscles(pairs, robot) == []  # too little data
+    assert misplaced_muscles(pairs, robot) == []  # the comparison requires all joint angles
 
 
 def test_a_message_that_was_sent_before_the_last_one_is_left_out(arm, robot, tmp_path):

@@ -33,7 +33,8 @@ def test_the_recorded_arm_was_moved_by_hand_and_repeated_the_motion():
     after = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     desired = np.array([point.positions for point in trajectory.points])
     assert np.ptp(desired, axis=0).max() > 0.3  # a hand moved the arm
-    # Joint sensors are the reference, because the network knows the geometric model only.
+    # Compare joint sensors: the arm's network knows the geometric model only, so its estimate is
+    # inaccurate.
     shown = truly(pushed[0] - 1.0), truly(pushed[-1] + 1.0)
     begun, ended = truly(sent + after[0]), truly(sent + after[-1])
     moved = np.linalg.norm(shown[1] - shown[0])
@@ -48,22 +49,23 @@ def test_the_recorded_arm_lost_a_muscle_moved_on_and_used_it_again():
     noticed, detected = series(bag, '/anomaly_detected')
     assert [message.data for message in detected] == [False, True, False]
     times, states = series(bag, '/muscle_states')
-    tension = np.array([message.data[10] for message in states])  # of the first muscle
+    tension = np.array([message.data[10] for message in states])  # T of the first muscle [N]
     assert (tension[(times > at[1]) & (times < noticed[2])] < 3.0).all()
     assert tension[times > at[2]].max() > 100.0
     (sent,), (target,) = series(bag, '/target_joint_states')
     assert noticed[2] < sent < at[2]
     times, states = series(bag, '/joint_states')
     where = np.array([state.position for state in states])[np.searchsorted(times, sent + 8.0)]
-    assert np.linalg.norm(where - target.position) < 0.3  # by the network of the geometric model
+    # The arm misses the target a little, because its network knows the geometric model only.
+    assert np.linalg.norm(where - target.position) < 0.3
 
 
 def test_the_recorded_second_body_was_explored_until_a_muscle_pulled_too_much():
     bag = Bag.open(BAGS / 'foreign')
     times, states = series(bag, '/muscle_states')
     tension = np.array([message.data[10:20] for message in states])
-    stopped = times[tension[:, 7] > 350.0][-1]  # of triceps_brachii
+    stopped = times[tension[:, 7] > 350.0][-1]  # muscle 7 is triceps_brachii
     _, states = series(bag, '/joint_states')
     moved = np.ptp([state.position for state in states], axis=0)
     assert moved.min() > 0.3 and stopped - times[0] > 150.0
-    assert (tension[times > stopped + 10.0] < 50.0).all()  # paid out to T_bias
+    assert (tension[times > stopped + 10.0] < 50.0).all()  # all muscles are paid out to T_bias

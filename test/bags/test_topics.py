@@ -17,7 +17,8 @@ from musculoskeletal_ae.bags.topics import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-# doc/reference/topics_and_services.md, Bags.
+# The section "Bags" of doc/reference/topics_and_services.md lists these topics as recorded by
+# default, and those in LEFT_OUT as not recorded.
 DEFAULT = {
     'joint_states',
     'muscle_states',
@@ -33,7 +34,7 @@ DEFAULT = {
     'sim/external_wrench',
     'sim/fixed_joint_states',
 }
-LEFT_OUT = {'estimated/markers', 'muscle_joint_states'}  # the same
+LEFT_OUT = {'estimated/markers', 'muscle_joint_states'}
 STRING = 'std_msgs/msg/String'
 
 

@@ -23,7 +23,8 @@ from musculoskeletal_ae.nodes.messages import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures('both_cores')
-INITIAL, LEARNED = range(2), range(5, 1000)  # numbers of checkpoints
+#: numbers of checkpoints before learning has an effect, and after
+INITIAL, LEARNED = range(2), range(5, 1000)
 STATUS = re.compile(
     r'^ *\d+ s  error (?P<error>\d+\.\d+) rad  A (?P<a>\d+\.\d+)  '
     r'samples (?P<samples>\d+)  checkpoints (?P<checkpoints>\d+)'
@@ -40,7 +41,7 @@ def environment(tmp_path_factory, trained_file):
 
 def bringup(environment, *arguments):
     command = [str(REPOSITORY / 'bringup.sh'), *arguments]
-    if 'arm26' in arguments:  # the network of another robot has to be trained
+    if 'arm26' in arguments:  # the shared test network is one of arm26
         command += ['--checkpoint', environment['TRAINED']]
     return Process('bringup.sh', command, env=environment, start_new_session=True)
 
@@ -115,10 +116,10 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     robot = tmp_path / '.own'
     import_robot(model, robot)
     model.write_text(bodies.MJCF.replace('range="-1.8 0.2"', 'range="-1.5 0.2"'), encoding='utf-8')
-    # The paper's network is trained in a few seconds.
+    # Training the network of preset `paper` takes only a few seconds.
     chosen = ['--robot', str(robot), '--preset', 'paper', '--no-learner']
 
-    # Shown to the network on request, and killed.
+    # Option --network keeps the discovery range of the environment. SIGKILL leaves no process.
     shown = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
     run = bringup(shown, *chosen, '--reality', str(model), '--network')
     reported = f"-- reality {model}: joint 'elbow' moves from -1.5 to 0.2 there"
@@ -135,8 +136,9 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
     assert re.search(r'^-- record: \d+ messages recorded to .*, \d+ lost$', output, re.MULTILINE)
     lines = statuses(output)
-    assert lines, output  # on a busy machine, sensor data arrive late
-    # Seeds 0 to 4: 0.08 to 0.30 rad. The middle of the joint range would be 0.58 rad off.
+    assert lines, output  # their number depends on how busy the machine is
+    # Measured with seeds 0 to 4: 0.08 to 0.30 rad. A constant estimate in the middle of the joint
+    # range would have an error of 0.58 rad.
     assert np.median([float(line['error']) for line in lines]) < 0.45
     assert all(0.0 < float(line['a']) < 2.0 for line in lines)
     assert left_behind(run) == ''
@@ -144,16 +146,16 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     played = bringup(environment, *chosen, '--bag', str(recording))
     _, output = played.ended()
     assert played.process.returncode == 0, output
-    assert statuses(output), output  # on a busy machine, the replay is over soon after the first
+    assert statuses(output), output  # on a busy machine, the replay may end after the first line
     assert 'hardware_emulator' not in output and 'controller' not in output
     assert left_behind(played) == ''
 
 
 def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(environment, tmp_path):
-    # A sourced Jazzy exports SUBNET.
+    # A sourced ROS 2 Jazzy sets this variable to SUBNET.
     environment = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
     file = tmp_path / 'my.yaml'
-    # An option of bringup.sh sets max_age too.
+    # bringup.sh also sets max_age, but the value in this file has to take precedence.
     file.write_text('/**: {ros__parameters: {max_age: 3.0, hold_time: 3.0}}')
     options = ['--params-file', str(file), '-p', 'controller:hold_time:=4.0']
     left = bringup(environment, '--robot', 'arm26', '--namespace', 'left_arm', *options)
@@ -175,9 +177,10 @@ def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(env
         status, output = graph.ended(right, signal.SIGINT)
         assert status == 130 and 'Traceback' not in output, output
         assert left_behind(right) == ''
-        # An emulated arm stays on this machine.
+        # Without --network, the nodes of an emulated arm communicate on this machine only.
         assert set(reaches(left)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'}
-        # Parameters of a file and of the command line take precedence.
+        # Parameters in the user's file and on the command line take precedence over those that
+        # bringup.sh sets.
         request = GetParameters.Request(names=['max_age', 'hold_time', 'explore'])
         values = graph.call(GetParameters, '/left_arm/controller/get_parameters', request).values
         assert (values[0].double_value, values[1].double_value) == (3.0, 4.0)
@@ -192,7 +195,8 @@ def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(env
         graph.close()
     assert status == 130 and 'Traceback' not in output, output
     before, after = errors(output, INITIAL), errors(output, LEARNED)
-    # Over seeds and runs 0.05 to 0.13 rad fall to a tenth or a third of that within 20 s.
+    # Measured over seeds and runs: an error of 0.05 to 0.13 rad falls to between a tenth and a
+    # third of that within 20 s.
     assert np.mean(after) < 0.7 * np.mean(before), output
     assert left_behind(left) == ''
 
@@ -226,7 +230,7 @@ def test_a_ruptured_muscle_is_detected_and_a_dead_node_named(environment):
     os.kill(int(victim.split()[0]), signal.SIGKILL)
     _, output = run.ended()
     assert run.process.returncode == 1
-    # The end of the log of that node is printed.
+    # After the status, bringup.sh prints the end of the estimator's log.
     assert 'brachialis' in output.rpartition('estimator ended with status')[2], output
     assert left_behind(run) == ''
 
@@ -279,4 +283,4 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_its_namespace_
     assert 'the driver keeps its contract' in transcript + output
     assert status == 130 and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
-    assert kept.is_dir()  # it is kept for the next run
+    assert kept.is_dir()  # what was learned of a real arm is kept for the next run

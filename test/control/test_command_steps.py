@@ -50,7 +50,7 @@ class Arm(RuleBasedStateMachine):
         self.core.target(dict(zip(ROBOT.joints, ((0.0, 0.0),) * ROBOT.joint_count)))
         if explores:
             self.core.explore(True)
-        #: kind, published value and time of the last command, and of the last length command
+        #: last command, and last length command: kind, published value and time of each
         self.last = self.last_length = None
         self.has_stopped = False
 
@@ -112,7 +112,7 @@ class Arm(RuleBasedStateMachine):
     def demand(kind, value, length):
         return value if kind == TENSION else ROBOT.actuation.demanded(length, value)
 
-    # -- what happens ---------------------------------------------------------------------------
+    # -- events ---------------------------------------------------------------------------------
 
     @rule(theta=POSTURES)
     def target(self, theta):

@@ -83,7 +83,8 @@ def test_second_runs_after_first_and_reads_the_tension_once():
     done = bench.step(200)[-1].value
     wanted = ROBOT.muscle_lengths(REST, bench.tension) - 50.0 / ROBOT.stiffness
     np.testing.assert_allclose(done, wanted, atol=1e-9)
-    # The held target is solved again for a new network, with the measured tension.
+    # For a new network, the controller computes the lengths of the held target again. It uses the
+    # tension that was measured when the target was reached, not the present one.
     bench.tension = np.full(ROBOT.muscle_count, 150.0)
     bench.core.use(shifted())
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted + 0.01, atol=1e-9)
@@ -310,7 +311,7 @@ def test_a_stop_is_reported_with_every_cause_that_refuses_the_reset():
     bench = Bench()
     bench.core.stop(StopCause.OPERATOR)
     bench.core.watchdog.second_publisher = 'two estimators'
-    bench.now += 10.0  # nothing is received
+    bench.now += 10.0  # no message arrives in this time
     reported = bench.report()
     assert reported.values['stop cause'] == 'operator_stop'
     assert 'also several publishers: two estimators; also muscle_states' in reported.message
@@ -326,7 +327,7 @@ def test_after_a_stop_of_the_exploration_the_remedy_ends_with_exploring_again(si
     bench = Bench(max_age=0.2, hold_time=0.5)
     bench.core.explore(True)
     bench.step(50)
-    if silent:  # an auto-recoverable cause, which becomes latched when the arm is released
+    if silent:  # stale data are an auto-recoverable cause, until the arm has been released
         bench.blind = {'muscles'}
         bench.step(80)
         assert bench.cause == 'stale_muscle_states'
@@ -341,7 +342,7 @@ def test_a_new_network_keeps_the_correction_of_rest_feedback():
     bench = Bench(first_duration=0.5)
     bench.target(REST)
     bench.step(50)
-    bench.theta = REST + 0.05  # friction keeps the arm off its target
+    bench.theta = REST + 0.05  # the arm rests beside its target, as friction may cause
     bench.step(1000)
     correction = bench.core.activities.follower.feedback.correction.copy()
     assert np.abs(correction).max() > 0.02
@@ -356,7 +357,7 @@ def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
     bench.target(REST)
     bench.step(200)
-    if chosen['method'] == 'stiffness':  # this method uses tensions above T_bias
+    if chosen['method'] == 'stiffness':  # measure the tensions that this method demands
         bench.tension = bench.core.activities.follower.tension
     still = bench.step(200)[-1].value
     bench.theta = REST + 0.05

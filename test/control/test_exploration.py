@@ -49,8 +49,8 @@ def test_every_explored_posture_can_be_held_and_lies_within_the_joint_limits(pre
 def test_joints_are_sent_to_their_limits_at_the_given_rate_and_pressed_there():
     asked = steps(2, 300, 'default')[2::3]
     way = np.array([(s.theta == ROBOT.upper) * 1.0 - (s.theta == ROBOT.lower) for s in asked])
-    # Fewer postures at joint limits are holdable, and only 200 targets were drawn: hence the
-    # tolerance.
+    # The tolerance is large, because only 200 targets were drawn, and postures at joint limits are
+    # less often holdable than others.
     assert 0.12 < np.abs(way).mean() < 0.38
     assert {*np.unique(way)} == {-1.0, 0.0, 1.0}
     mean = 0.5 * (BIAS + LIMIT)
@@ -58,7 +58,7 @@ def test_joints_are_sent_to_their_limits_at_the_given_rate_and_pressed_there():
         if np.abs(side).sum() == 1.0:
             jacobian = ROBOT.routes.muscle_jacobian(step.theta)
             assert ((step.tension >= BIAS) & (step.tension <= LIMIT)).all()
-            # presses more than the mean tension
+            # The tensions press the joint towards its limit more than equal tensions would.
             assert side @ (jacobian.T @ (mean - step.tension)) > 0.0
     never = steps(2, 300)
     assert not any(((s.theta == ROBOT.upper) | (s.theta == ROBOT.lower)).any() for s in never)
@@ -71,7 +71,7 @@ def test_holdable_postures_are_held_by_their_tensions_on_an_individual_too():
         exerted = -individual.muscle_jacobian(theta[None])[0].T @ tension
         np.testing.assert_allclose(exerted, ROBOT.kinematics.holding_torque(theta), atol=1e-6)
         assert ((tension > BIAS - 1e-6) & (tension < LIMIT + 1e-6)).all()
-        holding_tension(ROBOT, theta)  # the geometric model can hold the posture as well
+        holding_tension(ROBOT, theta)  # raises if the geometric model cannot hold the posture
 
 
 def test_a_seed_determines_the_stream_of_exploration():

@@ -63,7 +63,7 @@ class Loop:
             states = read_muscle_states(message, ROBOT.muscle_count)
             if self.has_joint_sensors:
                 self.estimator.joints(reading.theta, self.now)
-            # Each node has its own stream.
+            # Controller and estimator each check the message. One may reject it, the other not.
             for take in (self.control, self.estimate):
                 with suppress(MessageError):
                     take(states)
@@ -102,7 +102,7 @@ def loop(settled):
     return copy.deepcopy(settled)
 
 
-#: part of the stop cause under each fault; '' if the arm continues
+#: part of the stop cause under each fault; '' if the arm must continue, None if it may stop
 PROMISES = {
     'drop:0.5': '',
     'drop:1': 'older than',
@@ -115,7 +115,7 @@ PROMISES = {
     f'bias:length:{MUSCLE}:0.3': 'muscle_states',
     f'bias:tension:{MUSCLE}:400': 'overload: tension of',
     f'bias:temperature:{MUSCLE}:90': 'overheated',
-    f'overheat:{MUSCLE}': '',  # the module then exerts T_bias only
+    f'overheat:{MUSCLE}': '',  # the module protects itself: it exerts T_bias only
     f'overheat:{MUSCLE}:120': 'overheated',
     f'freeze:{MUSCLE}': None,
     'freeze': None,
@@ -125,7 +125,7 @@ PROMISES = {
     f'stuck_motor:{MUSCLE}': None,
     f'slack:{MUSCLE}': None,
     f'winch_speed:{MUSCLE}:0.009': None,
-    f'unzeroed:{MUSCLE}:0.1': 'length',  # implausible lengths, or a jump
+    f'unzeroed:{MUSCLE}:0.1': 'length',  # the cause is either an implausible length or a jump
 }
 
 
@@ -184,7 +184,7 @@ def test_the_services_of_a_length_calibration_may_follow_each_other_at_once(loop
     assert np.ptp(loop.commands[-200:], axis=0).max() > 0.005
     loop.estimator.calibrate_lengths()
     loop.controller.use_body(loop.estimator.body)
-    loop.estimate = lambda _: None  # the estimator hangs
+    loop.estimate = lambda _: None  # from now on, the estimator does not respond
     loop.run(7.0)
     assert 'estimated_joint_states are too old' in loop.cause
 

@@ -72,7 +72,7 @@ def test_relief_pays_out_antagonists_and_exerts_no_torque(robot):
         steps += 1
     assert steps * DT <= RELIEF_INTERVAL + 2 * DT
     change = feedback.relief - before
-    # The arm came to rest at the first step.
+    # The relief covers one more step than this loop counted: the arm was at rest before it.
     expected = GAIN * (steps + 1) * DT * (needless - holding(robot)) / robot.stiffness
     assert change == pytest.approx(expected, abs=1e-9)
     assert jacobian(robot).T @ change == pytest.approx(np.zeros(robot.joint_count), abs=1e-9)
@@ -86,7 +86,7 @@ def test_tension_that_friction_keeps_in_a_tendon_after_winding_in_is_paid_out(ro
     motor = least * np.exp(wound)
     for _ in range(20):
         step(feedback, robot, np.zeros(robot.joint_count), least, motor=motor)
-    if wound < 0.0:  # friction holds the arm, and winding in would increase the tension
+    if wound < 0.0:  # after paying out, a correction would have to wind in, and is not made
         assert feedback.relief == pytest.approx(np.zeros(robot.muscle_count), abs=1e-9)
     else:
         assert (feedback.relief > 0.0).all()

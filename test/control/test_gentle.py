@@ -76,7 +76,7 @@ def test_exploration_without_length_offsets_moves_the_arm_slowly_and_with_low_te
     assert not loop.core.supervisor.condition
     assert np.ptp(observed, axis=0).min() > 0.3
     speed = np.abs(np.diff(loop.commands, axis=0)) / DT
-    # Only paying out is faster, which keeps tensions below their limit.
+    # Few commands are faster: they pay out a muscle to keep its tension below the limit.
     assert np.quantile(speed, 0.99) < 1.2 * SPEED
     assert max(loop.pulls) < gentle_limit(loop.arm.robot)[0] + 30.0
 
@@ -87,7 +87,7 @@ def test_new_length_offsets_do_not_move_the_arm(loop):
     loop.run(1.0)
     before = loop.commands[-1]
     loop.know(loop.offset)
-    # An estimate may arrive before the next lengths.
+    # The controller may compute a command with the new offsets before it receives new lengths.
     assert np.abs(loop.sent(loop.core.step(loop.now)) - before).max() < 0.002
     loop.run(DT)
     assert np.abs(loop.commands[-1] - before).max() < 0.002

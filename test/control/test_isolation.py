@@ -51,7 +51,7 @@ NOT_THERE = next(theta for theta in POSTURES if not held(theta))
 @pytest.mark.parametrize('method', METHODS)
 def test_no_method_commands_tension_of_an_isolated_muscle(method, duration):
     bench = Bench(method=method, first_duration=1.0, second_duration=0.5, target_duration=duration)
-    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # the isolated muscle has tension, too
+    bench.tension = np.full(ROBOT.muscle_count, 60.0)  # also of the isolated muscle
     bench.isolate([LOST])
     if method != 'float':
         bench.theta = THERE
@@ -122,7 +122,7 @@ def test_the_arm_stops_when_all_remaining_muscles_are_overheated():
     bench.target(REST)
     bench.step(10)
     bench.temperature = np.where(USED, bench.core.settings.temperature_limit + 10.0, 30.0)
-    bench.step(500)  # a jump of temperature is not accepted at once
+    bench.step(500)  # the controller accepts a jump of temperature only if it lasts
     assert bench.condition.startswith('overheated')
 
 
@@ -301,7 +301,7 @@ class VerificationBench(Bench):
 def test_a_suspect_is_wound_in_gently_during_verification_and_the_arm_goes_on_afterwards():
     bench = VerificationBench()
     before = bench.wound(round((bench.core.settings.hold_time + PAYING_OUT) / 0.01) - 2)
-    assert (np.diff(before) >= 0.0).all()  # the muscle is only paid out
+    assert (np.diff(before) >= 0.0).all()  # until the verification begins, it is only paid out
     after = bench.wound(100)
     assert np.diff(after).min() >= -0.02 * 0.01 - 1e-12
     fell = before[-1] - after[-1]
@@ -320,7 +320,7 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
     bench = VerificationBench()
     bench.step(50)
     length, tension = rest_readings(ROBOT, REST)
-    for _ in range(50):  # messages have stopped
+    for _ in range(50):  # the estimator sends nothing, while muscle_states continue
         bench.now += 0.01
         bench.core.muscles(np.array([length, tension, np.full(6, 30.0)]), bench.now)
         bench.core.step(bench.now)
@@ -363,7 +363,7 @@ def test_a_requested_stop_outlasts_a_verification(first):
 def test_the_end_of_an_anomaly_without_a_suspect_does_not_end_the_stop():
     bench = Bench()
     bench.target(REST)
-    bench.isolate([LOST])  # long before the anomaly
+    bench.isolate([LOST])  # this muscle is isolated long before the anomaly, so it is no suspect
     bench.step(150)
     bench.core.anomaly(True)
     lengths = bench.step(300)[-1].value
@@ -377,7 +377,8 @@ def test_exploration_resumes_after_the_suspect_was_verified():
     bench = Bench()
     bench.core.explore(True)
     bench.step(20)
-    bench.core.anomaly(True)  # the two messages may arrive in either order
+    # In the other tests, the isolation arrives before the anomaly. Both orders are legal.
+    bench.core.anomaly(True)
     bench.isolate([0])
     bench.step(300)
     bench.isolate([])  # the estimator restores the suspect as healthy

@@ -39,7 +39,7 @@ def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_h
     limiter, before = CommandLimiter(ROBOT, Settings(rate_limit=rate)), None
     for desired, length, limit in commands:
         pull = np.full(COUNT, BIAS)
-        if before is not None:  # muscle stiffness control obeys the last command
+        if before is not None:  # tensions follow from the last command by muscle stiffness control
             pull += np.maximum(0.0, ROBOT.stiffness * (length - before))
         now = sample(length, pull)
         if before is None:
@@ -49,7 +49,8 @@ def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_h
         demanded = BIAS + np.maximum(0.0, ROBOT.stiffness * (length - sent))
         tense = pull > ROBOT.tension.limit
         assert (demanded <= np.minimum(limit, ROBOT.tension.limit) + 1e-6)[tense].all()
-        # The tension limit may pay out faster, but not beyond the measured length.
+        # A muscle above its tension limit may be paid out faster than the rate limit allows, but
+        # not beyond its measured length.
         assert ((sent - before)[~tense] <= rate * DT + 1e-12).all()
         assert (sent <= np.maximum(before + rate * DT, length) + 1e-12).all()
         before = sent

@@ -154,7 +154,8 @@ def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(
     assert held.max() > 1.5 * ROBOT.tension.bias[0]
     bench.now += 2.0
     moved(bench, 200)
-    # The tolerance covers the unknown tendon friction.
+    # The arm has come to rest. Its tensions may differ by the tendon friction, whose direction is
+    # unknown at rest.
     np.testing.assert_allclose(bench.core.activities.follower.tension, held, rtol=0.25)
 
 
@@ -288,7 +289,8 @@ def test_a_desired_stiffness_is_kept_during_a_trajectory_and_at_its_end(bench):
 
 
 def test_sudden_changes_of_planned_tension_slow_a_trajectory_little():
-    # Near the limits of holdability, tensions change suddenly even in slow motion.
+    # Near postures that the muscles cannot hold, planned tensions change suddenly even in a slow
+    # motion.
     mae, chosen, slowed = Bench().mae, Settings(), []
     postures = ROBOT.random_postures(60, np.random.default_rng(0))
     bias = np.tile(ROBOT.tension.bias, (100, 1))
@@ -298,7 +300,8 @@ def test_sudden_changes_of_planned_tension_slow_a_trajectory_little():
         way = np.abs(np.diff(mae.lengths(theta, bias), axis=0)).sum(axis=0).max()
         fastest = PEAK_SPEED * way / (SHARE * chosen.rate_limit)
         slowed.append(slowness(ROBOT, mae, trajectory, chosen) / max(1.0, fastest / 0.5))
-    # The speed of a tendon may peak at another time than that of the joints.
+    # `fastest` assumes that every tendon is fastest in the middle of the motion, which is not
+    # exact.
     assert 0.9 < min(slowed) <= max(slowed) < 1.5
 
 
@@ -319,12 +322,13 @@ def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
         demanded = np.clip(ROBOT.actuation.demanded(length, command.value), 0.0, ROBOT.tension.max)
         bench.tension = pull = pull + 0.3 * (demanded - pull)
         highest = max(highest, (pull - ROBOT.tension.limit).max())
-    assert -20.0 < highest < 5.0  # [N]
+    assert -20.0 < highest < 5.0  # highest tension relative to its limit [N]
     assert bench.cause == ''
 
 
 def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch):
-    # It starts in motion; slowed for slow winches, its path would leave the joint limits.
+    # The trajectory starts at a speed. When it is slowed for slow winches, the arm takes longer to
+    # brake, and overshoots the joint limits.
     bench = Bench(rate_limit=0.05)
     start = Setpoint(np.array([0.5, -0.5]), np.array([-1.4, 1.8]), np.zeros(2))
     Trajectory.through(start, points((-0.8, -1.1), 0.3), 0.0).check(ROBOT)
@@ -374,7 +378,7 @@ def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(be
 def test_a_hand_pose_that_the_muscles_cannot_hold_is_refused(bench, monkeypatch):
     strong, half = bench.mae.muscle_jacobian, 0.5 * np.abs(OTHER - REST)
 
-    def weak(theta, tension):  # in the second half of the motion
+    def weak(theta, tension):  # without moment arms in the second half of the motion
         return strong(theta, tension) * (np.abs(theta - REST) < half).all()
 
     monkeypatch.setattr(bench.mae, 'muscle_jacobian', weak, raising=False)
@@ -400,7 +404,7 @@ def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
         bench.core.activities.follower.desired.theta
     ).translation
     assert np.linalg.norm(at - wanted) < 0.006
-    moved(bench, 150)  # no other twist arrives
+    moved(bench, 150)  # no other twist arrives, so the last one times out
     assert not bench.core.activities.follower.is_moving
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(
@@ -436,7 +440,8 @@ def test_the_duration_to_the_nearest_posture_does_not_grow_with_an_unreachable_d
 
 
 def test_a_long_trajectory_is_slowed_as_a_short_one_is(bench):
-    theta = np.vstack([REST, np.tile([OTHER, REST], (3, 1))])  # waits, then moves
+    # The arm waits at REST until the time `late`, and then moves to OTHER and back three times.
+    theta = np.vstack([REST, np.tile([OTHER, REST], (3, 1))])
     slowed, still = [], np.zeros_like(theta)
     for late in (0.0, 500.0):
         points = Points(np.array([0, 1]), late + 0.3 * np.arange(1.0, 8.0), theta, still, still)

@@ -49,8 +49,8 @@ def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_w
         now = sample(length, tension, ROBOT)
         before = limiter.last(LENGTH, now).value
         sent = limiter.limit(Command(LENGTH, desired), now, limit, DT).value
-        # The speed of the modules limits the commands as well. Only a muscle above T_limit is paid
-        # out faster.
+        # No command changes faster than the modules move, except that a muscle above T_limit is
+        # paid out faster.
         is_tense = tension > LIMIT
         assert (sent - before >= -SPEED_DEFAULT * DT - 1e-12).all()
         assert ((sent - before)[~is_tense] <= SPEED_DEFAULT * DT + 1e-12).all()
@@ -68,7 +68,7 @@ def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hi
         tension = end * np.exp(friction * sliding)
         tensions.append(tension / LIMIT)
         readings.append(replace(sample(length, tension, ROBOT), time=n * DT))
-        now = readings[max(0, n - 3)]  # 30 ms old
+        now = readings[max(0, n - 3)]  # readings arrive with a delay of 30 ms
         goal = limiter.limit(Command(LENGTH, np.full(COUNT, -0.05)), now, LIMIT, DT).value
         moved = np.clip(goal - length, -SPEED_DEFAULT * DT, SPEED_DEFAULT * DT)
         sliding = slid(sliding, -np.sign(moved), moved)
@@ -89,8 +89,10 @@ def test_a_motor_current_that_reads_too_little_does_not_lead_to_too_much_tension
         goal = limiter.limit(Command(LENGTH, np.full(COUNT, -0.1)), now, LIMIT, DT).value
         tension, length = pull_in_this_posture(length, tension, goal), goal
         highest = max(highest, (tension / LIMIT).max())
-    assert 0.6 < highest < 1.0  # it would be 1.4 without the uncertainty of the current
-    assert (tension > 0.6 * LIMIT).all()  # and the muscle stays usable
+    # If the limiter ignored the uncertainty of the current, the highest tension would be
+    # 1.4 T_limit. If it were too cautious, the muscle would be too weak.
+    assert 0.6 < highest < 1.0
+    assert (tension > 0.6 * LIMIT).all()
 
 
 def test_a_desired_tension_becomes_a_length_command_towards_it():
@@ -123,12 +125,12 @@ def test_a_stop_holds_and_then_pays_out_until_the_measured_tension_is_the_bias()
 
     sent = stopped(now, 200, settings=Settings(hold_time=0.2))
     assert (sent[15] == 0.0).all()
-    assert np.diff(sent, axis=0).min() >= 0.0  # nothing is wound in
+    assert np.diff(sent, axis=0).min() >= 0.0  # no muscle is wound in
     assert np.diff(sent, axis=0).max() <= SPEED_DEFAULT * DT + 1e-12
     left = pull_in_this_posture(0.0, np.full(COUNT, 150.0), sent[-1])
     np.testing.assert_allclose(left, BIAS, atol=3.0)
     is_slack = stopped(lambda _, command: sample(command, 5.0, ROBOT), 50)
-    assert (is_slack == 0.0).all()  # a tendon without tension is not moved
+    assert (is_slack == 0.0).all()  # tendons below T_bias are not moved
 
 
 def test_without_a_known_tension_a_stop_pays_out_the_stated_length():
@@ -185,12 +187,12 @@ def test_every_method_moves_the_arm_and_keeps_it_within_its_tensions(loops, meth
     loop = loops[method]
     assert loop.core.supervisor.is_running
     assert loop.core.limiter.command.kind == LENGTH
-    # Gravity compensation holds the present posture, away from the stop of the elbow.
+    # Gravity compensation has no target. The arm stays near the posture in which it began.
     goal, near = (THETA, 0.1) if method != 'float' else (np.zeros(2), 0.15)
     assert np.abs(loop.arm.theta - goal).max() < near
     assert loop.arm.tension.max() < LIMIT[0]
     if method in ('proposed', 'stiffness'):
-        assert loop.arm.tension.min() > 0.5 * BIAS  # no tendon stays slack
+        assert loop.arm.tension.min() > 0.5 * BIAS  # no tendon is slack
 
 
 def test_gravity_compensation_follows_a_hand(loops):

@@ -35,8 +35,8 @@ def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
     jacobian = robot.routes.muscle_jacobian
     k = robot.muscle_stiffness(THETA, tension)
     true = joint_stiffness(jacobian(THETA), muscle_hessian(jacobian, THETA), k, tension)
-    # The remaining 1 % are the cubic approximation of the elongation, the stretch of the tendon and
-    # the finite difference of G.
+    # The model approximates the elongation by a cubic polynomial, neglects the stretch of the
+    # tendon and differentiates G numerically. Together these errors reach 1 %.
     np.testing.assert_allclose(model.joint_stiffness(tension), true, atol=0.01 * np.trace(true))
     np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
 
@@ -94,11 +94,12 @@ def test_torque_beyond_the_muscles_leaves_no_range_and_is_reported(robot, mae):
 def test_a_push_turns_the_nominal_arm_by_the_predicted_ratio(robot, mae):
     measured, predicted = stiffness_ratios(robot, mae, 3).T
     np.testing.assert_allclose(measured / predicted, 1.0, atol=0.05)
-    assert predicted.max() > 1.2  # the ratio is not trivially one
+    assert predicted.max() > 1.2  # a ratio of 1 would be a trivial prediction
 
 
 def test_a_push_turns_bodies_with_friction_by_about_the_predicted_ratio(robot, mae):
-    # The push is large compared with friction; single arms differ by 0.1 from the prediction.
+    # The push is much larger than friction. The ratio of a single arm still differs by 0.1 from the
+    # prediction, so this test compares the mean of four arms.
     arms = [EmulatedArm(robot, seed) for seed in range(4)]
     ratios = [stiffness_ratios(robot, mae, 2, arm, push=3.0)[1] for arm in arms]
     measured, predicted = np.mean(ratios, axis=0)

@@ -39,7 +39,7 @@ def test_every_latched_stop_outlives_a_kill_and_a_proper_end(tmp_path, cause):
     assert found(killed(arm)) is cause
     memory.close()
     assert found(arm) is cause
-    assert found(arm) is cause  # a controller that is started and ended does not end the stop
+    assert found(arm) is cause  # starting and ending a controller does not end the stop
 
 
 def test_a_killed_controller_counts_as_a_stop_and_a_proper_end_does_not(tmp_path):

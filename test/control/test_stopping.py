@@ -32,7 +32,7 @@ def test_it_holds_then_pays_out_to_the_measured_length_and_keeps_commanding():
     assert sent[8] == -0.012
     assert np.diff(sent).max() <= 0.001 + 1e-12
     assert np.diff(sent).min() >= 0.0
-    assert sent[-1] == 0.0  # MSC pulls with T_bias where command and length are equal
+    assert sent[-1] == 0.0  # the commanded length is the measured one, so MSC exerts only T_bias
 
 
 def test_with_stale_lengths_it_pays_out_to_the_longest_length_of_the_muscle():

@@ -47,7 +47,7 @@ def test_old_data_that_outlasts_the_hold_time_stops_the_arm_until_a_reset():
     wait(supervisor, seconds=10.0)
     assert supervisor.mode == 'stopped'
     assert supervisor.on_reset([]) is None
-    assert supervisor.mode == 'idle'  # exploration has no target to hold
+    assert supervisor.mode == 'idle'  # there is no target to hold, because the arm explored
 
 
 def test_a_reset_is_refused_with_the_cause_that_is_present():
@@ -63,7 +63,7 @@ def test_the_arm_explores_again_once_the_suspect_is_verified():
     supervisor.on_suspect(True)
     assert supervisor.mode == 'verifying'
     supervisor.on_verified()
-    wait(supervisor, ANOMALY, seconds=STEP)  # the cause is still present, so the arm does not move
+    wait(supervisor, ANOMALY, seconds=STEP)  # the anomaly has not ended yet
     assert not supervisor.is_running
 
 
@@ -102,7 +102,7 @@ class Arm(RuleBasedStateMachine):
         self.supervisor = Supervisor()
         self.present = []
         self.before = StopState.RUNNING
-        self.latched_by = set()  # latching causes since the stop began
+        self.latched_by = set()  # causes since the stop began that do not end by themselves
         self.may_start = True
 
     @rule(activity=st.sampled_from(list(Activity)))
@@ -168,14 +168,15 @@ class Arm(RuleBasedStateMachine):
     def check(self):
         supervisor = self.supervisor
         started = supervisor.is_running and self.before is not StopState.RUNNING
-        # A stop ends only by legal transitions, and a latched one by a reset or a verification.
+        # Only legal events end a stop. Without a reset, a stop ends (RESUMING) only if each of its
+        # latching causes ends by a verification.
         assert not started or self.may_start
         if supervisor.state is StopState.RESUMING:
             assert all(c.clears is Clears.VERIFICATION for c in self.latched_by)
-        # Every stop has one cause, with a remedy; a running arm has none.
+        # There is a cause exactly while the arm is stopped, and every cause has a remedy.
         assert (supervisor.condition is None) == supervisor.is_running
         assert supervisor.is_running or supervisor.condition.cause.remedy
-        # After a latched stop, the arm neither explores nor moves without a new request.
+        # A latched stop ends exploration and motion, which then need a new request.
         assert not (supervisor.is_latched and supervisor.activity is Activity.MOVING)
         assert not (supervisor.is_latched and supervisor.explores)
 

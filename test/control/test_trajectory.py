@@ -53,7 +53,8 @@ def test_a_slowed_trajectory_passes_its_points_with_scaled_derivatives(rows, ord
 
 
 def test_points_at_nearly_the_same_time_are_refused():
-    time = np.array([0.001, 3e5, 3e5 + 1e-9])  # doubles cannot resolve the last interval [s]
+    # The last interval is too short for double precision at such large times [s].
+    time = np.array([0.001, 3e5, 3e5 + 1e-9])
     points = Points(BOTH, time, np.array([MIDDLE, MIDDLE, MIDDLE + REACH]), None, None)
     with pytest.raises(MessageError, match='points too close in time'):
         Trajectory.through(Setpoint.resting(MIDDLE), points)

@@ -97,7 +97,7 @@ def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(ro
     assert cause in str(bench.core.reset(bench.now))
     steps = np.diff(values([before, *sent]), axis=0)
     assert steps.min() >= -TICK - 1e-9
-    # Only a muscle above its tension limit is paid out faster.
+    # A muscle above its tension limit may be paid out faster than the rate limit allows.
     assert 'above 220 N' in cause or steps.max() <= TICK + 1e-9
     bench.step(500)
     assert bench.core.reset(bench.now) is None
@@ -178,13 +178,13 @@ def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_t
     bench.pull(tension)
     tension[3] = 230.0
     bench.tension = tension
-    bench.step(3)  # until the median filter passes the new tensions
+    bench.step(3)  # the median filter needs three messages to pass the new tensions
     assert f'too much tension: {ROBOT.muscles[3]} (above 220 N)' in bench.report().message
     before = bench.step(round(OVERLOAD_TIME / DT) - 3)[-1]
     assert bench.cause == ''
     after = bench.step(10)
     assert bench.condition == f'overload: tension of {ROBOT.muscles[3]} above 220 N for 0.2 s'
-    assert (after[-1].value > before.value).any()  # the command is not held for hold_time
+    assert (after[-1].value > before.value).any()  # paying out does not wait for hold_time
     bench.tension = None
     bench.step(120)
     assert bench.core.reset(bench.now) is None
@@ -199,7 +199,7 @@ def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
     bench.core.explore(True)
     bench.step(50)
     bench.blind = {what}
-    held = bench.step(60)  # stale after 0.2 s, released after 0.7 s
+    held = bench.step(60)  # data are stale after 0.2 s; the arm would be released after 0.7 s
     assert 'older' in bench.condition
     assert bench.report().level == 'warn'
     assert len({tuple(command.value) for command in held[25:]}) == 1
@@ -230,14 +230,14 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
     bench.now += pause
     sent = bench.step(100)
     assert bench.cause == ''
-    # LONGEST_STEP is 10 steps
+    # After a pause, the controller reckons with LONGEST_STEP at most, which is 10 ticks.
     assert np.abs(values(sent)[0] - before.value).max() <= 10 * TICK + 1e-9
     assert pause > OWN_PAUSE
 
 
 @pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
 def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(pause):
-    """Messages that are read before the first step after the pause were too fresh by its length."""
+    """Messages read before the first step after the pause must not count as newer by its length."""
     bench = DistortingBench(max_age=0.2, hold_time=0.5)
     bench.step()
     bench.now += pause
@@ -256,7 +256,7 @@ def run(pace, gap=0.0, at=150, count=250):
     bench.target(OTHER)
     now, time, sent = 100.0, 5.0, []
     for k in range(count):
-        # no message arrives; only the watchdog steps
+        # During the gap no message arrives, and only the watchdog's timer steps the controller.
         for _ in range(round(gap / DT) if k == at else 0):
             now, time = now + DT, time + pace * DT
             sent.append(bench.core.step(now, time))

@@ -47,7 +47,7 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
     arm = make_arm(ROBOT, 0)
     read = arm.sense()
     assert np.isnan(read.tension).all()
-    # without a tension source, all of them are ignored
+    # Without a tension source, the stream ignores whatever tension a message contains.
     for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):
         sample = MuscleStream(ROBOT, window=3).take_states(
             np.array([read.length, tension, read.temperature]), 0.0
@@ -55,7 +55,7 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
         assert np.isnan(sample.motor_tension).all()
         np.testing.assert_array_equal(sample.model_tension, ROBOT.actuation.assumed_tension)
         np.testing.assert_array_equal(sample.bone_tension, ROBOT.actuation.assumed_tension)
-    with pytest.raises(RejectionError):  # lengths are still required
+    with pytest.raises(RejectionError):  # lengths are still checked
         MuscleStream(ROBOT).take_states(
             np.array([read.length + 5.0, read.tension, read.temperature]), 0.0
         )

@@ -16,7 +16,7 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
-PERIOD = 0.01  # [s]
+PERIOD = 0.01  # time between two published messages [s]
 
 
 class Driver:
@@ -24,18 +24,19 @@ class Driver:
 
     def __init__(self, robot: Robot, seed: int = 0) -> None:
         self.robot, self.arm = robot, EmulatedArm(robot, seed)
-        # Faults: functions of published rows (3, M) and of received targets (M,), and delays.
+        # Tests inject faults: `publish` changes the published rows (3, M), `take` the received
+        # targets (M,), and `angles` the published θ (D,). `late` delays commands [s].
         self.publish: Callable = lambda rows: rows
         self.take: Callable = lambda target: target
         self.names = robot.joints
-        self.angles: Callable = lambda theta: theta  # (D,) as published
-        # Converts rows (3, M) at a time into messages of ros2_control, which `motors` reads.
+        self.angles: Callable = lambda theta: theta
+        # Converts rows (3, M) and a time [s] into a message, which is passed to `Listening`.
         self.message: Callable = lambda rows, _: array(rows)
         self.motors: MotorInterface | None = None
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
         self._commands: deque = deque()
-        # (l_target, rows) → T, instead of the arm's own law.
+        # Computes T [N] from l_target and the measured rows; if None, the arm's own law does.
         self.in_tension: Callable | None = None
         self._target = None
         self._sent = -1.0
@@ -59,7 +60,7 @@ class Driver:
         return [(each.theta, self.publish(np.stack(each[1:]))) for each in read]
 
     def command(self, target: np.ndarray) -> None:
-        """Take a command."""
+        """Receive l_target [m], (M,); follow it after `late` seconds."""
         self._commands.append((self.now + self.late, self.take(target.copy())))
 
     def listen(

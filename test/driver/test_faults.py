@@ -105,7 +105,8 @@ def test_a_sound_driver_is_found_sound(seed):
     reported = str(verdict).splitlines()
     for name, line in zip(ROBOT.muscles, reported[1:]):
         assert line.startswith(name)
-        assert line.count('ok') == 4 and 'WRONG' not in line  # all but rate, order, zero, clip
+        # `Winding` alone does not judge rate, order, zero and clip.
+        assert line.count('ok') == 4 and 'WRONG' not in line
 
 
 HEARD = {
@@ -163,7 +164,7 @@ def test_advice_on_a_rejected_message_is_that_of_its_topic():
     listening.muscles(array(np.zeros((2, M))), 0.0)
     advice = [fault.change for fault in listening.verdict(0.1).faults]
     assert sum('fill `position`, one value for each name' in change for change in advice) == 1
-    assert sum('3×M' in change for change in advice) == 1  # of muscle_states alone
+    assert sum('3×M' in change for change in advice) == 1  # this advice concerns muscle_states only
 
 
 def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
@@ -278,7 +279,7 @@ class Messages:
     def __init__(self):
         self.listening, self.driver = Listening(ROBOT, 100.0), settled()
         self.number = 0
-        self.ticks = []  # times at which this process shows that it runs [s]
+        self.ticks = []  # times at which `Listening` learns that this process is running [s]
 
     def bring(self, count, sent, came, lost=()):
         """Pass messages; `sent` and `came` compute their times [s] from their number."""
@@ -400,7 +401,7 @@ def law(bias=BIAS, stiffness=K, most=ROBOT.tension.max[0], clip=True, gain=1.0):
     return follow
 
 
-def spring(target, rows):  # without max(0, …): the tension falls below T_bias if l_target > l
+def spring(target, rows):  # a wrong law: if l_target > l, the tension falls below T_bias
     return np.maximum(0.0, BIAS + K * (rows[0] - target))
 
 
@@ -459,7 +460,7 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
     driver = settled()
     home = driver.arm.sense().length
 
-    def mirrored(rows):  # mirrored at the initial length, so that the law seems to hold
+    def mirrored(rows):  # mirrored about the initial length, where the law still seems to hold
         return np.stack([2.0 * home - rows[0], *rows[1:]])
 
     driver.publish = mirrored
@@ -471,7 +472,8 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
 def stiff_and_strong(stiffness):
     """Return the arm with K [N/m] and muscles of some kilonewtons."""
     tension = TensionRange(*np.outer([100.0, 2000.0, 3000.0], np.ones(M)))
-    units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))  # stiffer than K, or the module oscillates
+    # The elastic element must be stiffer than K, because the module would oscillate otherwise.
+    units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))
     elastic = SeriesElastic(*units)
     parts = {'tension': tension, 'stiffness': np.full(M, stiffness), 'series_elastic': elastic}
     return Robot(replace(ROBOT.description, **parts))
@@ -500,7 +502,7 @@ def test_a_fault_of_a_stiff_robot_is_found(wrong):
 
 
 def test_oscillation_of_a_stiff_robot_is_reported():
-    verdict = wound_in_stiff(7.0e5)  # 8 seeds: at least 1.27 times the tolerance
+    verdict = wound_in_stiff(7.0e5)  # with 8 seeds, oscillation was ≥ 1.27 times the tolerance
     assert 'N (standard deviation) while it is held' in str(verdict)
     assert 'latency' not in verdict.wrong, str(verdict)
 

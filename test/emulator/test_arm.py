@@ -43,7 +43,7 @@ def drive(arm, length, seconds):
 def test_tension_from_elongation_inverts_the_elongation(tension, force, rate, stretch):
     elastic = SeriesElastic(np.array([force]), np.array([rate]), np.array([stretch]))
     elongation = elastic.elongation(np.array([1.0]), np.array([tension]))[0]
-    if rate * elongation < 6.0:  # the compiled inverse is limited to this range
+    if rate * elongation < 6.0:  # beyond this, the compiled inverse limits the tension
         solved = tension_from_elongation(elongation, force, rate, stretch)
         assert solved == pytest.approx(tension, rel=1e-6, abs=1e-6)
 
@@ -154,8 +154,10 @@ def test_a_length_offset_shifts_the_controlled_posture(robot, nominal):
 def test_temperatures_settle_at_the_steady_state_of_the_thermal_model(robot):
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
     muscle, module = arm._muscle, arm._module_constants
-    assert np.ptp(module.loss) > 0.1 * module.loss.mean()  # no two modules are the same
-    for _ in range(20):  # skip most of the housing's time constant of minutes
+    assert np.ptp(module.loss) > 0.1 * module.loss.mean()  # the modules differ
+    # The housing would take many minutes to settle. Setting it to the steady temperature of the
+    # present tension again and again is faster.
+    for _ in range(20):
         muscle.housing[:] = modules.AMBIENT + module.housing_resistance * (
             module.loss * muscle.tension**2
         )
@@ -228,7 +230,7 @@ def test_the_sensor_of_a_prismatic_joint_errs_by_millimetres(tmp_path, reality):
 def test_a_prismatic_joint_stops_at_its_limits(tmp_path, reality):
     """The stop is as stiff as that of a revolute joint with a pinion: 200 N move it some mm."""
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
-    urdf.write_text(urdf.read_text().replace('"0.25"', '"0.005"'))  # the tool
+    urdf.write_text(urdf.read_text().replace('"0.25"', '"0.005"'))  # a light tool [kg]
     robot = Robot.load(tmp_path)
     arm, pull = make_arm(robot, 0, reality), robot.tension.bias.copy()
     for name in ('slider_in', 'slider_out'):

@@ -142,7 +142,7 @@ def test_ending_slack_causes_no_peak_of_tension(robot, reality):
             arm.command_length(command)
             arm.step(0.001)
             most = max(most, arm.tension[MUSCLE])
-    assert most < 200.0  # a sudden change would cause 2996 N
+    assert most < 200.0  # if the slack ended at once, the tension would rise to 2996 N
     arm.set_faults([f'slack:{name}'])
     arm.reset()
     assert arm.tension[MUSCLE] == pytest.approx(robot.tension.bias[MUSCLE])
@@ -170,7 +170,7 @@ def test_an_overheated_module_is_hot_until_a_reset(arm, robot):
     assert hot[MUSCLE] > 90.0 and np.delete(hot, MUSCLE).max() < 40.0
     arm.faults.set([])
     arm.step(0.1)
-    assert arm.sense().temperature[MUSCLE] > 90.0  # a body cools slowly
+    assert arm.sense().temperature[MUSCLE] > 90.0  # the motor cools only slowly after the repair
     arm.reset()
     assert arm.sense().temperature.max() < 40.0
 

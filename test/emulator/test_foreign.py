@@ -68,7 +68,8 @@ def test_a_foreign_body_without_effects_is_the_described_body(robot, coupled, im
             np.testing.assert_allclose(jacobian, slopes, atol=1e-6)
         tension = np.broadcast_to(model.tension.limit, lengths.shape)
         off = true.muscle_lengths(theta, tension) - model.muscle_lengths(theta, tension)
-        # Its tendon stretch is that at θ = 0 in all postures.
+        # In every posture, the foreign body stretches its tendons as at θ = 0. The geometric model
+        # stretches them in proportion to their present length.
         stretch = model.series_elastic.wire_stretch * tension * (lengths - true.length_at_zero)
         np.testing.assert_allclose(off, stretch, atol=2e-5)
 
@@ -95,11 +96,11 @@ def test_a_prismatic_joint_coupled_to_a_revolute_one_does_not_lag(tmp_path):
 @pytest.mark.parametrize('name', EFFECTS)
 def test_each_effect_alone_changes_the_motion(robot, name, monkeypatch):
     sprung = JointElasticity(np.eye(2), np.zeros(2), np.zeros(2))
-    robot = robot.with_elasticity(sprung)  # joint springs are required to see their errors
+    robot = robot.with_elasticity(sprung)  # without joint springs, their effects change nothing
     monkeypatch.setattr(foreign, 'SLIP_TIME', 0.01)
     monkeypatch.setattr(foreign, 'HOUR', 0.1)
     size = EFFECTS[name] if name != 'dropouts' else 0.5
-    # Each effect requires another: stiction needs friction, late stretch and creep need stretch.
+    # Two effects change nothing alone: stiction needs tendon friction, and jitter needs a delay.
     others = {'stiction': {'guide_friction': 0.25}, 'jitter': {'delay': 0.0125}}.get(name, {})
     bare = replace(NONE, **others)
     lives = [drive(ForeignArm(robot, 1, e)) for e in (bare, bare, replace(bare, **{name: size}))]
@@ -137,7 +138,8 @@ def test_creep_is_the_same_in_every_decade_of_time(robot):
         arm.step(seconds)
         crept.append(arm._memory.slow[:, :4].sum(axis=1) / arm._memory.elongation)
     decades = np.diff(crept, axis=0) / [[1.0], [np.log10(5.0)]]
-    # 2/3 to 4/3 of 4 % of the elongation; half of that with these few elements.
+    # An individual creeps by 2/3 to 4/3 of 4 % of the elongation per decade. The few elements that
+    # are summed here contribute at least half of that.
     assert np.all((decades > 0.5 * 0.04 * 2.0 / 3.0) & (decades < 1.5 * 0.04 * 4.0 / 3.0))
 
 
@@ -146,7 +148,7 @@ def test_tendon_friction_grows_with_the_bends_of_the_tendon(robot):
     bends, losses = [], []
     for theta in (robot.lower, robot.upper):
         arm.reset(theta)
-        for _ in range(20):  # wind in, so that every tendon slides
+        for _ in range(20):  # wind in all muscles, so that friction acts in every tendon
             arm.command_tension(np.full(robot.muscle_count, 150.0))
             arm.step(0.01)
         muscle = arm._muscle
@@ -169,10 +171,11 @@ def test_kinks_lengthen_some_routes_by_about_their_size():
     longer = kinked - straight
     assert longer.min() > -1e-9
     most = longer.max(axis=0)
-    # A route with several segments has several of them; some cannot be bent as much.
+    # A route with several segments has several kinks, so it may lengthen by more than 0.01 m. Short
+    # segments cannot have such a large kink.
     assert np.median(most) > 0.004
     assert np.all(most < 0.035)
-    assert np.mean(longer < 1e-6) > 0.3  # a tendon that does not touch them is straight
+    assert np.mean(longer < 1e-6) > 0.3  # where a tendon touches no obstacle, it stays straight
 
 
 def test_joint_friction_follows_the_load_of_each_joint():
@@ -182,7 +185,7 @@ def test_joint_friction_follows_the_load_of_each_joint():
     theta = robot.random_postures(500, np.random.default_rng(3))
     weight = np.abs(robot.kinematics.holding_torque(theta)).max(axis=0)
     assert np.all(friction > 0.01 * weight)
-    assert friction[4] < 0.5 * friction[:2].min()  # the yaw of the elbow carries little
+    assert friction[4] < 0.5 * friction[:2].min()  # elbow_yaw carries much less than the shoulder
 
 
 def test_a_users_mjcf_file_moves_as_the_robot_imported_from_it(imported):
@@ -196,7 +199,8 @@ def test_a_users_mjcf_file_moves_as_the_robot_imported_from_it(imported):
     assert np.ptp(motions[0], axis=0).max() > 0.1
     assert np.isfinite(motions[0]).all()
     hand = robot.kinematics.end_effector_pose(arm.theta).translation
-    np.testing.assert_allclose(arm.hand.translation, hand, atol=1e-3)  # a step earlier
+    # MuJoCo's pose of the hand is that before the last step, hence the tolerance.
+    np.testing.assert_allclose(arm.hand.translation, hand, atol=1e-3)
     assert arm.route_points().shape == robot.routes.points(arm.theta[None])[0].shape
 
 
@@ -224,7 +228,7 @@ def test_a_users_mjcf_file_stands_at_the_root_of_the_robot(tmp_path, old, new, b
     arm.step(0.001)
     applied = arm._data.qfrc_applied[arm._order]
     due = robot.kinematics.end_effector_jacobian(theta).T @ push
-    np.testing.assert_allclose(applied[:2], due[:2], atol=0.01)  # besides the coupled joint
+    np.testing.assert_allclose(applied[:2], due[:2], atol=0.01)  # the third joint is coupled
 
 
 def test_actuator_settings_of_a_users_mjcf_file_do_not_act_on_the_modules(imported, tmp_path):
@@ -332,7 +336,7 @@ def test_a_ball_joint_becomes_the_three_hinges_that_it_is_imported_as(tmp_path):
     np.testing.assert_allclose(lengths, robot.routes.absolute_lengths(theta), atol=1e-9)
 
 
-#: bodies and joints without names, in a file of their own
+#: MJCF file for <include>, whose bodies and joints have no names
 PART = """<mujoco><site name="o" pos=".05 0 1"/><site name="o2" pos="-.05 0 1"/>
   <body pos="0 0 1"><joint axis="0 1 0" range="-60 60"/><geom size=".02" fromto="0 0 0 0 0 -.2"
     type="capsule"/><site name="i" pos=".03 0 -.1"/><site name="i2" pos="-.03 0 -.1"/>
@@ -379,7 +383,7 @@ def test_an_unknown_reality_is_refused_with_the_legal_ones(robot):
         make_arm(robot, 0, 'dream')
 
 
-#: an elbow with two tendons, with places for faults
+#: MJCF template of an elbow with two tendons; the fields are filled by variants and faults
 ELBOW = """<mujoco>{options}<worldbody>
   <site name="o" pos=".05 0 0"/><site name="o2" pos="-.05 0 0"/>
   <body name="mount" pos="0 0 1">{held}<geom name="g1" size=".02"/>
@@ -401,8 +405,8 @@ HINGE = '<joint name="held" axis="1 0 0" range="-60 60"/>'
         {'options': '<compiler fusestatic="true"/>'},
         {'options': '<compiler fusestatic="true"/>', 'hand': ''},
         {'hand': ''},
-        {'held': HINGE},  # the body is fixed if the joint is omitted
-        {'anchor': 'pos="0 0 .03" ', 'hand': ''},  # the joint is not at the origin of its body
+        {'held': HINGE},  # a joint that the import leaves out, so that its body is fixed
+        {'anchor': 'pos="0 0 .03" ', 'hand': ''},  # a joint beside the origin of its body
     ],
 )
 def test_an_mjcf_file_has_the_lengths_of_the_robot_imported_from_it(tmp_path, change):

@@ -17,7 +17,8 @@ def test_true_jacobian_is_the_derivative_of_true_lengths(name):
     body = Individual(robot, 3, Spread(wrap=0.9))
     theta = robot.random_postures(20, np.random.default_rng(0))
     off = np.abs(slopes(body.absolute_lengths, theta) - body.muscle_jacobian(theta))
-    # Where a tendon just touches a bone there is no derivative: allow one posture in twenty.
+    # Length has no derivative in postures where a tendon just touches a bone. Allow this in one of
+    # the twenty postures.
     assert (np.sum(off.max(axis=1) > 1e-6, axis=0) <= 1).all()
 
 

@@ -227,7 +227,7 @@ def test_a_restarted_learner_does_not_roll_back_to_an_earlier_network(trained):
 def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
     gate, first = CheckpointValidator(ROBOT), trained['paper']
     gate.take(first, 0.0)
-    for _ in range(3 * MOST_USED):  # no message arrives in between
+    for _ in range(3 * MOST_USED):  # without messages between them, no network is proven
         gate.take(trained['default'], 0.0)
     assert gate.anomaly(True, 0.0) is first
 
@@ -258,7 +258,7 @@ def test_a_network_that_moves_the_posture_by_as_much_as_learning_does_is_accepte
     trained, measures
 ):
     gate, mae = CheckpointValidator(ROBOT), trained['default']
-    gate.take(_turned(mae, 0.3), 0.0)  # this network's θ is wrong by 0.3 rad
+    gate.take(_turned(mae, 0.3), 0.0)  # θ by the network in use is wrong by 0.3 rad
     send_messages_of_the_model(gate, measures)
     gate.check(mae)
 

@@ -75,7 +75,8 @@ def test_a_planar_arm_estimates_no_force_across_its_plane(robot):
 
 def test_known_tendon_friction_is_not_taken_for_a_force():
     tension, length = pulling(THETA)
-    wound = length + np.linspace(0.01, 0.0, 50)[:, None]  # every tendon is wound in, so s is 1
+    # Every tendon is wound in, so the direction of sliding s is 1.
+    wound = length + np.linspace(0.01, 0.0, 50)[:, None]
     errors = []
     for friction in (0.0, 0.1):
         core, sliding = observer(), FrictionDirection()
@@ -191,7 +192,7 @@ def test_healthy_torque_is_measured_in_motion_and_a_touch_hardly_counts():
 
     for _ in range(100):
         core.step(tension, length, DT)
-    assert core.use(image).touch.time == 0.0  # the arm was at rest
+    assert core.use(image).touch.time == 0.0  # only motion counts, and the arm was at rest
     move(LEAST_MOTION + 20.0)
     healthy = core.use(image).touch.spread
     move(1.0, push=500.0)
@@ -210,7 +211,8 @@ def test_the_estimator_reports_contacts(robot, mae):
     assert values['contacts'] == '1' and values['contact'].endswith('N at the hand')
     core.calibrate_lengths(tuple(theta.tolist()))
     core.step(states(tension, length), 1.0, 1.0)
-    assert 'contact' not in core.report(1.0).values  # the length offsets are no longer valid
+    # During a length calibration the lengths are unknown, so no contact can be estimated.
+    assert 'contact' not in core.report(1.0).values
     core = Estimator(robot)
     core.use(mae)
     core.step(states(tension, length), 1.0, 1.0)

@@ -100,7 +100,8 @@ def test_a_reset_restarts_the_count(calibrated, watch, wound):
 def test_a_muscle_without_its_commanded_tension_is_an_anomaly(robot, mae, watch, slack, by_length):
     watched = watch(mae)
     messages = round(DEAD_TIME / DT) + 1
-    assert not any(watched.findings(slack, messages))  # without a command, no tension is demanded
+    # Without a command no tension is demanded, so a muscle without tension is no anomaly.
+    assert not any(watched.findings(slack, messages))
     watched.demand = np.full(6, 60.0)
     if by_length:
         watched.demand = robot.actuation.demanded(slack.length, slack.length - 0.003)
@@ -172,7 +173,8 @@ def test_preset_paper_decides_by_a_alone_once_it_is_calibrated(
     assert finding.evidence.startswith('A = ') if known else finding is None
     watched.health.reset()
     assert not any(watched.findings(healthy, IN_A_ROW))
-    # A never reaches this threshold; only detectors by physics remain
+    # A never reaches this threshold, so only the detectors that do not use A could find something.
+    # The preset `paper` has none of them.
     watched.health.configure(Detection(1e6))
     assert not any(watched.findings(slack, round(2 * DEAD_TIME / DT)))
 
@@ -186,7 +188,7 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, w
     reported = np.where(np.arange(6) == 3, tension - 1e4 * wound, tension).clip(30.0)
     for n in range(300):
         length = state.length + 1e-4 * rng.standard_normal(6)
-        length[0] -= 0.01 * n * (n < 200) / 200  # another muscle lags behind its command, but moves
+        length[0] -= 0.01 * n * (n < 200) / 200  # muscle 0 lags too, but moves, so it is not jammed
         reported[0] = 140.0 if n < 200 else 60.0
         watched.demand = reported
         if kind == 'length':

@@ -104,7 +104,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     loop.step(cut, 20)
     assert loop.core.cause.startswith(robot.muscles[2])
     assert loop.core.body.isolated == loop.core.mae.isolated == (2,)
-    assert robot.isolated == ()  # other parts share this object, so it must not change
+    assert robot.isolated == ()  # other objects use this robot too, so it must not change
     values = loop.core.report(loop.now).values
     assert values['finding'] in ('residual_distance', 'slack_tendon')
     assert values['verification'] == 'running' and 'remedy steps' not in values
@@ -114,7 +114,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     assert loop.core.suspects.last_verification == f'{robot.muscles[2]}: ruptured'
     assert loop.core.body.isolated == (2,)
     before = loop.core.mae.estimate(*cut).theta
-    loop.step(cut, 300)  # the suspect is isolated
+    loop.step(cut, 300)  # an isolated muscle does not raise the anomaly again
     assert loop.core.cause == ''
     np.testing.assert_array_equal(loop.core.mae.estimate(*healthy._replace(length=cut.length)).theta,
                                   before)  # fmt: skip
@@ -146,7 +146,8 @@ def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, heal
         assert loop.core.suspects.last_verdict[1].outcome is Outcome.HEALTHY
         assert loop.core.body.isolated == ()
         assert loop.core.cause == ''
-    assert loop.core.body.isolated == ()  # the finding stays latched, as with on_anomaly: stop
+    # The third finding isolates no muscle. It is latched, as with `on_anomaly: stop`.
+    assert loop.core.body.isolated == ()
     loop.step(healthy, 1000)
     assert loop.core.cause
 
@@ -203,7 +204,7 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calib
 
 
 def test_a_tension_that_stays_exactly_at_the_bias_is_no_sensor_fault(robot, calibrated, healthy):
-    # A simulated module without sensor noise reports exactly T_bias while its tendon is paid out.
+    # A simulated module without sensor noise reads exactly T_bias as long as l_target > l.
     rng, paid_out = np.random.default_rng(0), 3
     core = Estimator(robot)
     quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
@@ -242,7 +243,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
 
 @pytest.mark.parametrize('scale', [1.0, 0.1])
 def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
-    # The tension stays at T_bias although three times T_bias is demanded.
+    # The tension of the jammed muscle stays at T_bias, although three times T_bias is demanded.
     watched = Verification(0, ModuleLaw(scale * BIAS, scale * STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0004), 0.006)

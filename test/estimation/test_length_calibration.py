@@ -43,7 +43,7 @@ def swinging(robot, mae):
 
 @pytest.fixture
 def seldom(monkeypatch):
-    # Fits take long, and with fewer of them the calibration is not slower.
+    # Fits take much CPU time. Fitting less often saves it, and the calibration takes no longer.
     monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 5.0)
 
 
@@ -55,7 +55,7 @@ def moment(robot, mae):
 def run(calibration, moment, seconds, sees, begin=0.0):
     for n in range(round(seconds / WINDOW)):
         theta, tension, length = moment(begin + n * WINDOW)
-        for k in range(25):  # joint angles arrive less often than lengths
+        for k in range(25):  # joint angles arrive with every third message of lengths
             calibration.step(
                 tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None
             )
@@ -103,7 +103,8 @@ def test_a_posture_that_the_arm_cannot_have_is_refused(robot, mae):
         with pytest.raises(MusculoskeletalError, match='legal'):
             estimator.calibrate_lengths(posture)
     assert estimator.body.offsets.known
-    on_stop = tuple(robot.upper + 0.002)  # sensors of joints at their stops may read this
+    # Sensors of joints at their stops may read a little more than the limit. This is accepted.
+    on_stop = tuple(robot.upper + 0.002)
     estimator.calibrate_lengths(on_stop)
     assert not estimator.body.offsets.known
 
@@ -133,9 +134,8 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibration(
     monkeypatch, robot, mae, moment, sees
 ):
-    monkeypatch.setattr(
-        length_calibration, 'FIT_INTERVAL', 10.0
-    )  # fits without a muscle take longer
+    # Fits without a muscle take still more CPU time.
+    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 10.0)
     rng = np.random.default_rng(0)
 
     def disturbed(t):
@@ -163,7 +163,8 @@ def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 def test_length_calibration_of_an_arm_without_weight_stays_finite(mae):
     robot = Robot.load('arm26')
-    # like an arm whose joints all have vertical axes
+    # Without gravity, as in an arm whose joints all have vertical axes, weight carries no
+    # information.
     robot.kinematics.model.gravity.linear = np.zeros(3)
     calibration = run(LengthCalibration(robot, mae), swinging(robot, mae), 60.0, sees=False)
     assert np.isfinite(calibration.offsets.offset).all()
@@ -180,7 +181,7 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     assert re.search('calibrating the lengths: [1-4] of', reported)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == reported
-    estimator.use(mae)  # the estimator treats it as another network
+    estimator.use(mae)  # any call of `use` counts as another network
     assert 'calibrating the lengths: 0 of' in str(estimator.report(4.0))
     for n in range(400, 800):
         _, tension, length = moment(0.01 * n)

@@ -70,7 +70,8 @@ def verdict(tension, length, slack):
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.028)
         pull, wound = tension(-command, shake), length(command, stir)
-        likely = -slack - elongation(pull)  # the joints do not move
+        # The joints do not move, so the route and the elongation determine the length.
+        likely = -slack - elongation(pull)
         if result := watched.step(pull, wound, command, likely, DT):
             return result.outcome
     raise AssertionError('no answer')

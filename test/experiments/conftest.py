@@ -8,7 +8,7 @@ import pytest
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
-#: of exploration: enough for updates of both presets
+#: duration of the exploration [min], long enough for updates of both presets
 MINUTES = 0.35
 
 

@@ -35,7 +35,8 @@ def errors(estimate, theta):
 def test_the_elongation_is_removed_exactly(robot, motion):
     theta, tension, length = motion
     off = without_elongation(robot, tension, length) - robot.routes.relative_lengths(theta)
-    assert np.abs(off).max() < 1e-5  # second order in tendon stretch times elongation
+    # The only error is a product of two small terms: relative stretch times elongation.
+    assert np.abs(off).max() < 1e-5
 
 
 def test_the_polynomial_filter_follows_the_motion(robot, motion):

@@ -61,7 +61,8 @@ def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(
     Fake(arm26, arm26.tension.bias).follow(plan, plan.duration)
     assert not plan.carried.any()
     np.testing.assert_allclose((plan.rupture - 4.0) % SLOT, LATEST_RUPTURE, atol=0.011)
-    assert plan.counted.tolist() == list(range(arm26.muscle_count))  # all, as none qualifies
+    # If no muscle carried tension, all ruptures count instead of none.
+    assert plan.counted.tolist() == list(range(arm26.muscle_count))
 
 
 def test_a_switched_off_muscle_is_not_ruptured_but_commanded_no_tension(arm26):
@@ -83,7 +84,7 @@ def test_a_switched_off_muscle_of_the_arm_goes_slack_and_the_others_hold(arm26, 
     assert after[:, 1].max() < 0.1 * arm26.tension.bias[1] < before[:, 1].min()
     others = np.arange(6) != 1
     assert (after[:, others] > 0.5 * arm26.tension.bias[others]).all()
-    assert np.abs(taken.length[-1] - taken.length[599]).max() < 0.05  # nothing winds in
+    assert np.abs(taken.length[-1] - taken.length[599]).max() < 0.05  # no muscle is wound in
 
 
 def test_the_payload_changes_every_minute(arm26):
@@ -99,8 +100,8 @@ def test_only_an_alarm_that_begins_after_the_rupture_counts_as_detection(arm26, 
     alarm, suspect = np.zeros(count, dtype=bool), np.zeros(count, dtype=int)
     starts = np.round(plan.rupture / 0.01).astype(int)
     alarm[starts[0] + 9 : starts[0] + 20] = True  # detected after 0.1 s, with the right muscle
-    alarm[starts[1] + 19 : starts[1] + 30] = True  # after 0.2 s, with muscle 0 as the suspect
-    alarm[starts[2] - 50 : starts[2] + 400] = True  # the alarm began before
+    alarm[starts[1] + 19 : starts[1] + 30] = True  # detected after 0.2 s, with the wrong muscle
+    alarm[starts[2] - 50 : starts[2] + 400] = True  # this alarm began before the rupture
     observed = DetectorOutput(np.zeros((count, 2)), alarm, alarm, suspect, alarm)
     well = DetectorOutput(*(np.zeros(5, dtype=bool) for _ in range(5)))
     numbers = detection(arm26, plan, observed, well, trained['default'])

@@ -15,7 +15,7 @@ from musculoskeletal_ae.experiments.results import write_report
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.tools import experiment
 
-# As INTERFACE.md lists them.
+# Keys that result.json must contain, for each experiment.
 KEYS = {
     'online_learning': 'before_rad after_rad paper_before_rad paper_after_rad oracle_rad '
     'fit_start_rad fit_end_rad samples samples_to_halve paper_samples_to_halve',
@@ -94,7 +94,8 @@ def test_robustness_has_both_emulator_models_and_says_why_a_number_is_missing(qu
     content = result(quick, 'robustness')
     for reality in ('kin', 'foreign'):
         assert set(REALITY.split()) <= set(content[reality])
-    # Besides geometry, only sensors and friction of emulator model `kin` deviate.
+    # The informed oracle also knows the true sensor errors and tendon friction, so its error must
+    # be the smallest.
     kin = content['kin']
     assert kin['informed_oracle_rad'] < min(kin['oracle_rad'], kin['least_squares_rad'])
     assert content['kin']['after_rad'] == result(quick, 'online_learning')['after_rad']

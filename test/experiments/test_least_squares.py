@@ -45,7 +45,8 @@ def body(robot, name):
 def test_least_squares_is_exact_on_its_own_body(robot, name):
     rng = np.random.default_rng(1)
     estimator, lengths = body(robot, name)
-    # Not at the limits, where θ is clipped, and close enough to the start at mid-range.
+    # Draw postures away from the joint limits, where θ is clipped, and near mid-range, where the
+    # search starts.
     middle, half = 0.5 * (robot.lower + robot.upper), 0.25 * (robot.upper - robot.lower)
     theta = middle + half * rng.uniform(-1.0, 1.0, (COUNT, robot.joint_count))
     tension = rng.uniform(30.0, 130.0, (COUNT, robot.muscle_count))

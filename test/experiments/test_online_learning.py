@@ -74,7 +74,8 @@ def test_the_held_out_motion_has_the_same_commands_for_every_individual(twice):
     (study, _), _ = twice
     other = record(study.arm(1), study.network(None), HELD_OUT_STREAM, study.held_out_time)
     one = study.stream(0, 'held_out')
-    # The first ramp starts where each arm hangs; from the second target on, all are equal.
+    # Each arm starts its first ramp from another posture. From the second target on (sample 500),
+    # the commands are equal.
     start = 500
     np.testing.assert_array_equal(one.command[start:], other.command[start:])
     assert np.abs(one.theta - other.theta).max() > 1e-3  # the arms differ

@@ -30,7 +30,8 @@ def plain(arm26, mae):
 
 
 def test_a_recording_lasts_for_whole_steps_and_rests_at_the_end_of_each(plain):
-    assert len(plain.theta) == round(10.0 / SAMPLE_TIME)  # 5 s + 2 s are too short for 8 s
+    # Steps end after 5, 7 and 10 s, so a recording of at least 8 s takes 10 s.
+    assert len(plain.theta) == round(10.0 / SAMPLE_TIME)
     for end in (5.0, 7.0, 10.0):
         commands = plain.command[rows_between(end - 0.5, end)]
         np.testing.assert_array_equal(commands, np.broadcast_to(commands[0], commands.shape))
@@ -80,4 +81,5 @@ def test_a_recording_is_estimated_as_by_the_estimator(arm26, mae, plain):
         estimated.append(core.step(states, now, now).state.theta)
     tension = end_tensions(mae, plain)
     np.testing.assert_allclose(mae.estimate(tension, plain.length).theta, estimated, atol=1e-6)
-    assert np.abs(np.log(tension / plain.tension)).max() > 0.09  # friction had an effect
+    # Tendon friction must have had an effect, because the comparison would be trivial otherwise.
+    assert np.abs(np.log(tension / plain.tension)).max() > 0.09

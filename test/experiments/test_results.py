@@ -31,7 +31,7 @@ def test_result_json_has_means_of_the_seeds_that_have_them_but_counts_alarms(arm
         0: {'after_rad': 0.1, 'false_alarms': 1, 'first': {'error_rad': 0.2}, 'joint': 'elbow'},
         1: {'after_rad': 0.3, 'false_alarms': 2, 'first': {'error_rad': 0.4}, 'joint': 'elbow'},
     }
-    rows[0] |= {'hand_circle_m': None, 'ellipsoid_share': None}  # there is no circle
+    rows[0] |= {'hand_circle_m': None, 'ellipsoid_share': None}  # None: could not be measured
     rows[1] |= {'hand_circle_m': 0.01, 'ellipsoid_share': None}
     content = combine(study, {seed: Measured(row, {}) for seed, row in rows.items()})
     assert content['after_rad'] == 0.2
@@ -140,7 +140,7 @@ def is_killed(name, study, seed):
         begun = study.folder / f'{seed}'
         first = not begun.exists()
         begun.touch()
-        if first:  # the workers wait for each other
+        if first:  # opening both ends of a FIFO makes the two workers wait for each other
             (study.folder / 'fifo').open('rw'[seed]).close()
         if seed == 0:
             os.kill(os.getpid(), signal.SIGKILL)

@@ -78,7 +78,7 @@ def test_a_point_on_the_rim_of_a_wrapped_object_counts_as_outside_it(mjcf, tmp_p
     drum = (
         '<geom name="pulley" type="cylinder" size="0.03" fromto="0 -0.02 0 0 0.02 0" mass="0.01"/>'
     )
-    site = '<site name="rim" pos="0.018 0 -0.024"/>'  # 30 mm from the axis
+    site = '<site name="rim" pos="0.018 0 -0.024"/>'  # 30 mm from the axis, which is the radius
     text = mjcf.read_text().replace('<site name="l1"', f'{drum}{site}<site name="l1"')
     route = '<site site="u1"/><geom geom="pulley"/><site site="rim"/>'
     text = text.replace('<site site="u1"/><site site="l1"/>', route)
@@ -148,7 +148,7 @@ FORCES = 'forcelimited="true" forcerange="-100 500"'
         (f'<motor gear="-2" {RANGE}"-50 100"/>', 200.0),
         (f'<motor {RANGE}"-250 0"/><motor gear="-1" {RANGE}"0 100"/>', 350.0),
         (f'<muscle tendon="out" force="150" {FORCES}/>', 100.0),
-        (f'<position kp="100" {RANGE}"0 0.1"/>', 18.1),  # its longest travel
+        (f'<position kp="100" {RANGE}"0 0.1"/>', 18.1),  # kp × its largest position error, 0.181 m
         (f'<motor {RANGE}"0 250"/>', None),
     ],
 )
@@ -260,7 +260,7 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
     assert result.robot.muscles == ('front', 'back')
     point = result.robot.description.routes[0][0]
     np.testing.assert_allclose(point.xyz, [0.05, 0.01, 0.2])
-    # It has no lengths of wraps.
+    # The source computes no lengths of muscles that wrap, so only the straight one is compared.
     assert result.comparison.lengths == pytest.approx({'front': 0.0}, abs=1e-9)
     assert any('muscle still: it moves no joint' in note for note in result.notes)
 
@@ -436,7 +436,7 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
 
 
 def test_an_opensim_model_is_refused_with_the_way_to_convert_it(tmp_path):
-    # Such tags of OpenSim are not valid XML.
+    # Tags such as <A::B/> occur in files of OpenSim, although they are not valid XML.
     text = '<?xml version="1.0"?><OpenSimDocument Version="40000"><A::B/></OpenSimDocument>'
     with pytest.raises(SourceError, match='convert it to MJCF with MyoConverter'):
         read_source(put(tmp_path, 'own.osim', text))
@@ -452,13 +452,13 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
     assert 'dropped: muscle front: attached to base, which is left out' in output
     assert 'largest length error over 1000 postures: 0.000 mm' in output
-    assert 'check_robot: not sound' in output  # no muscle holds it open against its weight
+    assert 'check_robot: not sound' in output  # no muscle holds the elbow open against its weight
 
 
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):
     whole = import_robot(mjcf, tmp_path / 'whole').robot
     part = import_robot(mjcf, tmp_path / 'part', base='upper').robot
-    rest = np.array([0.2, 0.0])  # where MuJoCo's file puts the joints above
+    rest = np.array([0.2, 0.0])  # angles in the MJCF file of the joints that the part leaves out
     for elbow in (-1.0, 0.1):
         torque = whole.kinematics.holding_torque(np.append(rest, elbow))[2]
         np.testing.assert_allclose(part.kinematics.holding_torque(np.array([elbow])), torque)

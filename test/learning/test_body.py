@@ -143,7 +143,7 @@ def test_a_relearned_muscle_takes_a_new_offset_and_the_others_keep_theirs(arm26,
         store.add(sample._replace(length=sample.length + shift))
     fit_body(body, store.observations())
     (predicted,) = body.lengths(states[0], states[1], np.zeros((100, 6)))
-    # Measured over 24 drawn bodies, the error has a standard deviation of 0.2 mm.
+    # Over 24 drawn bodies, the error of this offset had a standard deviation of 0.2 mm.
     assert abs((predicted - known)[:, 2].mean() - 0.01) < 0.001
     np.testing.assert_allclose(predicted[:, 0], known[:, 0], atol=5e-4)
 
@@ -157,7 +157,8 @@ def test_a_muscle_without_samples_gets_a_large_noise(arm26, stage):
         store.add(stage.sample())
     again = fit_body(CalibratedBody(arm26), store.observations()).noise
     others = np.arange(arm26.muscle_count) != 1
-    # The values differ by at most 2 % for drawn bodies, because a group is fitted jointly.
+    # The noise of the other muscles changes a little, because all muscles of a group are fitted
+    # together. Over drawn bodies the change was at most 2 %.
     np.testing.assert_allclose(forgotten[others], known[others], rtol=0.06)
     assert forgotten[1] > 10.0 * known[1]
     assert known[1] < again[1] < 0.5 * forgotten[1]

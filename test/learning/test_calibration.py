@@ -27,9 +27,11 @@ def test_the_detector_is_calibrated_only_with_enough_healthy_data(learned):
     enough = updater.update(job(store, stage.messages(600), LEAST_TIME, 1)).mae
     assert enough.anomaly.calibrated
     kept = updater.update(job(store, stage.messages(10), 1.0, 1)).mae.anomaly
-    assert kept.calibrated  # few messages, as after a restart, do not replace the calibration
+    # After a restart there are only few messages. They do not replace the earlier calibration.
+    assert kept.calibrated
     lost = updater.update(job(store, stage.messages(10), 1.0, 1, hold=False)).mae.anomaly
-    assert not lost.calibrated  # the calibration is invalid after a muscle was replaced
+    # After a muscle was replaced (hold=False), the earlier calibration is invalid.
+    assert not lost.calibrated
 
 
 def test_the_detector_is_not_calibrated_on_one_posture(learned):
@@ -105,9 +107,9 @@ def test_every_second_message_is_learned_and_the_others_validate():
 @pytest.mark.parametrize(
     'unfit',
     [
-        {'theta': np.nan},  # no joint sensor measured θ
-        {'tension': 0.0},  # the muscle is isolated or slack
-        {'spread': np.full(2, 0.01)},  # a camera measured θ
+        {'theta': np.nan},  # θ was not measured
+        {'tension': 0.0},  # a muscle was isolated or slack
+        {'spread': np.full(2, 0.01)},  # θ was measured by a camera, with this uncertainty [rad]
     ],
 )
 def test_messages_that_do_not_determine_the_posture_are_not_learned(unfit):

@@ -33,7 +33,7 @@ def part(recording, start, end):
 
 def test_learning_from_one_recording_improves_the_estimate_of_another(robot):
     exploration = part(read(BAGS / 'exploration', robot), 0.0, 40.0)
-    other = part(read(BAGS / 'rupture', robot), 0.0, 110.0)  # the part before the rupture
+    other = part(read(BAGS / 'rupture', robot), 0.0, 110.0)  # the first 110 s, before the rupture
     mae = initial_mae(robot, steps=600).mae
     learner = Learner(robot, mae, steps=50)
     reported = []
@@ -106,7 +106,8 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     arm26, initial, monkeypatch, tmp_path, capsys
 ):
     time = 0.02 * np.arange(1000)
-    waves = np.sin(np.outer(time, [1.7, 2.3]))  # without rests, so nothing is learned
+    # The arm never rests, so there is no rest sample to learn from.
+    waves = np.sin(np.outer(time, [1.7, 2.3]))
     theta = 0.5 * (arm26.lower + arm26.upper) + 0.3 * (arm26.upper - arm26.lower) * waves
     tension = np.full((1000, arm26.muscle_count), 60.0)
     length = arm26.muscle_lengths(theta, tension)

@@ -120,7 +120,8 @@ def test_two_centimetres_of_a_prismatic_joint_are_another_posture(tmp_path):
     learner, pull = Learner(robot), np.full(robot.muscle_count, 60.0)
     theta = 0.5 * (robot.lower + robot.upper)
     theta[-1], length = 0.01, robot.muscle_lengths(theta, pull)
-    for k in range(1200):  # rest, then a slow motion of 5 mm/s that no length shows, then rest
+    # The arm rests for 4 s, moves at 5 mm/s for 4 s while no length changes, and rests again.
+    for k in range(1200):
         theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (400 <= k < 800)]
         learner.step(DT * k, theta, pull, length)
     angles = [sample.theta[-1] for sample in learner.samples.samples]
@@ -131,7 +132,7 @@ def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner
     learner.accept(stage.sample())
     for now in np.arange(0.0, 5.0, 0.25):
         learner.poll(now)
-    assert learner.trainer.jobs == []  # at least two samples are required
+    assert learner.trainer.jobs == []  # an update requires at least two samples
     times = []
     for now in np.arange(5.0, 10.0, 0.25):
         if now < 6.0:
@@ -221,7 +222,8 @@ def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage)
     assert len(learner.samples) == 0
     assert 'length calibration' in learner.report().message
     learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
-    arm.rest(3.0 * MARGIN)  # the offsets are compared with messages first
+    # The learner first compares the new offsets with messages, so the first sample comes later.
+    arm.rest(3.0 * MARGIN)
     assert [sample.body_version for sample in learner.samples.samples] == [learner.body.version]
 
 
@@ -238,7 +240,7 @@ def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learn
     learner.poll(0.5)
     assert not calibrated(learner)
     assert not any(known[2] for known in learner.samples.known)
-    learner.poll(1.5)  # this update began after the change, so its statistics describe the arm
+    learner.poll(1.5)  # returns an update that began after the change, so its statistics are valid
     assert not learner.trainer.jobs[-1].statistics_hold
     assert calibrated(learner)
 
@@ -290,7 +292,7 @@ def test_a_replaced_network_drops_samples_and_continues_the_version_count(learne
     learner.replace(initial)
     assert len(learner.samples) == 0
     assert learner.mae.version == version + 1
-    assert learner.poll(0.0) == learner.checkpoint  # published without delay
+    assert learner.poll(0.0) == learner.checkpoint  # the new network is published at once
     learner.replace(None)
     assert learner.checkpoint is None
     learner.accept(stage.sample())
@@ -320,7 +322,8 @@ def test_without_joint_sensors_rest_is_detected_from_the_muscles(arm26, initial,
         arm.rest(1.1)
     assert len(learner.samples) >= 20
     assert np.isnan(learner.samples.observations().theta).all()
-    assert len(learner.trainer.jobs[0].observed) == 20  # fewer samples are not enough
+    # Without joint sensors, the first update requires 20 samples.
+    assert len(learner.trainer.jobs[0].observed) == 20
 
 
 def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial, stage):
@@ -336,7 +339,7 @@ def test_with_joint_sensors_a_rest_needs_at_least_one_joint_angle(arm26, initial
             assert np.isfinite(sample.theta).tolist() == [False, True]
 
 
-UP = np.array([0.0, 0.0, 9.8])  # reading at rest if the link hangs down [m/s²]
+UP = np.array([0.0, 0.0, 9.8])  # accelerometer's reading at rest while its link hangs down [m/s²]
 
 
 def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_received_in(
@@ -392,12 +395,13 @@ def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stag
     learner.trainer.released = True
     published = learner.poll(4.0)
     assert learner.trainer.ready and learner.updates == updates
-    if not goes_back:  # after an anomaly the learner goes back to the previous network
+    if not goes_back:  # after an anomaly, the learner publishes the previous network instead
         assert published is None and learner.checkpoint == checkpoint
     stop(learner, False)
     jobs = len(learner.trainer.jobs)
     learner.poll(6.0)
-    assert len(learner.trainer.jobs) == jobs + 1  # the sample is learned after the stop
+    # The update that was not used is repeated after the stop, so that its sample is learned.
+    assert len(learner.trainer.jobs) == jobs + 1
 
 
 NAN = np.nan
@@ -410,7 +414,7 @@ NAN = np.nan
         ([9.0, 0.0], 0.0, 'joint limits'),
         ([0.1, 0.2], 5.0, 'muscle_states are rejected'),
         (None, 0.0, 'without usable joint angles'),
-        ([0.1, NAN], 0.0, ''),  # the other joint provides a sample
+        ([0.1, NAN], 0.0, ''),  # one joint sensor is enough for a sample
     ],
 )
 def test_a_learner_that_gets_nothing_to_learn_from_warns_and_names_why(

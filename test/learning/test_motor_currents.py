@@ -62,7 +62,7 @@ def test_tensions_of_currents_are_recovered_from_rests(seed):
     before = np.abs(held_out.tension - held_end).mean()
     after = np.abs(body.transmission.end(held_out.tension, held_out.direction) - held_end).mean()
     assert after < 0.4 * before
-    error = np.abs(body.drive[2] - true.drive[2]).mean()  # drive friction
+    error = np.abs(body.drive[2] - true.drive[2]).mean()  # error of the drive friction [N]
     assert error < 0.5 * np.abs(0.08 * LIMIT - true.drive[2]).mean() + 0.01 * LIMIT.mean()
 
 
@@ -83,7 +83,7 @@ def test_the_uncertainty_of_tensions_of_currents_covers_their_errors(count):
             spread = transmission.spread(read, direction)
             errors.append((tension - transmission.motor(read, direction)) / spread)
     assert (np.array(errors) < CONFIDENCE).mean() > 0.95
-    assert np.std(errors) > 0.2  # the uncertainty is not much too large either
+    assert np.std(errors) > 0.2  # an excessive uncertainty would cover all errors trivially
 
 
 def test_derivatives_by_the_drive_are_those_of_the_length():
@@ -126,7 +126,7 @@ def test_a_checkpoint_carries_the_transmission_and_fits_only_motor_currents(trai
     with pytest.raises(CheckpointError, match=r'learned with motor currents .* sensor'):
         checkpoint.from_bytes(data, SENSORS)
     body = CalibratedBody(ROBOT)
-    fit_to_network(body, mae)  # the learner of another machine continues with it
+    fit_to_network(body, mae)  # a learner on another machine continues from this network
     np.testing.assert_allclose(body.drive, drive, rtol=1e-3)
     excessive = replace(touch, drive=drive + np.array([[9.0], [0.0], [0.0]]))
     wrong = checkpoint.to_bytes(replace(trained['default'], touch=excessive))

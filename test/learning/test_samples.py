@@ -61,7 +61,8 @@ def test_a_moving_joint_or_tendon_is_no_rest():
 
 @pytest.mark.parametrize('before', [0.1, 0.7, 3.0, 12.3])
 def test_a_rest_does_not_depend_on_what_was_before_it(before):
-    def theta(t):  # the joint moves, rests from 0.5 s to 1.4 s, and moves again
+    # Both joints move, rest from 0.5 s to 1.4 s, and move again.
+    def theta(t):
         return max(0.0, 0.5 - t) + max(0.0, t - 1.4)
 
     def rest(detector, before):
@@ -249,7 +250,7 @@ def test_a_glitch_is_rejected_from_rests_and_healthy_messages(messages, arm26):
 
 def test_the_direction_of_friction_is_unknown_after_a_gap_in_the_stream(messages, arm26):
     theta, pull, length = middle(arm26)
-    for n in range(50):  # wound in, so that friction has a direction
+    for n in range(50):  # wind in all muscles, so that the direction of friction is known
         messages.send(theta, pull, length + 0.01 - 0.0002 * n)
     (sample,) = messages.rest(theta, 1.0 + MARGIN + 0.1)
     assert (sample.direction > 0.5).all()

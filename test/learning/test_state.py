@@ -130,7 +130,7 @@ def test_a_learner_killed_while_it_saves_has_the_state_before_or_after(
         done.append(target)
         return replace_file(file, target)
 
-    def die(*_, **__):  # a killed process does not clean up
+    def die(*_, **__):  # a killed process does not remove its temporary files
         raise Killed
 
     with closing(StateStore(tmp_path, arm26)) as state, monkeypatch.context() as patch:
@@ -238,7 +238,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     for _ in range(4):
         theta, *parts, spread, gravity, _, _ = stage.sample()
         measured = theta, *(part[kept] for part in parts), spread, gravity
-        # This index means the muscle after the added one.
+        # In the robot without the added muscle, this index is that of the muscle after it.
         store.add(Sample(*measured, isolated=(added,)))
     store.forget(0, newest=1)
     with closing(StateStore(tmp_path, small)) as state:
@@ -254,7 +254,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
         np.testing.assert_array_equal(np.array(loaded.known)[:, kept], store.known)
         assert not np.array(loaded.known)[:, added].any()
         assert arm26.muscles[added] in learner.report().values['saved state not used']
-        # The samples cause as many updates as when they were new. Then the learner waits.
+        # The four loaded samples cause four updates, as new ones do. Then the learner waits.
         for now in range(10):
             learner.poll(2.0 * now)
         assert learner.updates == 4
@@ -340,7 +340,8 @@ def test_a_directory_that_became_read_only_is_an_error_until_it_is_not(begun, st
     def read_only(*_):
         raise OSError(errno.EROFS, 'Read-only file system')
 
-    # Replace the function that writes, because file modes do not restrict the superuser.
+    # The test may run as root, whom the mode of a file does not restrict. Replace the function that
+    # writes instead.
     with monkeypatch.context() as patch:
         patch.setattr(states, 'write_whole', read_only)
         accept(learner, stage, 1)
@@ -352,7 +353,7 @@ def test_a_directory_that_became_read_only_is_an_error_until_it_is_not(begun, st
 
 def test_a_directory_that_is_deleted_is_noticed_at_once_and_made_again(begun, stage, tmp_path):
     learner = begun()
-    accept(learner, stage, 1)  # one sample is not enough for an update
+    accept(learner, stage, 1)  # one sample does not cause an update, which would save the state
     shutil.rmtree(tmp_path / 'state')
     learner.poll(0.0)
     assert learner.report().level == 'error'
@@ -397,7 +398,8 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
     with monkeypatch.context() as patch:
         patch.setattr(CheckpointValidator, 'check', refuse)
         messages = []
-        for _ in range(2):  # the second start finds no network to reject
+        # The first start rejects the saved network; the second start finds none.
+        for _ in range(2):
             with closing(
                 Learner(arm26, trainer=IdleTrainer, directory=tmp_path / 'state')
             ) as again:
@@ -407,7 +409,7 @@ def test_a_saved_network_that_is_refused_becomes_one_backup_and_its_samples_stay
     assert messages[1] == ''
     assert len(list((tmp_path / 'state').glob('backup-*'))) == 1
     assert_same(read_backup(tmp_path / 'state', arm26, tmp_path / 'scratch')[0], before.samples)
-    learner = begun()  # learns from the saved samples again
+    learner = begun()  # this learner starts without a network, and learns from the saved samples
     for now in range(10):
         learner.poll(2.0 * now)
     assert learner.updates == 3

@@ -7,7 +7,7 @@ import pytest
 from musculoskeletal_ae.learning.stops import ROUGH_OFFSET, STOP_SPREAD, sensor_zeros
 
 LOWER, UPPER = np.array([-0.4, -1.5, -0.8]), np.array([1.2, 0.1, 0.8])
-TRUE = np.array([0.05, -0.04, 0.0])  # true offsets of the joint sensors [rad]
+TRUE = np.array([0.05, -0.04, 0.0])  # offsets of the joint sensors [rad], which are to be found
 
 
 def rests(count: int = 150, beyond: float = 0.3, seed: int = 0) -> np.ndarray:

@@ -15,8 +15,7 @@ from musculoskeletal_ae.learning.trainer import Trainer, TrainerProcess
 
 from .conftest import job
 
-# Time after which a test fails [s]; a busy machine starts a process within minutes.
-PATIENCE = 300.0
+PATIENCE = 300.0  # longest wait for an update [s]; a busy machine needs minutes to start a process
 
 
 @pytest.fixture
@@ -75,7 +74,7 @@ def test_a_training_process_that_hangs_is_replaced_and_its_job_repeated(
     with monkeypatch.context() as patch:
         patch.setattr(trainers, 'PATIENCE', 0.3)
         process._patience = 0.3
-        # The job exceeds the capacity of a pipe, so that sending it hangs as well.
+        # The job is larger than the buffer of a pipe, so sending it to a suspended process blocks.
         process.submit(job(stage.store(300), steps=1))
         assert answer(process) is None
     assert 'did not answer in time' in process.trouble

@@ -18,13 +18,13 @@ def test_a_body_is_fitted_to_lengths_whatever_torque_the_assumed_tension_would_g
     true, rng = Individual(ROBOT, 3), np.random.default_rng(0)
     tension = np.tile(ROBOT.actuation.assumed_tension, (60, 1))
     theta = ROBOT.random_postures(60, rng)
-    # The true tensions differ from the assumed ones, and do not balance the torque either.
+    # The true tensions differ from the assumed ones. Neither of them balances the arm's weight.
     length = true.muscle_lengths(theta, tension * rng.uniform(0.8, 1.2, tension.shape))
     known, still = np.ones(tension.shape, dtype=bool), np.zeros(tension.shape)
     fit = BodyFit(ROBOT, None)
     before = np.abs(fit.body.lengths(theta, tension, still)[0] - length).mean()
     fitted = fit.fit(Observations(theta, tension, length, still, known), theta)
-    # Joint sensors determine the postures.
+    # The joint sensors alone determine the postures.
     np.testing.assert_allclose(fitted.theta, theta, atol=0.02)
     held_out = ROBOT.random_postures(200, rng)
     assumed = np.tile(ROBOT.actuation.assumed_tension, (200, 1))

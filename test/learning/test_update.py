@@ -74,7 +74,8 @@ def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
     stage = CompliantStage(other_body)
     store = stage.store(30)
     observed, messages = (stage.store(400).observations() for _ in range(2))
-    # Measured over eight bodies and streams: a ratio of 0.91, with a standard deviation of 0.02.
+    # Over eight bodies and streams, motion samples reduced the error by a factor of 0.91 (standard
+    # deviation 0.02).
     assert learned(learned=messages) < 0.98 * learned()
 
 
@@ -102,8 +103,8 @@ def test_the_covariance_covers_95_percent_of_validation_messages(arm26, initial,
 
     store = stage.store(30)
     assert inside() < 0.8
-    # Measured over eight drawn bodies: 0.46 to 0.59 without validation messages, and 0.94 with them
-    # (standard deviation 0.02).
+    # Over eight drawn bodies, the share was 0.46 to 0.59 without validation messages, and 0.94 with
+    # them (standard deviation 0.02).
     assert inside(judging=judging) == pytest.approx(0.95, abs=0.07)
 
 
@@ -112,7 +113,7 @@ def test_a_changed_muscle_is_detected(arm26, initial, stage):
     assert updater.update(job(store, steps=1)).changed == ()
     for _ in range(5):
         sample = stage.sample()
-        # Found in all of 20 drawn bodies; a shift of 0.01 m in two of three.
+        # In 20 drawn bodies, this shift was always detected, and one of 0.01 m in two of three.
         shift = 0.02 * (np.arange(6) == 3)
         store.add(sample._replace(length=sample.length + shift))
     assert updater.update(job(store, steps=1)).changed == ((3, 5),)
@@ -131,7 +132,9 @@ def test_a_slipped_joint_sensor_is_not_taken_for_a_changed_muscle(arm26, initial
 
 def test_all_of_the_training_is_on_the_device_that_was_chosen(initial, other_body):
     data = synthetic_samples(other_body, np.zeros(6), 200, np.random.default_rng(0))
-    with torch.device('meta'):  # computes nothing, so that the final loss has no value
+    # Tensors on the device `meta` have no values. Training therefore runs to its end, where reading
+    # the loss fails.
+    with torch.device('meta'):
         trainer = NetworkTrainer(from_mae(initial))
         with pytest.raises(RuntimeError, match='item'):
             trainer.train(data, 1)
@@ -182,7 +185,8 @@ def test_an_unknown_preset_is_refused_with_the_legal_ones(arm26):
 def test_an_update_on_few_samples_keeps_most_of_a_learned_network(learned, arm26, initial):
     mae, _, _, stage = learned
     states, two = stage.states(1000), job(stage.store(2))
-    # Four seeds, because a network with so few steps varies: 1.1 to 2.5 times the earlier error.
+    # An update on two samples multiplies the error by 1.1 to 2.5, depending on the seed. Compare
+    # the means of four seeds.
     going_on, anew = (
         np.mean([error(BodyUpdater(arm26, each, s).update(two).mae, *states) for s in range(4)])
         for each in (mae, initial)
@@ -236,7 +240,8 @@ def test_the_covariance_of_a_network_covers_its_errors_and_is_saved(arm26, learn
     error = mae.estimate(tension, length).theta - theta
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
     inside = (distance <= chi2.ppf(0.95, 2)).mean()
-    assert inside > 0.8  # the body has no friction, and its errors follow the prior
+    # The ellipsoid covers 95 % if the errors follow the prior; this body is drawn from it.
+    assert inside > 0.8
     spread = np.sqrt(np.diag(mae.covariance))
     assert (spread < 5.0 * error.std(axis=0)).all()
     again = checkpoint.from_bytes(checkpoint.to_bytes(mae), arm26)

@@ -12,7 +12,7 @@ from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
-POSTURE = 1.0 + MARGIN + 0.5  # duration of a rest that gives a sample [s]
+POSTURE = 1.0 + MARGIN + 0.5  # duration of a rest that is long enough for a sample [s]
 
 
 class ArmWithOffsets(Arm):
@@ -64,7 +64,7 @@ def test_false_zeros_are_not_believed_and_cost_nothing(learner, arm, false):
     assert 'length offsets disagree' in report.message
     assert 'estimator/zero' in report.message
     use(learner, np.zeros(6), known=False)
-    use(learner, np.full(6, 0.001))  # the result of estimator/zero
+    use(learner, np.full(6, 0.001))  # correct offsets, as after a length calibration
     arm.rest(2.0 * POSTURE)
     arm.rest(POSTURE)
     assert len(learner.samples) >= 3
@@ -122,10 +122,12 @@ def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
     history.use(wrong)
     for sample in true[2:]:
         store.add(sample._replace(length=sample.length - wrong))
-    if is_interrupted:  # a power cycle may have changed the offsets
+    if is_interrupted:  # after a power cycle, the true offsets may be others
         history.interrupt()
     history.use(np.zeros(6))
-    assert history.corrected == corrected  # includes the first two samples
+    # Two samples are corrected when the wrong offsets arrive. If the right ones follow without an
+    # interruption, all four samples are corrected.
+    assert history.corrected == corrected
     if not is_interrupted:
         for sample, expected in zip(store.samples, true, strict=True):
             np.testing.assert_allclose(sample.length, expected.length)

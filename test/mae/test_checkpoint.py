@@ -97,9 +97,8 @@ def test_what_one_joint_has_learned_is_read_back():
 def test_a_file_written_in_this_format_is_read():
     read = load(Path(__file__).parent / 'format_1.safetensors')
     for ours, theirs in zip(arrays(read), arrays(small()), strict=True):
-        np.testing.assert_allclose(
-            ours, theirs, rtol=1e-12
-        )  # each machine rounds the covariance differently
+        # Each processor rounds the covariance differently.
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
     for name in ('joints', 'muscles', 'preset', 'activation', 'version', 'training'):
         assert getattr(read, name) == getattr(small(), name)
     assert read.anomaly.calibrated and read.anomaly.thresholds == {'norm': 0.25}
@@ -228,7 +227,7 @@ def test_whatever_a_header_holds_its_refusal_can_be_sent_in_a_message(key):
     'data',
     [
         b'',
-        b'\x80\x04N.',  # a pickle
+        b'\x80\x04N.',  # a file of pickle, which must never be executed
         (2**63).to_bytes(8, 'little') + b'{}',
         (2).to_bytes(8, 'little') + b'{}',
         (200_000).to_bytes(8, 'little') + b'[' * 200_000,
@@ -270,7 +269,7 @@ def test_any_changed_byte_gives_a_sound_network_or_a_checkpoint_error(place, fli
         mae = from_bytes(bytes(data))
     except CheckpointError:
         return
-    # A flipped bit of a weight results in another valid weight.
+    # A flipped bit of a weight cannot be noticed if it results in another finite weight.
     assert all(np.isfinite(part).all() for part in arrays(mae))
 
 

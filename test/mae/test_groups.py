@@ -16,7 +16,7 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.groups import Group, groups
 from musculoskeletal_ae.robot.robot import Robot
 
-# Three limbs, whose joints and muscles are numbered in no particular order.
+# Three limbs. The numbers of their joints and muscles are mixed, as a user may list them.
 LIMBS = (Group((0, 4), (1, 6, 7, 8)), Group((1,), (0, 5)), Group((2, 3), (2, 3, 4)))
 JOINTS, MUSCLES = 5, 9
 
@@ -55,7 +55,7 @@ def test_one_arm_is_one_group(name):
 def test_groups_are_what_muscles_connect_however_they_are_listed():
     crossed = np.zeros((MUSCLES, JOINTS), dtype=bool)
     for joints, muscles in LIMBS:
-        # only the first muscle of a limb crosses two joints
+        # Only the first muscle of a limb crosses two joints, and thereby connects them.
         for k, muscle in enumerate(muscles):
             crossed[muscle, joints[k % len(joints)]] = True
             crossed[muscle, joints[(k + 1) % len(joints)]] |= k == 0

@@ -35,7 +35,7 @@ def test_readings_of_isolated_muscles_have_no_influence(trained, states, preset,
     others[1][:, lost] = rng.uniform(-9.0, 9.0, (60, len(lost)))
     for got, want in zip(mae.estimate(*others), before, strict=True):
         np.testing.assert_array_equal(got, want)
-    one = mae.estimate(others[0][7], others[1][7])  # one message that is not part of a batch
+    one = mae.estimate(others[0][7], others[1][7])  # a single message instead of a batch
     np.testing.assert_allclose(one.theta, before.theta[7], atol=1e-4)
     error = residuals(before, *others, lost)
     assert not error.reshape(60, 2, 6)[..., lost].any()
@@ -54,7 +54,8 @@ def test_the_remaining_muscles_determine_the_posture(trained, states):
     mae, (theta, tension, length) = trained['default'], states
     for lost in range(6):
         off = mae.without((lost,)).estimate(tension, length).theta - theta
-        # A briefly trained network has an error of 0.1 rad; a wrong input would cause 0.5 rad.
+        # Measured: 0.1 rad with this briefly trained network. If the lost muscle had an influence,
+        # the error would be 0.5 rad.
         assert np.linalg.norm(off, axis=1).mean() < 0.25
     at = mae.encode(Mask.THETA_TENSION, theta, tension)
     assert at.shape == mae.without((1,)).encode(Mask.THETA_TENSION, theta, tension).shape
@@ -81,7 +82,7 @@ def test_the_statistics_are_those_of_the_remaining_muscles(trained):
     )
     np.linalg.cholesky(reduced.anomaly.covariance)
     assert reduced.anomaly.calibrated
-    assert not reduced.without(()).anomaly.calibrated  # no statistics exist for the restored muscle
+    assert not reduced.without(()).anomaly.calibrated  # the restored muscle has no statistics
 
 
 def test_a_checkpoint_stores_the_isolated_muscles(trained):

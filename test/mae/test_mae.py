@@ -61,7 +61,7 @@ def test_single_state_gives_what_the_batch_gives(mae, states):
     for i in range(12):
         single = mae.estimate(states.tension[i], states.length[i])
         for one, many in zip(single, batch, strict=True):
-            # Single precision is relative to the largest value: 5 N are as inexact as 500 N.
+            # The sums are rounded relative to their largest terms, so 5 N are as inexact as 500 N.
             np.testing.assert_allclose(one, many[i], rtol=0, atol=1e-5 * np.abs(many).max())
 
 

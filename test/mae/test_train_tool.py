@@ -45,7 +45,7 @@ def test_unknown_robot_exits_with_1_in_one_line(tmp_path, capsys):
 def test_train_warns_of_lengths_that_jump_before_it_trains(tmp_path, capsys, name):
     behind_a_drum(tmp_path / 'arm', DRUM_ENDS[name])
     arguments = ['--robot', str(tmp_path / 'arm'), '--out', str(tmp_path / 'x')]
-    # the missing bag is noticed before the training
+    # `train` refuses the missing bag before it trains, which keeps this test short.
     assert main([*arguments, '--from-bag', str(tmp_path / 'none')]) == 1
     error = capsys.readouterr().err
     assert ('warning: no network can represent lengths that jump' in error) == (name == 'jumps')

@@ -52,7 +52,7 @@ def test_a_tenth_of_the_training_beats_the_mean_posture(robot, trained, preset):
 
 def test_muscle_jacobian_approaches_the_geometric_one(robot, trained):
     theta, tension, _ = random_states(robot, 100, np.random.default_rng(6), robot.tension.limit)
-    # l = f_geo − L_e(l_abs, T), and L_e grows with l_abs.
+    # l = f_geo − L_e, and the elongation L_e grows with the absolute length at the rate `slope`.
     slope = robot.series_elastic.length_slope(tension)[..., None]
     true = robot.routes.muscle_jacobian(theta) * (1.0 - slope)
     error = trained['default'].muscle_jacobian(theta, tension) - true

@@ -26,7 +26,7 @@ def diagnostics(
 
 def test_before_the_first_sample_a_hint_explains_why_the_error_may_rise():
     situation = Situation('/left')
-    assert situation.hint() == ''  # no learner has reported
+    assert situation.hint() == ''  # no learner has reported yet, so there may be none
     situation.diagnosed(diagnostics('/left/learner', samples='0'))
     assert 'error may rise' in situation.hint()
     situation.diagnosed(diagnostics('/left/learner', samples='3', checkpoints='2'))
@@ -105,7 +105,7 @@ def test_a_stop_of_this_arm_alone_is_shown_with_its_remedy():
     situation.diagnosed(stopped(StopCause.OPERATOR))
     assert situation.trouble() == f'STOPPED: controller/stop was called {RESET}'
     situation.diagnosed(diagnostics('/left/controller', mode='paused', stop_cause='stale_estimate'))
-    assert situation.trouble() == ''  # the controller resumes by itself
+    assert situation.trouble() == ''  # from the mode `paused`, the controller resumes by itself
 
 
 @pytest.mark.parametrize('cause', StopCause)
@@ -121,7 +121,8 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps'}
     situation.diagnosed(diagnostics('/left/estimator', **suspect, d='12.5', d_limit='9.0'))
     assert (situation.distance, situation.limit) == (12.5, 9.0)
-    assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'  # no controller has reported
+    # No controller has reported yet, so the remedy names only the estimator's steps.
+    assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'
     situation.diagnosed(stopped(StopCause.ANOMALY, explored=True))
     assert situation.trouble() == (
         'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
@@ -140,7 +141,8 @@ def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_e
     stopped_learner = 'stopped by an anomaly', DiagnosticStatus.WARN
     situation.diagnosed(diagnostics('/left/learner', *stopped_learner, waits_for='anomaly'))
     verifying = 'ANOMALY: biceps is being verified: no tension'
-    assert situation.trouble() == verifying  # before the controller reports it
+    # The text is the same before and after the controller reports its stop.
+    assert situation.trouble() == verifying
     situation.diagnosed(stopped(StopCause.ANOMALY))
     assert situation.trouble() == verifying
     situation.diagnosed(diagnostics('/left/estimator', **suspect, verification='none'))
@@ -154,7 +156,7 @@ def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_e
         (Kind.JOINT_SENSORS_DISAGREE, 'check the named sensor'),
         (Kind.LENGTHS_JUMPED, 'call estimator/zero'),
         (Kind.SLACK_TENDON, 'repair the muscle'),
-        (None, 'call controller/reset'),  # the cause of the stop is over
+        (None, 'call controller/reset'),  # the anomaly is over, but the stop is latched
     ],
 )
 def test_the_remedy_of_an_anomaly_is_that_of_its_kind(kind, first):
@@ -246,7 +248,7 @@ def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seco
                 diagnostics(f'/{node}', mode='holding', checkpoint_version=str(version))
             )
 
-    for version in range(10):  # the controller uses each version a report later
+    for version in range(10):  # the controller takes each version over one report later
         second(version, max(version - 1, 0))
         assert situation.trouble() == ''
     for _ in range(3):
@@ -297,7 +299,8 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
 
     for _ in range(3):
         assert second('sim', 'learner', 'view') == ('ok', '')
-    assert second('sim', lasting=60.0)[0] == 'ok'  # a suspended machine is no silence
+    # A jump of the clock by 60 s means that this machine was suspended, not that nodes are silent.
+    assert second('sim', lasting=60.0)[0] == 'ok'
     assert second('sim')[0] == 'error'
     level, trouble = second('sim')
     assert level == 'error' and trouble.startswith('/left/learner: no report for 4 s; ')
@@ -305,7 +308,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert second('sim', 'learner') == ('ok', '')
     situation.diagnosed(diagnostics('/left/second', 'wrong', DiagnosticStatus.ERROR))
     assert second('sim', 'learner')[1] == '/left/second: wrong'
-    for _ in range(6):  # /left/second has ended and is not a node of the arm
+    for _ in range(6):  # a node that is not part of the arm may end without becoming an error
         second('sim', 'learner')
     assert second('sim', 'learner') == ('ok', '')
 

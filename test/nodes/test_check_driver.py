@@ -30,7 +30,8 @@ def ended(graph, process):
 def test_a_sound_driver_passes_and_is_moved_only_with_move(graph):
     start_driver(graph)
     commands = graph.listen(Float64MultiArray, 'muscle_length_command')
-    # A busy machine may delay a healthy driver; repeat until its messages are regular.
+    # On a busy machine, messages of a healthy driver may be irregular. With --wait, `check_driver`
+    # repeats the check until they are regular.
     assert ended(graph, check(graph, '--wait', '--seconds', '2'))[0] == 0
     assert not commands
     one = ['--move', '--muscles', 'biceps_long']

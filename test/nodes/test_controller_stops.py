@@ -123,7 +123,8 @@ def test_a_killed_controller_leaves_the_modules_safe_and_a_new_one_waits_for_a_r
     arm.controller = arm.start_controller(explore=True)
     arm.says('restarted')
 
-    def heard():  # repeat, because discovery may be late
+    # The new controller may not have been discovered yet, so repeat the message until it arrives.
+    def heard():
         arm.target(THERE)
         return arm.controller.core.target_state.theta is not None
 
@@ -142,7 +143,7 @@ def test_an_operators_stop_outlives_a_killed_controller(moving):
     arm.processes = ()
     arm.controller = arm.start_controller(explore=True)
     arm.says("'stop cause': 'operator_stop'")
-    arm.graph.end(arm.controller)  # without a reset
+    arm.graph.end(arm.controller)  # end this controller without a reset of the stop
     arm.controller = arm.start_controller(explore=True)
     arm.says("'stop cause': 'operator_stop'")
     arm.graph.wait(lambda: reset(arm).success, 'the reset')
@@ -151,7 +152,7 @@ def test_an_operators_stop_outlives_a_killed_controller(moving):
 
 def test_an_anomaly_stops_the_arm_until_estimator_and_controller_are_reset(moving):
     arm = moving()
-    # A low threshold makes a healthy arm anomalous, without a rupture and its repair.
+    # With a very low threshold, even a healthy arm has an anomaly, so nothing has to be repaired.
     assert arm.graph.set_parameter('estimator', 'anomaly_threshold', 1e-4)[0]
     arm.says('anomaly_detected')
     answer = reset(arm)
@@ -197,7 +198,7 @@ def test_a_killed_learner_does_not_disturb_a_motion(moving):
     arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'a movement under way')
     arm.kill(learner)
     arm.goes_to(THERE)
-    # The nodes report no problem as soon as the arm is at rest.
+    # All remaining nodes report `ok` again.
     for node in ('controller', 'estimator', 'hardware_emulator'):
         arm.graph.wait(lambda node=node: arm.state(node).level == 'ok', f'{node} to be well')
     arm.never_jumped(before)

@@ -65,7 +65,8 @@ def test_estimates_are_published_by_name_and_near_the_truth(estimator, arm26, he
     joints = answer(estimator, healthy)
     assert tuple(joints.name) == arm26.joints
     assert joints.header.stamp.sec > 0
-    # After 600 training steps the mean error is 0.01 rad; core tests check the estimate itself.
+    # After 600 training steps, the mean error of the network is 0.01 rad. This test only checks
+    # that each angle is published under its joint's name.
     np.testing.assert_allclose(joints.position, 0.5 * (arm26.lower + arm26.upper), atol=0.1)
     muscles = estimator.received['estimated_muscle_states']
     restored = estimator.wait(lambda: muscles, 'the restored muscles')[-1]
@@ -124,7 +125,8 @@ def test_a_checkpoint_is_replaced_by_parameter_and_topic_and_an_unfit_one_refuse
     singular = replace(mae.anomaly, covariance=np.ones((12, 12)) + 1e-15 * np.eye(12))
     unfit = (
         b'not a checkpoint',
-        checkpoint.to_bytes(replace(mae, joints=('\ud800', 'b'))),  # no message can carry it
+        # UTF-8 cannot encode this name, so no message could contain it.
+        checkpoint.to_bytes(replace(mae, joints=('\ud800', 'b'))),
         checkpoint.to_bytes(replace(mae, anomaly=singular)),
     )
     for count, data in enumerate(unfit, start=1):
@@ -143,7 +145,7 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
     assert estimator.set_parameter('estimator', 'anomaly_threshold', 0.2)[0]
     detected = estimator.received['anomaly_detected']
     sick = deepcopy(healthy)
-    sick.data[0] -= 0.025  # less than a jump, which would revoke the length offsets
+    sick.data[0] -= 0.025  # a larger change would count as a jump, and revoke the length offsets
 
     def observed():
         answer(estimator, sick)
@@ -165,7 +167,7 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
 def test_a_muscle_without_its_commanded_length_or_tension_is_an_anomaly(
     estimator, arm26, healthy, kind
 ):
-    healthy.data[6 + 2] = 0.0  # tension of muscle 2
+    healthy.data[6 + 2] = 0.0  # no tension in muscle 2
     command = estimator.publisher(Float64MultiArray, f'muscle_{kind}_command')
     demand = np.array(healthy.data[:6]) - 0.003 if kind == 'length' else np.full(6, 60.0)
     detected = estimator.received['anomaly_detected']

@@ -41,7 +41,7 @@ def test_under_every_executor_a_node_counts_exceptions_goes_on_and_ends_with_sta
     graph.listen(DiagnosticArray, '/diagnostics')
     process = graph.start('estimator', robot='arm26')
     graph.wait(lambda: graph.report('estimator').values, 'its diagnostics')
-    # rclpy's own callback for this service raises ValueError.
+    # For this unknown parameter type, rclpy's own callback raises ValueError.
     request = SetParameters.Request(
         parameters=[Parameter(name='explore', value=ParameterValue(type=99))]
     )

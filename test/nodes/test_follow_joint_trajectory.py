@@ -65,7 +65,7 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     status, result = first.ended()
     assert (status, result.error_code) == (GoalStatus.STATUS_SUCCEEDED, kind.Result.SUCCESSFUL)
     assert tuple(first.feedback[0].joint_names) == arm.robot.joints
-    # rclpy's client drops feedback that arrives after the result.
+    # Do not expect feedback of the end: rclpy's client drops what arrives after the result.
     desired = np.array([feedback.desired.positions for feedback in first.feedback])
     distance = np.linalg.norm(desired - HERE, axis=1)
     assert (np.diff(distance) <= 0.0).all() and distance[-1] < distance[0]
@@ -112,7 +112,7 @@ class FakeServer(Waitable):
         node.add_waitable(self)
 
     def is_ready(self, _wait_set):
-        return self.pending  # ready until the request is taken
+        return self.pending  # ready until `take_data` takes the request
 
     def take_data(self):
         self.pending = False
@@ -139,7 +139,8 @@ class FakeServer(Waitable):
 
 
 def test_requests_of_an_action_are_served_at_once(monkeypatch):
-    monkeypatch.setattr(executor, 'FULL_ROUND_PERIOD', 600)  # serve only urgent entities
+    # Between full rounds, the executor serves only urgent entities. Let there be no full round.
+    monkeypatch.setattr(executor, 'FULL_ROUND_PERIOD', 600)
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('asked', context=context)

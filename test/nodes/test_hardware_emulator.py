@@ -82,7 +82,7 @@ def test_a_muscle_is_ruptured_and_repaired_at_run_time(arm, arm26):
     name = arm26.muscles[3]
     success, reason = arm.set_parameter('hardware_emulator', 'ruptured_muscles', ['biceps'])
     assert not success
-    assert name in reason  # the legal names
+    assert name in reason  # the reason lists the legal names
     assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
     before = rows(arm, arm26)
     assert before[1, 3] == 0.0

@@ -68,14 +68,16 @@ def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
 
 def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trained):
     graph, names = arm.graph, list(arm.robot.muscles[1:3])
-    assert not graph.call(Trigger, 'estimator/isolate').success  # isolate_muscles names no muscle
+    # The service is refused while the parameter isolate_muscles is empty.
+    assert not graph.call(Trigger, 'estimator/isolate').success
     done, reason = graph.set_parameter('estimator', 'isolate_muscles', ['tail'])
     assert not done
     assert 'legal: ' in reason
     assert graph.set_parameter('estimator', 'isolate_muscles', names)[0]
     assert graph.call(Trigger, 'estimator/isolate').message == f'isolated: {", ".join(names)}'
     graph.wait(lambda: arm.controller.core.robot.isolated == (1, 2), 'the controller')
-    # The estimator publishes the isolated muscles again for a learner's network without them.
+    # A learner's network in which no muscle is isolated shows that the learner does not know the
+    # list. The estimator therefore publishes it again.
     count = len(graph.received['isolated_muscles'])
     graph.send_network(checkpoint.to_bytes(trained['default']))
     graph.wait(lambda: len(graph.received['isolated_muscles']) > count, 'the list')
@@ -90,7 +92,7 @@ def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, ar
     graph.wait(lambda: reported, 'the list')
     assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
-    # From now on the estimator decides, and networks no longer determine the isolated muscles.
+    # Only the first network determines the isolated muscles. From now on the estimator does.
     graph.wait(lambda: not estimator.candidates.queue.is_busy, 'the end of the validation')
     others = replace(trained['default'].without((1, 2)), version=6)
     graph.send_network(checkpoint.to_bytes(others))

@@ -27,9 +27,9 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 
-# Shorter rests and fewer steps than on a robot, so that a test takes seconds.
+# With shorter rests and fewer training steps than on a robot, a test takes only seconds.
 QUICK = {'rest_time': 0.4, 'update_steps': 20}
-REST, MOVE = 0.8, 0.1  # time in one posture, and between two [s]
+REST, MOVE = 0.8, 0.1  # duration of a rest, and of the motion between two rests [s]
 DT = 0.01
 
 
@@ -200,7 +200,7 @@ def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     graph.node.create_service(Trigger, 'estimator/check_health', confirm)
     detected.publish(Bool(data=False))
     learner.learn(lambda: learner.updates > updates, 'learning again')
-    assert not graph.call(Trigger, 'learner/save').success  # nothing can be saved
+    assert not graph.call(Trigger, 'learner/save').success  # this learner has no state directory
 
 
 def test_learner_enable_stops_and_resumes_learning(host, graph):
@@ -256,7 +256,8 @@ def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, gra
     assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
     assert not any(known[1] for known in learner.node.core.samples.known)
-    # The service forgets the muscle in samples that arrived after the parameter was set.
+    # Setting the parameter forgets the muscle in all samples. The service does so again, for
+    # samples that have arrived since then.
     samples = learner.samples
     learner.learn(lambda: learner.samples > samples, 'a sample')
     assert any(known[1] for known in learner.node.core.samples.known)
@@ -292,7 +293,8 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
     assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
     assert not together(fresh=True, checkpoint='').successful
     assert learner.samples >= 2 and all(known.all() for known in core.samples.known)
-    # The three parameters together cause one start and one backup of the earlier state.
+    # Three parameters that are set together restart the learner once, and make only one backup of
+    # the earlier state.
     assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
     assert learner.samples == 0
     assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1.state']
@@ -310,7 +312,7 @@ def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
     def known():
         return learner.node.core.mae.isolated
 
-    isolated.publish(String(data=''))  # as published by an estimator that has just started
+    isolated.publish(String(data=''))  # an estimator that has just started publishes this
     graph.wait(lambda: learner.node.has_heard_isolated, 'what it says')
     assert known() == (4,)
     for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
@@ -423,7 +425,7 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
     shutil.rmtree(state)
     before = len(levels())
     graph.wait(lambda: DiagnosticStatus.ERROR in levels()[before:], 'the error')
-    # One regular report may come first. The next one is caused by the loss.
+    # The loss of the directory causes a report at once, but a regular report may precede it.
     assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
     learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
     learner.learn(lambda: levels()[-1] != DiagnosticStatus.ERROR, 'the end of the error')

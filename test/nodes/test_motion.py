@@ -48,7 +48,7 @@ def test_a_trajectory_is_followed_and_its_state_published_and_a_wrong_one_moves_
     since = state.points[0].time_from_start
     assert since.sec + 1e-9 * since.nanosec > 0.9
     arm.never_jumped()
-    # Move one joint only. Then send a message without points, after which the arm holds.
+    # Move one joint only. Then end the motion by a message without points.
     publisher.publish(trajectory(arm, HERE[1:], 20, [robot.joints[1]]))
     arm.says('following a trajectory')
     publisher.publish(JointTrajectory())
@@ -89,4 +89,4 @@ def test_a_hand_pose_is_reached_and_one_in_another_frame_refused(arm):
     graph.wait(
         lambda: arm.controller.core.activities.follower.trajectory is not before, 'the motion'
     )
-    arm.says('holding')  # after its time-out
+    arm.says('holding')  # the twist has timed out

@@ -31,7 +31,7 @@ def test_the_file_of_parameters_is_the_one_that_the_table_makes():
 
 @pytest.mark.parametrize('node', PARAMETERS)
 def test_the_file_holds_every_parameter_of_every_node_with_its_default(node):
-    # A name has the same meaning in all nodes, because they share one file.
+    # All nodes read this file, so a parameter must have the same default in all nodes that have it.
     held = yaml.safe_load(yaml_text())['/**']['ros__parameters']
     for name, parameter in PARAMETERS[node].items():
         default = parameter.default
@@ -78,7 +78,7 @@ def test_every_number_has_a_range_in_which_its_default_is(node):
 def test_every_parameter_that_is_settable_is_followed(graph, kind):
     node = graph.host(kind, robot='arm26')
     settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
-    # The nodes read stop_recordings at every stop instead.
+    # No callback follows stop_recordings: the nodes read it at every stop.
     assert settable - {'stop_recordings'} == node.parameters.followed
 
 
@@ -88,7 +88,7 @@ def test_every_parameter_that_is_settable_is_followed(graph, kind):
         ('controller', 'joint_stiffness', '[-1.0, -1.0]'),
         ('controller', 'max_age', '.nan'),
         ('hardware_emulator', 'faults', '[melt]'),
-        ('hardware_emulator', 'marker_rate', '10.0'),  # the nearest name is marker_pose_rate
+        ('hardware_emulator', 'marker_rate', '10.0'),  # unknown; the parameter is marker_pose_rate
     ],
 )
 def test_a_value_that_is_not_legal_is_refused_at_the_start(node, name, value):
@@ -131,13 +131,13 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
             {'command_timeout': 1.0, 'faults': ['melt']},
             lambda node: node.arm.command_timeout,
         ),
-        # The network in use may have been learned since the file was read.
+        # Setting `checkpoint` would replace the network in use, which may have learned much.
         (
             Estimator,
             {'checkpoint': '', 'isolate_muscles': ['tail']},
             lambda node: id(node.core.mae),
         ),
-        # A change of method ends the present activity.
+        # Setting `method` would end the exploration.
         (
             Controller,
             {'method': 'float', 'joint_stiffness': [1.0]},

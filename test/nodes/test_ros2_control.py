@@ -78,7 +78,8 @@ def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained
 
     def pulls():
         effort = joint_values(graph, 'effort')
-        return max(abs(effort[motor] - before[motor]) for motor in MOTORS) > 0.1  # [N·m], for 8 N
+        # A motor torque of 0.1 N·m corresponds to a tension of 8 N.
+        return max(abs(effort[motor] - before[motor]) for motor in MOTORS) > 0.1
 
     graph.wait(pulls, 'a motor that pulls')
     converted = controller.motors.command(np.array(lengths[-1].data))

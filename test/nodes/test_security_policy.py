@@ -39,10 +39,11 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     own = name, graph.namespace
     used = names(node.get_publisher_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'publish')}
-    assert used == allowed - {'/tf'}  # /tf needs tf2_msgs and publish_tf
+    assert used == allowed - {'/tf'}  # published only with tf2_msgs and the parameter publish_tf
     used = names(node.get_subscriber_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'subscribe')}
-    # /clock is subscribed only with use_sim_time, and the camera's topic only with its source.
+    # A node subscribes to /clock only with use_sim_time, and to vision_joint_states only if a
+    # camera is the source of joint angles.
     assert allowed - {'/clock', 'vision_joint_states'} <= used <= allowed
     used = names(node.get_service_names_and_types_by_node(*own))
     assert used == rights(name, 'services', 'reply')

@@ -117,7 +117,7 @@ def test_joints_are_forced_and_released(arm, core):
     for names, extra, reason in (
         (['knee'], {}, 'unknown joint'),
         (['elbow'] * 2, {}, 'duplicate joint'),
-        ([], {'effort': [1.0]}, 'empty'),  # must not release the joints
+        ([], {'effort': [1.0]}, 'empty'),  # only an entirely empty message releases the joints
     ):
         force.publish(JointState(name=names, position=[0.0] * len(names), **extra))
         arm.wait(lambda reason=reason: reason in str(arm.report('sim').values), reason)
@@ -159,7 +159,7 @@ def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae,
         graph.wait(lambda reported=reported: reported in str(graph.report('sim').values), reported)
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
-    # The estimator decides which network all nodes use, once it has published one.
+    # Once the estimator has published a network, it decides which network all nodes use.
     done, reason = graph.set_parameter('sim', 'checkpoint', trained_file)
     assert not done
     assert 'of the estimator' in reason
@@ -174,7 +174,7 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
     common = {'robot': 'arm26', 'checkpoint': trained_file}
     graph.host(Sim, **common, as_robot=True)
     graph.host(Estimator, **common)
-    # A large max_age avoids stops on a loaded machine.
+    # On a loaded machine messages arrive late. A large max_age avoids stops.
     graph.host(Controller, **common, first_duration=1.0, max_age=10.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
@@ -197,7 +197,7 @@ def test_the_simulator_as_robot_keeps_tension_in_isolated_muscles(graph, arm26, 
     graph.next('muscle_states', 2)
     _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
     np.testing.assert_array_equal(tension, arm26.tension.bias)
-    assert shell.longest_step == 1.0  # two periods at 2 Hz
+    assert shell.longest_step == 1.0  # two periods of the rate of 2 Hz [s]
 
 
 def test_the_simulator_as_robot_does_not_use_length_offsets_of_others(graph, trained_file):

@@ -130,7 +130,7 @@ def test_messages_in_the_name_of_the_estimator_stop_the_arm_and_change_nothing(
         arm.says('several publishers', 'estimator')
         graph.node.destroy_publisher(stranger)
         graph.wait(lambda: graph.call(Trigger, 'controller/reset').success, 'the reset')
-        # The estimator's own value has been received again.
+        # The reset succeeds only after the controller has received the estimator's own value again.
         assert core.stream.body.isolated == before.isolated == ()
         assert core.stream.body.offsets.known and not core.stream.body.offsets.offset.any()
         assert core.mae is network or core.mae.version == network.version

@@ -77,7 +77,7 @@ def test_large_messages_do_not_fill_the_memory(recording, monkeypatch):
 
 def test_old_recordings_are_deleted_and_other_folders_stay(recording, now, tmp_path):
     (tmp_path / 'stop_of_mine').mkdir()
-    (tmp_path / 'stop_20200101-000000-000000').mkdir()  # incomplete because of a kill
+    (tmp_path / 'stop_20200101-000000-000000').mkdir()  # a killed node left it without a bag
     for n in range(5):
         now[0] += 1_000_000
         recording.heard('muscle_states', states(float(n)))

@@ -75,7 +75,7 @@ def test_no_request_or_clock_ends_a_node(graph, node):
     names = [*PARAMETERS[node], 'use_sim_time', 'start_type_description_service', *NAMES]
     lists = [[], names, names[:1] * 3, *([name] for name in NAMES)]
     for value in strange_values():
-        # Set one bad parameter at a time, then all at once, then a legal one before illegal ones.
+        # Set all parameters to this strange value: first each for itself, then together.
         parameters = [Parameter(name=name, value=value) for name in names]
         results = graph.call(
             SetParameters, f'{node}/set_parameters', SetParameters.Request(parameters=parameters)
@@ -119,7 +119,7 @@ def test_no_request_or_clock_ends_a_node(graph, node):
     before = len(states(graph, node))
     graph.wait(lambda: len(states(graph, node)) > before + 1, 'its diagnostics')
     process, own = graph.processes[-1].process.pid, os.nice(0)
-    second = node in ('learner', 'sim')  # commands do not depend on these
+    second = node in ('learner', 'sim')  # low priority, because commands do not depend on them
     assert os.getpriority(os.PRIO_PROCESS, process) == (max(own, NICENESS) if second else own)
     values = {value.key: value.value for value in states(graph, node)[-1].values}
     counted = [key for key in values if 'ValueError' in key]
@@ -145,7 +145,7 @@ def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
     publisher.publish(DiagnosticArray(status=shouting))
     graph.wait(lambda: status.situation.samples, 'the message')
     status.anomalies.append(0.0)
-    status.started = 1.0  # long ago: the nodes have settled
+    status.started = 1.0  # so long ago that the status line no longer waits for the nodes
     status._print()
     printed = capsys.readouterr().out
     assert 'STOPPED' in printed and all(line.isprintable() for line in printed.splitlines())
@@ -157,7 +157,7 @@ def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
 def test_the_status_line_waits_for_a_slow_start_for_a_limited_time(graph):
     status = graph.host(BringupStatus, robot='arm26', duration=1e6, patience=0.01)
     status.anomalies.append(0.0)
-    status._print()  # the system has come up late
+    status._print()  # `patience` is over, but the system has come up: the status is printed
     status.begun -= 1e3
     status._print()
     status.started = None

@@ -90,14 +90,16 @@ def test_an_anomaly_cancels_the_validation_of_a_network(arm, trained):
 def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_nodes(
     arm, trained, monkeypatch
 ):
-    # Not proven in time, however slow the machine is.
+    # The new network must not be proven before the anomaly, however slow the machine is.
     monkeypatch.setattr(checkpoint_validation, 'PROOF', 1e6)
     nodes = arm.estimator, arm.controller
     first = trained['default'].version
     network = replace(trained['paper'], version=first + 1)
     rejected = -1
 
-    def is_used():  # on a busy machine, late messages may contradict a healthy network
+    # On a busy machine, late messages may contradict a healthy network, so that it is rejected.
+    # Send it again in this case.
+    def is_used():
         nonlocal rejected
         if arm.estimator.rejected[REFUSED] > rejected:
             rejected = arm.estimator.rejected[REFUSED]
@@ -141,7 +143,7 @@ def test_a_second_driver_of_the_same_name_stops_the_arm(arm):
     try:
         publisher = twin.create_publisher(Float64MultiArray, 'muscle_states', 10)
 
-        def repeat(message):  # a second publisher repeats the message
+        def repeat(message):  # publish the message a second time, unless it is itself such a copy
             if (data := bytes(message.data)) not in reported:
                 reported.add(data)
                 publisher.publish(message)
@@ -157,12 +159,13 @@ def test_impossible_lengths_stop_the_arm_with_their_cause_and_without_a_jump(arm
     arm.goes_to(HERE)
     done, _ = arm.graph.set_parameter('hardware_emulator', 'length_offset', [0.15])
     assert done
-    # The cause is a jump of a length, or implausible lengths.
+    # The reported cause is a jump of a length or an implausible length, whatever is noticed first.
     arm.says('stopped: muscle_states are implausible: length ')
     assert any(reason.startswith('muscle_states: length ') for reason in arm.estimator.rejected)
-    # The modules compare the command with their wrong lengths, and pull; they are paid out.
+    # The modules pull too hard, because they compare the command with wrong lengths. Such muscles
+    # may be paid out faster than the rate limit allows.
     arm.never_jumped(relieved=True)
-    # The stop may be late. Until then the modules follow MSC, so the arm moves a little.
+    # Until the arm stops, the modules follow MSC with the wrong lengths, so the arm moves a little.
     assert np.linalg.norm(arm.posture() - HERE) < 0.7
 
 
@@ -202,14 +205,14 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         graph.spin(0.01)
         assert time.monotonic() - started < DEADLINE
     assert node.core.supervisor.is_running
-    # By the steady clock, the trajectory would end after 0.6 s of simulated time.
+    # If the trajectory followed the steady clock, it would end after 0.6 s of simulated time.
     assert follower.trajectory.duration >= 2.0
     assert done_at - begun >= 0.9 * follower.trajectory.duration
     assert len(sent) > 0
 
 
 def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
-    # Without the length of this muscle, the estimate is too wrong for the controller to start.
+    # With this muscle ruptured, the estimate is so wrong that the controller does not start.
     muscle = 'deltoid_anterior'
     graph.host(HardwareEmulator, robot='arm26', seed=0, ruptured_muscles=[muscle])
     graph.listen(Float64MultiArray, 'muscle_states')

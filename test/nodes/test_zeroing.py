@@ -24,7 +24,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, faults=['unzeroed'])
     hardware.arm.step(10.0)
     node = graph.host(Estimator, **common)
-    # A large max_age tolerates late messages on a loaded machine.
+    # On a loaded machine messages arrive late. A large max_age avoids stops.
     controller = graph.host(Controller, **common, max_age=10.0)
     learner = graph.host(Learner, robot='arm26', state_directory=str(tmp_path))
     if stands:
@@ -42,7 +42,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     offset = hardware.arm.faults.zero
     assert np.abs(offset).min() > 0.05
     for other in nodes:
-        # The tolerance is large, because the network has learned only the geometric model.
+        # The calibration is inaccurate, because the network has learned only the geometric model.
         np.testing.assert_allclose(other.body.offsets.offset, offset, atol=0.03)
         assert not any('length' in reason for reason in other.rejected)
     assert controller.core.stream.body.offsets.known and controller.core.supervisor.is_running
@@ -71,7 +71,8 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
 
     reported(0.05, 0.0)
     graph.wait(lambda: controller.body.offsets.offset.all(), 'the zeros')
-    reported(0.0, 0.0)  # a restarted estimator publishes these
+    # A restarted estimator publishes these offsets, but they contradict the earlier ones.
+    reported(0.0, 0.0)
     known(False)
     reported(0.0, 0.0)
     graph.spin(0.3)

@@ -12,7 +12,7 @@ def test_preset_paper_moves_towards_forced_joint_angles(trained):
     arms.fixed[0] = [np.nan, -1.2]
     before = abs(arms.state.theta[0, 1] + 1.2)
     state = arms.step(1.0)
-    # Measured over five seeds: at most 0.02 of `before`.
+    # Over five seeds, the remaining distance was at most 0.02 times `before`.
     assert abs(state.theta[0, 1] + 1.2) < 0.1 * before
     assert np.all((state.theta >= robot.lower) & (state.theta <= robot.upper))
 

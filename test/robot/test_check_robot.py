@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.tools.check_robot import main
 from musculoskeletal_ae.tools.robot_report import plot
 
-#: a route that crosses no joint
+#: a route on a single link, which crosses no joint
 IDLE = [{'link': 'upper', 'xyz': [0.0, 0.03, z]} for z in (-0.1, -0.2)]
 SHIPPED = ['musashi_left_arm', 'musashi_upper_body', 'arm26']
 
@@ -89,7 +89,7 @@ def test_the_shipped_arms_are_sound_with_margin(name, seed):
     assert result.stiff.mean() >= 0.98
     singular = np.linalg.svd(result.moment_arms, compute_uv=False)[:, -1]
     assert np.percentile(singular, 5) >= 0.03
-    # The longest moment arm of the whole body is at the neck.
+    # The neck of the upper body has the longest moment arms.
     longest = 0.1 if name == 'musashi_upper_body' else 0.07
     assert np.abs(result.moment_arms).max() <= longest
 
@@ -138,7 +138,7 @@ def test_a_prismatic_joint_has_the_stiffness_of_a_pinion_that_moves_it(tmp_path)
     robot = Robot.load(write_robot(tmp_path, slider=True, stiffness=2000.0))
     result = check_robot(robot, 20)
     held = result.held
-    assert held.any()  # premise: some postures are held
+    assert held.any()  # premise of this test: the muscles can hold some postures
     theta, tension = result.setting.theta[held], result.tension[held]
     raw, k = robot.routes.muscle_jacobian, robot.muscle_stiffness(theta, tension)
     mixed = joint_stiffness(raw(theta), muscle_hessian(raw, theta), k, tension)
@@ -478,7 +478,9 @@ def test_a_remedy_written_into_muscles_yaml_does_what_it_says(tmp_path, case):
         changed = {key: dict(v) if isinstance(v, dict) else v for key, v in top.items()}
         changes = number.findall(line)
         if len(changes) != line.split('→')[0].count(',') + 1:
-            continue  # changes of mass, moment arms and limits are not in muscles.yaml
+            # The remedy also changes masses, moment arms or joint limits, which muscles.yaml does
+            # not contain.
+            continue
         for owner, name, value in changes:
             (changed.setdefault(owner, {}) if owner else changed)[name] = float(value)
         changed.setdefault('tension', {})['max'] = 2000.0
@@ -495,7 +497,8 @@ def test_a_limit_is_no_remedy_where_no_limit_holds_the_arm(tmp_path):
     directory = change(write_robot(tmp_path), drop_straighteners)
     lines, _ = remedies_of(directory, 'not_held')
     change(directory, lambda d: d.update(tension={'limit': 10000.0, 'max': 10000.0}))
-    assert check_robot(Robot.load(directory), 60).held.mean() < 0.95  # premise: not held
+    # Premise of this test: even huge limits do not hold the arm.
+    assert check_robot(Robot.load(directory), 60).held.mean() < 0.95
     assert all('not enough' in line for line in lines[:-1])
     assert lines[-1] == 'other routes may help: see --suggest'
 
@@ -514,7 +517,7 @@ def test_stiffness_is_no_remedy_if_the_elastic_element_is_too_soft(tmp_path):
     directory = write_robot(tmp_path, series_elastic=SOFT)
     lines, _ = remedies_of(directory, 'not_stiff')
     change(directory, lambda d: d.update(stiffness=1e8))
-    assert 'not_stiff' in kinds(directory)  # premise: even stiff modules are not enough
+    assert 'not_stiff' in kinds(directory)  # premise of this test: stiff modules are not enough
     (remedy,) = lines
     assert remedy.startswith('series_elastic.rate ')
 
@@ -528,7 +531,7 @@ def test_changes_that_suffice_only_together_are_reported_together(tmp_path):
 def test_a_negative_stiffness_is_called_unstable(tmp_path, capsys):
     directory = write_robot(tmp_path, stiffness=300.0)
     lowest = np.nanmin(check_robot(Robot.load(directory)).stiffness)
-    assert lowest < 0.0  # premise: a posture is unstable
+    assert lowest < 0.0  # premise of this test: the arm is unstable in a posture
     _, printed, _ = verdict(capsys, directory)
     assert 'fault: the arm is unstable in' in printed
     assert f'down to {lowest:.1f} N·m/rad' in printed

@@ -16,7 +16,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 from musculoskeletal_ae.simulation.load import Load
 
-ANGLES = np.array([-0.5, 0.1, 0.2])  # angles of bend, lift and swing
+ANGLES = np.array([-0.5, 0.1, 0.2])  # angles of bend, lift and swing [rad]
 COUPLED = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
 
 
@@ -104,7 +104,8 @@ def test_the_emulated_joint_follows_its_master(robot):
     arm.command_length(arm.sense().length - 0.01)
     arm.step(0.4)
     assert np.abs(arm.theta - before).max() > 0.01
-    # One muscle is attached to the link of the coupled joint.
+    # A muscle is attached to the link that the coupled joint moves, so its via points show whether
+    # the joint follows.
     np.testing.assert_allclose(
         arm.route_points(), robot.routes.points(arm.theta[None])[0], atol=1e-9
     )

@@ -47,7 +47,8 @@ ROUTE = ('muscles', 0, 'route')
 POINT = (*ROUTE, 1)
 AT_POINT = '$.muscles[0].route[1]'
 
-#: edits of muscles.yaml, and texts of the error: the place, the value and the legal values
+#: edits that make muscles.yaml illegal, and texts that the error must contain: the place of the
+#: fault, the value and the legal values
 BAD = {
     'unknown key': (put(['sped'], 1.0), ["$: unknown key 'sped'", 'joints, muscles']),
     'unknown key within': (put([*POINT, 'frame'], 1), [AT_POINT, "'frame'", 'link, xyz']),
@@ -171,7 +172,7 @@ def test_defaults_apply_where_the_optional_keys_are_left_out(tmp_path):
     tension = description.tension
     assert {*tension.bias} == {30.0} and {*tension.limit} == {200.0} and {*tension.max} == {500.0}
     assert {*description.stiffness} == {10000.0}
-    assert description.end_effector == 'tool'  # the last link of the chain
+    assert description.end_effector == 'tool'  # by default, the last link of the chain
     assert (description.series_elastic.force > 0.0).all()
 
 
@@ -222,7 +223,8 @@ def test_shipped_arms_have_the_sizes_and_names_the_paper_gives_them():
     arm = Robot.load('arm26')
     assert (arm.joint_count, arm.muscle_count) == (2, 6)
     arms = np.abs(arm.routes.muscle_jacobian(arm.random_postures(50, np.random.default_rng(0))))
-    assert (np.median(arms, axis=0) > 0.003).all(axis=1).sum() == 2  # biarticular
+    # Two muscles are biarticular: they have a moment arm at both joints.
+    assert (np.median(arms, axis=0) > 0.003).all(axis=1).sum() == 2
 
 
 @pytest.mark.parametrize(
@@ -243,7 +245,7 @@ def test_a_urdf_that_is_still_to_be_expanded_is_refused(tmp_path, old, new):
     refused(tmp_path, str(file), 'expand it first:  xacro FILE')
 
 
-# -- malicious or strange URDFs -------------------------------------------------------------------
+# -- malicious and strange URDFs ------------------------------------------------------------------
 
 
 def in_arm26(old, new):

@@ -39,8 +39,8 @@ from musculoskeletal_ae.simulation.load import Load
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.tools.robot_report import summary
 
-#: entries of joint_elasticity: a spring that opposes the bender, and a soft one that couples lift
-#: and swing
+#: entries of joint_elasticity: the spring of `bend` opposes the muscle that bends; the springs of
+#: `lift` and `swing` are softer and coupled
 SPRINGS = [
     {'joint': 'bend', 'stiffness': 9.0, 'rest_angle': 0.3, 'damping': 0.4},
     {'joint': 'lift', 'stiffness': 3.0, 'rest_angle': 0.1, 'coupled': {'swing': -1.5}},
@@ -277,7 +277,7 @@ def test_an_update_publishes_learned_springs_and_control_uses_them(springy):
         for torque in (core.robot.kinematics.holding_torque(theta), before)
     )
     assert off < 0.3 * nominal
-    # The original stays as it was.
+    # The estimator has a robot with the learned springs; the original must not change.
     assert springy.kinematics.elasticity is springy.description.joint_elasticity
 
 
@@ -288,7 +288,7 @@ def rests(robot, count):
         theta = robot.random_postures(1, rng)[0]
         try:
             rows.append((theta, holding_tension(robot, theta, rng.uniform(30.0, 150.0, 8))))
-        except InfeasibleError:  # a posture that cannot be held
+        except InfeasibleError:  # the muscles cannot hold this posture, so draw another one
             continue
     theta, tension = map(np.array, zip(*rows, strict=True))
     length = robot.muscle_lengths(theta, tension) + 1e-4 * rng.standard_normal(tension.shape)

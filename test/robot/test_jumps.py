@@ -62,7 +62,7 @@ def test_lengths_of_emulated_individuals_jump_only_where_the_models_do(
     robot, odd = (behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items())
     m, laid = robot.muscles.index('straightener'), body(robot, seed)
     monkeypatch.setattr(module, 'MOST_DRAWS', 0)
-    assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # premise: the length jumps
+    assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # premise: this length jumps
     assert not jumping(laid.absolute_lengths, robot).any()
     monkeypatch.undo()
     np.testing.assert_array_equal(

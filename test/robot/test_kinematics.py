@@ -49,7 +49,7 @@ def test_holding_gradient_is_the_derivative_of_the_holding_torque(robot):
     for theta in robot.random_postures(5, np.random.default_rng(8)):
         expected = slopes(kin.holding_torque, theta, 1e-5)
         np.testing.assert_allclose(kin.holding_gradient(theta), expected, atol=1e-7)
-        # A gradient of forces with a potential is symmetric.
+        # The gradient of a torque that has a potential, such as that of weight, is symmetric.
         np.testing.assert_allclose(expected, expected.T, atol=1e-7)
 
 

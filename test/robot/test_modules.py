@@ -68,7 +68,7 @@ def test_an_emulated_module_goes_to_its_position_at_its_speed_and_holds_it(tmp_p
     robot = Robot.load(write_robot(tmp_path, actuation='position', speed=0.05))
     arm = make_arm(robot, 0, reality)
     start = arm.sense().length
-    arm.step(1.0)  # no command has arrived yet
+    arm.step(1.0)  # before the first command, the module must hold its length
     assert np.abs(arm.sense().length - start).max() < 1e-3
     goal = start + np.linspace(0.005, 0.015, robot.muscle_count)
     arm.command_length(goal)
@@ -76,7 +76,7 @@ def test_an_emulated_module_goes_to_its_position_at_its_speed_and_holds_it(tmp_p
     assert np.abs(arm.sense().length - start).max() < 0.05 * 0.1 + 1e-3
     arm.step(0.4)
     np.testing.assert_allclose(arm.sense().length, goal, atol=1.5e-3)
-    arm.step(2.0)  # commands have stopped
+    arm.step(2.0)  # without further commands, the module must hold its position
     np.testing.assert_allclose(arm.sense().length, goal, atol=1.5e-3)
     with pytest.raises(MusculoskeletalError, match='follow lengths only'):
         arm.command_tension(goal)
@@ -90,7 +90,8 @@ def test_an_emulated_module_pulls_no_harder_than_its_largest_tension(tmp_path):
         arm.command_length(np.full(robot.muscle_count, -0.1))
         arm.step(0.01)
         most = max(most, float(arm.tension.max()))
-    assert 40.0 < most < 90.0  # muscles may briefly exceed their demand while joints move
+    # While joints move, tensions may briefly exceed `max` (60 N). At rest they do not.
+    assert 40.0 < most < 90.0
     assert arm.tension.max() < 63.0
 
 

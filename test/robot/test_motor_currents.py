@@ -25,7 +25,7 @@ PER_AMPERE = 100.0  # tension per motor current of DRIVE [N/A]
 BY_CURRENT = {'actuation': 'position', 'tension_source': 'current'}
 ROBOT = Robot(with_modules(Robot.load('arm26').description, **BY_CURRENT))
 COUNT = ROBOT.muscle_count
-PERIOD = 0.01  # [s]
+PERIOD = 0.01  # time between two messages [s]
 
 
 def array(states):
@@ -86,7 +86,8 @@ def test_scale_offset_and_drive_friction_are_removed_by_the_direction_of_motion(
 def test_a_drive_that_pays_out_against_its_friction_does_not_make_a_tendon_push():
     stream = MuscleStream(ROBOT)
     states = np.stack([np.zeros(COUNT), np.full(COUNT, -15.0), np.full(COUNT, 30.0)])
-    sample = stream.take_states(states, 0.0)  # legal, although no tension sensor reads -15 N
+    # −15 N is legal for a motor current: the drive brakes while it pays out.
+    sample = stream.take_states(states, 0.0)
     assert (sample.motor_tension == 0.0).all() and (sample.bone_tension == 0.0).all()
     assert (sample.tension_read == -15.0).all()
     with pytest.raises(RejectionError, match='tension beyond the maximum'):
@@ -103,7 +104,8 @@ def test_an_emulated_drive_reads_more_current_while_it_winds_in(reality):
             arm.step(PERIOD)
             read[way] = arm.sense().tension - arm.tension
         start = arm.sense().length
-    # Twice the drive friction, which is 0.1 T_limit on average, beside the error of the scale.
+    # Winding in adds the drive friction and paying out subtracts it. The difference is therefore
+    # twice the friction, which is 0.1 T_limit on average; the current also has an error of scale.
     share = (read[1.0] - read[-1.0]) / ROBOT.tension.limit
     assert 0.1 < np.median(share) < 0.35
 

@@ -21,7 +21,8 @@ def test_muscle_jacobian_is_the_derivative_of_length(robot):
 def test_muscle_jacobian_is_the_derivative_of_length_beyond_the_limits_too(angles):
     theta = np.array(angles)
     expected = slopes(MUSASHI.routes.absolute_lengths, theta)
-    # A line through a joint's centre has a large curvature, so a relative tolerance is needed.
+    # Where a tendon passes close to a joint's centre, its length is strongly curved. The numerical
+    # derivative is then less accurate, so a relative tolerance is needed.
     np.testing.assert_allclose(
         MUSASHI.routes.muscle_jacobian(theta), expected, atol=1e-6, rtol=1e-3
     )
@@ -73,7 +74,8 @@ def test_a_flexor_shortens_when_its_joint_flexes():
     robot = Robot.load('arm26')
     jacobian = robot.routes.muscle_jacobian(np.array([0.0, -0.8]))
     flexor, elbow = robot.muscles.index('brachialis'), robot.joints.index('elbow')
-    # Flexion is negative: l decreases with the angle, and the torque −G of a tension is negative.
+    # The elbow flexes towards negative angles. Then l shortens, so G is positive, and the torque
+    # −G T is negative.
     assert jacobian[flexor, elbow] > 0.0
 
 

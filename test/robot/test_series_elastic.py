@@ -87,7 +87,7 @@ def test_the_tool_fits_the_shipped_table_to_its_noise(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'series_elastic: {force: ' in printed
     rms = float(printed.split('rms ')[1].split(' mm')[0])
-    assert 0.05 < rms < 0.15  # the noise in the table is 0.1 mm
+    assert 0.05 < rms < 0.15  # the lengths in the table have a noise of 0.1 mm
     assert (tmp_path / 'fit.png').read_bytes().startswith(b'\x89PNG')
 
 

@@ -23,7 +23,8 @@ def poor_arm(directory, spread=0.03):
     for muscle in document['muscles']:
         for point in muscle['route']:
             point['xyz'] = (point['xyz'] + rng.uniform(-spread, spread, 3)).tolist()
-    # The suggestion must keep a wrap, a repeated point, values of one muscle and another default.
+    # Add entries that the suggestion must keep: a wrapped object, a point that occurs twice, the
+    # limit of a single muscle, and a stiffness other than the default.
     document['muscles'][4]['route'].insert(2, WRAP)
     document['muscles'][5]['route'].insert(1, dict(document['muscles'][5]['route'][0]))
     document['muscles'][0]['tension'] = {'limit': 190.0}
@@ -65,16 +66,17 @@ def test_a_poor_arm_becomes_sound_by_via_points_moved_within_reach(tmp_path, cap
     mesh.parent.mkdir()
     mesh.write_bytes(b'solid')
     before = check_robot(Robot.load(arm), 400, seed=9)
-    assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}  # premise: faulty
+    # Premise of this test: the arm has faults.
+    assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}
     assert suggest(arm, out, '--reach', reach) == 0
     printed = capsys.readouterr().out
     assert 'better: sound' in printed
     assert 'changes the sign of its main action' not in printed.split(str(out))[1]
-    # Check the result in postures that neither the search nor the check above used.
+    # The search did not use the postures of this check, which has another seed.
     assert check_robot(Robot.load(out), 400, seed=9).faults == ()
     distance = np.linalg.norm(points(out) - points(arm), axis=1)
     assert 0.0 < distance.max() < reach
-    assert np.median(distance) < 1e-8  # most points are not moved
+    assert np.median(distance) < 1e-8  # most points stay where they were
     assert without_points(out) == without_points(arm)
     for name in ('robot.urdf', 'moment_arms.csv', 'meshes/hand.stl'):
         assert (out / name).read_bytes() == (arm / name).read_bytes()

@@ -14,14 +14,15 @@ LOW, HIGH = 30.0, 200.0
 def test_the_programme_finds_the_nearest_feasible_tension(seed, desired):
     rng = np.random.default_rng(seed)
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
-    inside = rng.uniform(LOW, HIGH, 8)  # so that a solution exists
+    # Compute the torque from legal tensions, so that a solution exists.
+    inside = rng.uniform(LOW, HIGH, 8)
     torque = -jacobian.T @ inside
     programme = TensionProgramme(jacobian, torque, LOW, HIGH)
     tension = programme.nearest(desired)
     np.testing.assert_allclose(-jacobian.T @ tension, torque, atol=1e-8)
     assert (tension >= LOW - 1e-8).all()
     assert (tension <= HIGH + 1e-8).all()
-    # The optimum of a convex problem: the cost increases towards every feasible point.
+    # At the optimum of a convex problem, the cost increases towards every other feasible point.
     for other in [inside, programme.nearest(0.0), programme.nearest(150.0)]:
         assert (tension - desired) @ (other - tension) >= -1e-6
 
@@ -40,7 +41,7 @@ def test_a_joint_without_muscles_and_without_load_is_held():
 
 def test_limits_may_differ_between_muscles():
     jacobian = np.array([[0.05], [-0.05], [0.05]])
-    high = np.array([200.0, 200.0, 0.0])  # the third is ruptured
+    high = np.array([200.0, 200.0, 0.0])  # the third muscle is ruptured
     programme = TensionProgramme(jacobian, np.array([-1.0]), np.array([30.0, 30.0, 0.0]), high)
     np.testing.assert_allclose(programme.nearest(60.0), [70.0, 50.0, 0.0], atol=1e-6)
 
@@ -62,7 +63,7 @@ def test_the_programme_is_solved_with_muscles_of_equal_bounds(seed, share):
     rng = np.random.default_rng(seed)
     jacobian = rng.uniform(-0.06, 0.06, (8, 3))
     torque = -share * jacobian.T @ rng.uniform(LOW, HIGH, 8)
-    high = np.where(rng.random(8) < 0.5, LOW, HIGH)  # half of them limited to T_bias by heat
+    high = np.where(rng.random(8) < 0.5, LOW, HIGH)  # heat limits about half of them to T_bias
     tension, missing = least_tension(jacobian, torque, LOW, high)
     assert (tension >= LOW - 1e-6).all()
     assert (tension <= high + 1e-6).all()

@@ -49,9 +49,9 @@ def robot(request, tmp_path_factory):
 @pytest.mark.parametrize(
     ('start', 'end', 'expected'),
     [
-        ([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], 1.0),  # misses the ball
-        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # just touches the ball
-        # straight at the centre: two tangents and an arc
+        ([1.0, -0.5, 0.0], [1.0, 0.5, 0.0], 1.0),  # the tendon misses the ball
+        ([1.0, -0.5, 0.0], [-1.0, -0.5, 0.0], 2.0),  # the tendon just touches the ball
+        # The straight line passes through the centre of the ball: two tangents and an arc.
         ([1, 0, 0], [-1, 0, 0], 2 * np.sqrt(0.75) + 0.5 * (np.pi - 2 * np.arccos(0.5))),
     ],
 )
@@ -75,7 +75,8 @@ def test_wrapping_never_shortens_and_pulls_with_unit_force(start, end, radius):
 
 
 def test_a_tendon_over_a_drum_is_the_geodesic():
-    # The tendon makes half a turn between two tangents and rises by 0.2 m.
+    # Unrolled, the path is straight: two tangents of 0.3 m and half a turn around the drum, while
+    # the tendon rises by 0.2 m.
     flat = 2 * 0.3 + np.pi * 0.1
     length, leave, _ = wire([0.1, -0.3, 0], [-0.1, -0.3, 0.2], 0.1, (0, 0, 1), [0, 5, 0])
     assert length == pytest.approx(np.hypot(flat, 0.2))
@@ -154,5 +155,5 @@ def test_the_drawn_line_is_as_long_as_the_muscle(robot):
         lines = draw_arm(robot, posture, np.full(robot.muscle_count, 50.0))
         muscles = [line.points for line in lines if line.kind == 'muscles']
         drawn = [np.linalg.norm(np.diff(points, axis=0), axis=1).sum() for points in muscles]
-        # The drawn chords, each over an eighth of the arc, are a little shorter than the arc.
+        # An arc is drawn as eight chords, which are together a little shorter than it.
         np.testing.assert_allclose(drawn, robot.routes.absolute_lengths(posture), atol=2e-4)

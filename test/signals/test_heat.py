@@ -100,7 +100,8 @@ def test_the_winding_temperature_is_estimated_after_twenty_minutes(seed):
     assert last.mean() < 4.0
     assert last.mean() < first.mean()
     through = motors.arm.winding - motors.arm._muscle.housing
-    assert last.mean() < 0.5 * through.mean()  # mean errors of the housing's temperature
+    # The error must be much smaller than if the housing's temperature were taken for the winding's.
+    assert last.mean() < 0.5 * through.mean()
     assert motors.heat.changed == {}
 
 
@@ -114,7 +115,7 @@ def test_a_muscle_held_at_its_limit_reaches_the_highest_temperature_and_no_more(
     assert (motors.heat.core <= HIGHEST + 0.5).all()
     assert (motors.heat.core > HIGHEST - 10.0)[hot].all()
     assert (motors.arm.winding < HIGHEST + held[-1] + 0.5).all()
-    # While the muscle rests at T_bias, its motor cools, and the limit rises again.
+    # While the muscles rest at T_bias, their motors cool, and their limits rise again.
     motors.run(300, TENSION.bias)
     assert (motors.heat.limits(HIGHEST)[0] > limit)[hot].all()
 
@@ -141,9 +142,9 @@ def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, 
     motors.run(600)
     assert set(motors.heat.changed) == {2}
     assert motors.core.cause.startswith(f'{ROBOT.muscles[2]}: its module ')
-    motors.core.heat.accept(3)  # the module was replaced
+    motors.core.heat.accept(3)  # another module than the changed one was replaced
     assert set(motors.heat.changed) == {2}
-    motors.core.reset()  # the present state counts as healthy
+    motors.core.reset()  # after a reset, the present state of all modules counts as healthy
     motors.run(60)
     assert motors.core.cause == ''
 
@@ -205,6 +206,6 @@ def test_an_intermittent_thermometer_does_not_disturb_the_other_muscles():
     np.testing.assert_allclose(flaky.heat.core[others], sound.heat.core[others], atol=0.1)
     for known, observed in zip(sound.heat.limits(HIGHEST), flaky.heat.limits(HIGHEST), strict=True):
         np.testing.assert_allclose(observed[others], known[others], atol=0.5)
-    # The estimated temperature of this muscle's winding continues to rise.
+    # The winding temperature of the muscle with the intermittent thermometer is still estimated.
     flaky.heat.step(TENSION.limit, read[0] + 24.0, 0.25)
     assert flaky.heat.core[1] > AIR + 40.0

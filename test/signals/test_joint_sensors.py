@@ -108,7 +108,7 @@ def test_a_sensor_that_repeats_a_reading_while_the_joint_moves_is_stuck():
     read[500:1000, 1] = read[500, 1]
     (fault,) = stuck_sensors(robot, time, read, length, tension)
     assert fault == (STUCK, (1,), time[500], time[999])
-    # A joint that rests repeats its reading as well, if the sensor has no noise.
+    # If a joint rests and its sensor has no noise, the reading repeats as well. This is no fault.
     resting = np.where(np.arange(2000)[:, None] // 500 == 1, theta[500], theta)
     resting[:, 0] = theta[:, 0]
     length = robot.muscle_lengths(resting, tension)

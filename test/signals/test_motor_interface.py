@@ -101,7 +101,7 @@ def test_a_repeated_message_is_rejected_by_its_stamp_until_the_clock_is_set_back
     interface.reading(joint_state(stamp=5))
     assert refused(joint_state(stamp=5), interface) == 'repeated stamp'
     interface.reading(joint_state(stamp=6))
-    interface.reading(joint_state(stamp=2))  # the clock has jumped back
+    interface.reading(joint_state(stamp=2))  # an earlier stamp, as after the clock was set back
     interface.reset()
     interface.reading(joint_state(stamp=2))
 

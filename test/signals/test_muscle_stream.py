@@ -127,7 +127,7 @@ def test_a_rejected_message_contains_the_tensions_that_last():
     stream = MuscleStream(ROBOT, window=3)
     for n in range(30):
         states = resting(length=(1, 0.1 * (n >= 20)), tension=(1, 300.0))
-        states[1, 2] = 400.0 * (n == 25)  # a glitch
+        states[1, 2] = 400.0 * (n == 25)  # a glitch of a single message
         try:
             stream.take_states(states, n * PERIOD)
         except RejectionError as rejection:
@@ -241,7 +241,7 @@ def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
 def test_tendon_friction_is_removed_by_the_direction_of_sliding():
     stream = MuscleStream(ROBOT)
     stream.use_transmission(Transmission(np.full(M, 0.1)))
-    for n in range(100):  # every tendon is wound in, so T exceeds T_end
+    for n in range(100):  # every tendon is wound in, so the motor-side tension exceeds T_end
         states = resting()
         states[0] -= 1e-4 * n
         sample = stream.take_states(states, n * PERIOD)

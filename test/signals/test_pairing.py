@@ -49,7 +49,7 @@ def paired_live(joints, muscles, period):
 
 
 def paired_by_definition(joints, muscles, period):
-    """Return the same from all times at once, by the definition: the nearest θ."""
+    """Return what `paired_live` returns, computed by the definition: each takes its nearest θ."""
     owners = [min(muscles, key=lambda m: abs(m - time), default=None) for time in joints]
     return [
         min(
@@ -72,7 +72,7 @@ def test_each_angle_is_paired_once_with_the_message_it_is_nearest_to(joints, mus
 @given(st.lists(st.tuples(times, st.integers(1, 7)), max_size=3), times, st.integers(2, 40))
 def test_each_joint_is_paired_as_if_it_were_alone(publishers, muscles, period):
     """Each of several nodes publishes some of three joints."""
-    sent = {}  # published joints by time; no two messages have the same time
+    sent = {}  # mask of the published joints, by time; no two messages have the same time
     for moments, joints in publishers:
         for time in moments:
             sent.setdefault(time, np.array([joints >> j & 1 for j in range(3)], dtype=bool))

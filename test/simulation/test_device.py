@@ -37,7 +37,7 @@ class Devices(TorchFunctionMode):
 def robot(request, tmp_path_factory):
     if request.param != 'slider':
         return Robot.load(request.param)
-    # A robot with two groups, a prismatic joint and a coupled joint.
+    # This robot has two groups, a prismatic joint and a coupled joint.
     coupled = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
     folder = tmp_path_factory.mktemp('slider')
     return Robot.load(write_robot(folder, slider=True, finger=True, couplings=[coupled]))
@@ -64,7 +64,7 @@ def test_torch_agrees_with_numpy(robot, mae):
     one, other = (pushed(robot, mae, device) for device in (None, 'cpu'))
     for _ in range(3):
         for ours, theirs in zip(one.step(0.02), other.step(0.02), strict=True):
-            # Networks compute in single precision, and stiff muscles amplify the rounding errors.
+            # The tolerance covers rounding errors of single precision, which stiff muscles amplify.
             np.testing.assert_allclose(theirs, ours, rtol=1e-4, atol=1e-2)
         np.testing.assert_allclose(other.state.theta, one.state.theta, atol=1e-5)
         assert other.report() == one.report()
@@ -76,7 +76,9 @@ def test_torch_agrees_with_numpy(robot, mae):
 def test_a_step_agrees_with_an_implementation_in_torch(robot, mae):
     arms = pushed(robot, mae, None)
     other = EagerSimulation(arms)
-    for _ in range(5):  # in later steps, one may reach a stop before the other
+    # Take few steps: later, rounding may let one simulation reach a joint limit earlier than the
+    # other, and their states would then differ.
+    for _ in range(5):
         ours, theirs = arms.step(0.01), other.step(0.01)
     for name, atol in {'theta': 1e-4, 'tension': 0.1, 'length': 1e-5, 'followed': 1e-5}.items():
         np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), atol=atol)

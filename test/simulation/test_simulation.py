@@ -85,7 +85,7 @@ def test_the_arm_rests_at_the_equilibrium_of_the_geometric_model(robot, body, co
     arms = settled(robot, body, commands)
     for i, command in enumerate(commands):
         if arms.limits(i):
-            continue  # `rest_of_body` models joint stops as springs, so it differs at a limit
+            continue  # at a joint limit the results differ: `rest_of_body` has springs as stops
         rest = rest_of_body(robot, arms.state, command, i)
         np.testing.assert_allclose(arms.state.theta[i], rest.theta, atol=1e-4)
         np.testing.assert_allclose(arms.state.tension[i], rest.tension, atol=0.1)
@@ -169,7 +169,8 @@ def test_a_command_out_of_reach_ends_at_the_limits_and_is_reported(robot, body):
     arms.isolate([0])
     assert robot.muscles[0] not in arms.limits()
     arms.isolate([])
-    # No error has accumulated: half a second later, the tension has fallen to T_bias.
+    # The extreme command must leave nothing behind: with long target lengths, all tensions fall to
+    # T_bias within 0.5 s.
     arms.command = np.full((1, robot.muscle_count), 1e9)
     assert arms.step(0.5).tension.max() < robot.tension.bias[0] + 1.0
 
@@ -188,7 +189,7 @@ def test_speeds_stay_limited_when_the_command_jumps(robot, body, commands):
     for _ in range(100):
         state = arms.step(0.01)
         assert np.abs(state.theta - before.theta).max() <= JOINT_SPEED * 0.01 + 1e-12
-        # at most 0.25 m/s · K_stiff · 10 ms
+        # T may change by K_stiff times the largest travel in 10 ms at 0.25 m/s.
         assert np.abs(state.tension - before.tension).max() < 25.0
         before = state
 
@@ -203,7 +204,8 @@ def test_a_long_step_agrees_with_many_short_ones(robot, body, commands):
 
 
 def test_one_arm_and_a_batch_agree(robot, body, commands, monkeypatch):
-    monkeypatch.setattr(simulation, 'CHUNK', 5)  # the last piece is smaller; all cores are used
+    # Small pieces make the batch use all cores; the last piece is smaller than the others.
+    monkeypatch.setattr(simulation, 'CHUNK', 5)
     rng = np.random.default_rng(0)
     wrench = rng.normal(0.0, 8.0, (len(commands), 6))
     fixed = np.where(rng.uniform(size=(len(commands), 5)) < 0.2, -0.2, np.nan)
@@ -234,7 +236,7 @@ def test_friction_holds_the_arm_after_winding_in(robot, commands, friction):
     left = robot.kinematics.holding_torque(before.theta) + pull
     free = (before.theta > robot.lower) & (before.theta < robot.upper)
     np.testing.assert_allclose(left[free], 0.0, atol=1e-3)
-    # With friction, winding in and back does not restore the state.
+    # With friction, winding in and paying out by the same length does not restore the state.
     for way in (0.01, 0.0):
         arms.command = commands - way
         arms.settle()
@@ -247,7 +249,7 @@ def test_friction_holds_the_arm_after_winding_in(robot, commands, friction):
 def test_with_a_network_the_arm_rests_at_the_equilibrium_of_the_nominal_body(arm26, mae):
     commands = random_commands(arm26, 10, seed=2)
     theta, _, drift, tension_drift = rest_errors(arm26, mae, 'default', commands)
-    # Networks of five training seeds had at most 0.004 rad, 1e-6 rad and 1e-4 N.
+    # Networks of five training seeds had at most 0.004 rad (error), 1e-6 rad and 1e-4 N (drift).
     assert np.median(theta.max(axis=1)) < 0.02
     assert drift.max() < 1e-4
     assert tension_drift.max() < 0.05
@@ -264,7 +266,8 @@ def test_with_a_network_one_arm_and_a_batch_agree(arm26, mae):
         single.command, single.wrench = commands[[i]], batch.wrench[[i]]
         for name, ours in single.step(0.3)._asdict().items():
             theirs = getattr(batch.state, name)[i]
-            # The rounding error of 1 µm in single precision is large relative to REVERSAL.
+            # Single precision rounds lengths to 1 µm. `slid` divides them by REVERSAL, so its error
+            # is larger than that of the other values.
             atol = 1e-6 / REVERSAL if name == 'slid' else 1e-5
             np.testing.assert_allclose(ours[0], theirs, rtol=1e-5, atol=atol)
 

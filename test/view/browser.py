@@ -25,13 +25,13 @@ OPTIONS = (
     '--remote-allow-origins=*',
     '--hide-scrollbars',
 )
-DEADLINE = 120.0  # [s]
-#: a low frame rate, because without a graphics card each frame occupies a core
+DEADLINE = 120.0  # longest wait for the browser [s]
+#: script that lowers the frame rate, because drawing without a graphics card occupies a core
 SLOWLY = """
 const soon = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 300);
 """
-#: every text on the page, shadow trees excepted
+#: expression for all text on the page, without that in shadow trees
 TEXT = 'document.body ? document.body.innerText : ""'
 
 
@@ -94,7 +94,7 @@ class Browser:
         while True:
             answer = json.loads(self._socket.recv(timeout=DEADLINE))
             if answer.get('id') == message['id']:
-                # While a page is loading there is no context for evaluation.
+                # An error is no failure: while a page is loading, no expression can be evaluated.
                 return answer.get('result') or {'result': {}, 'error': answer.get('error')}
 
     def evaluate(self, expression: str) -> Any:

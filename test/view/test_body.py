@@ -90,7 +90,7 @@ def test_ruptured_isolated_and_suspect_muscles_look_different(robot, theta):
     ).all()
     looks = {tuple(colour) for colour in tubes['batched_colors']}
     assert len(looks) == 4
-    # Colours differ in luminance as well as in hue.
+    # The colours must differ in luminance, for people who do not distinguish all hues.
     light = sorted(np.dot(look, [0.2126, 0.7152, 0.0722]) for look in looks)
     assert np.diff(light).min() > 15.0
 
@@ -99,7 +99,7 @@ def test_links_are_drawn_by_the_meshes_of_the_urdf_or_else_by_capsules(tmp_path)
     folder = tmp_path / 'arm'
     shutil.copytree(Robot.load('arm26').description.directory, folder)
     solids, notes = link_solids(Robot.load(folder))
-    assert len(solids) == 2 and not notes  # upper arm and forearm, which hang down
+    assert len(solids) == 2 and not notes  # capsules of the upper arm and the forearm
     elbow = Robot.load('arm26').kinematics.tree.placement_translation[2, 2]
     low, high = solids[0][1].bounds[:, 2]
     assert low < elbow < low + 0.03 and high - 0.03 < 0.0 < high
@@ -119,7 +119,7 @@ def test_links_are_drawn_by_the_meshes_of_the_urdf_or_else_by_capsules(tmp_path)
     (folder / 'robot.urdf').write_text(urdf)
     robot = Robot.load(folder)
     ((joint, mesh), (other, _)), notes = link_solids(robot)
-    # A capsule of the forearm, which has no mesh.
+    # The upper arm is drawn by its one readable mesh, the forearm by a capsule.
     assert [robot.kinematics.model.names[j] for j in (joint, other)] == ['shoulder', 'elbow']
     np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.05, -0.2], [0.05, 0.05, 0.0]])
     assert [any(word in note for note in notes) for word in ('no regular', 'No such', '.stl, .obj')]

@@ -36,7 +36,7 @@ from musculoskeletal_ae.view.readings import History, scale_top
 from view.browser import Browser, find_chromium
 
 SCREENSHOTS = Path(__file__).parents[2] / 'log' / 'view'
-#: first message of a browser: the visitor's camera
+#: content of the first message that a browser sends: the visitor's camera
 CAMERA = {
     'wxyz': (1.0, 0.0, 0.0, 0.0), 'position': (1.0, 1.0, 1.0), 'fov': 0.8, 'near': 0.01,
     'far': 100.0, 'image_height': 100, 'image_width': 100, 'look_at': (0.0, 0.0, 0.0),
@@ -114,7 +114,8 @@ def test_the_camera_sees_the_whole_arm_in_every_posture(robot, width, height, tm
         side = np.cross(ahead, [0.0, 0.0, 1.0])
         side /= np.linalg.norm(side)
         to = np.array(visible) - eye
-        # Half of the height is 0.4 rad; the panels cover 330 or 680 pixels of the width.
+        # The camera sees 0.4 rad above and below its axis. The panels cover 330 pixels of the width
+        # on a narrow page, and 680 pixels otherwise.
         free = width - (330 if is_narrow else 680)
         up = np.abs(to @ np.cross(side, ahead)) / (to @ ahead)
         assert up.max() < math.tan(0.4)
@@ -128,7 +129,8 @@ def test_values_that_are_not_known_are_not_drawn():
     for time, known in enumerate([1, 1, 0, 0, 1, 1, 0]):
         history.add(0.5 * time, [0.2 if known else math.nan, math.nan])
     time, values = history.curve([0])
-    np.testing.assert_allclose(time, [-1.0, -0.5])  # since the gap, until it was known last
+    # The curve begins after the last gap, and ends with the last known value.
+    np.testing.assert_allclose(time, [-1.0, -0.5])
     np.testing.assert_allclose(values, 0.2)
     assert all(len(line) == 0 for line in history.curve([1]))
 
@@ -190,17 +192,17 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
     graph.wait(lambda: graph.received['estimated_joint_states'], 'the estimate')
     port = view()
     topic = f'{graph.namespace}/anomaly'
-    assert graph.node.count_subscribers(topic) == 0  # there is no visitor
+    assert graph.node.count_subscribers(topic) == 0  # without a visitor, the page does not listen
     page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}')
 
     def see(text: str) -> None:
         graph.wait(lambda: text in page.text, f'{text!r} on the page')
 
     try:
-        # Nodes are discovered one after the other.
+        # Controls and readings appear as their nodes are discovered, one after the other.
         for text in ('Faults of the', 'error 0.', 'triceps_long', 'Explore', 'Stop', 'payload'):
             see(text)
-        assert 'Recording' not in page.text  # no bag is played
+        assert 'Recording' not in page.text  # this panel appears only while a bag is replayed
         page.close_notifications()
         before = page.screenshot(SCREENSHOTS / 'loaded.png')
         page.click(*page.centre('Explore'))
@@ -222,7 +224,9 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.click(*page.centre('Rupture'))
         see('ANOMALY: ')
         assert detected[-1].data
-        page.click(*page.centre('Reset after a stop'))  # otherwise it would stop again
+        # The page must refuse this as long as the muscle is ruptured, because the arm would stop
+        # again.
+        page.click(*page.centre('Reset after a stop'))
         see('press "Repair" first')
         assert 'controller/reset' not in page.text
         graph.spin(1.0)
@@ -275,7 +279,7 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
         lambda: graph.report('view').message == 'the page has no visitors', 'its diagnostics'
     )
 
-    def answer(request, response):  # like a node without these parameters
+    def answer(request, response):  # answer as a node that does not have these parameters
         asked.append(request)
         response.values = [ParameterValue() for _ in request.names]
         return response
@@ -288,7 +292,7 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
 
         def shown():
             joints.publish(JointState(name=arm26.joints, position=[1e308, -1e308]))
-            return len(asked) > 2  # once a second, after the picture
+            return len(asked) > 2  # the page asks for parameters once a second, after drawing
 
         graph.wait(shown, 'the page to go on')
         rate = 'estimated_joint_states rate'
@@ -309,7 +313,7 @@ def test_a_browser_can_change_only_the_values_of_controls(graph, arm26):
             mine.send(b'no message')
             for updates in {'update_cb': []}, 5, {'value': float(slider.max)}:
                 mine.send(msgspec.msgpack.encode({**control, 'updates': updates}))
-            # Otherwise the slider would move without an effect.
+            # A legal value must not only move the slider, but also request a target.
             graph.wait(lambda: asked, 'what the visitor asked for')
         assert asked == [('targets', {arm26.joints[0]: pytest.approx(slider.max)})]
     finally:
