@@ -28,8 +28,8 @@ class Inputs(NamedTuple):
 class ActivityControl(ABC):
     """Commands the arm during one activity.
 
-    The controller asks after each step what follows from it; the defaults are those of an activity
-    that needs and changes nothing.
+    After each step, the controller reads the properties below. Their defaults are those of an
+    activity that needs nothing else from the controller.
     """
 
     @abstractmethod
@@ -46,12 +46,12 @@ class ActivityControl(ABC):
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether it needs a new trajectory from the present posture to the target."""
+        """Whether the activity needs a new trajectory from the present posture to the target."""
         return False
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the motion that it was asked for has ended."""
+        """Whether the requested motion has ended."""
         return False
 
     @property

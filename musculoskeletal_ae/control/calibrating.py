@@ -35,8 +35,8 @@ class Calibrating(ActivityControl):
 
     Only differences of lengths are used, so that the length offsets cancel. θ_est and G may be
     wrong; muscle stiffness control turns these errors into tension errors, which are limited.
-    Goals cover the whole joint range. Each is approached by a short step and held with random
-    tensions. The calibration needs such varied postures and tensions, because it infers the
+    Each step leads a short way towards a random goal in the joint range. The arm is held there with
+    random tensions. The calibration needs varied postures and tensions, because it infers the
     posture from the torques that the tensions exert through G.
     """
 
@@ -47,7 +47,10 @@ class Calibrating(ActivityControl):
         self.use(robot, settings)
 
     def use(self, robot: Robot, _: Settings) -> None:
-        """Use another robot description, in which isolated muscles have no tension."""
+        """Use another robot description.
+
+        `robot` must already describe isolated muscles as muscles without tension.
+        """
         self._robot = robot
 
     def enter(self, _: Inputs) -> None:
@@ -69,9 +72,10 @@ class Calibrating(ActivityControl):
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:
-        """Return the lengths [m] (M,) of the first holdable goal.
+        """Return the length command [m], (M,), at the end of a step towards a random goal.
 
-        If no goal is holdable, the one with the least missing torque is used.
+        Of GOALS random goals, the first one is used whose step ends in a holdable posture. If there
+        is none, the goal with the least missing torque is used.
         """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
         tension = inputs.sample.model_tension * inputs.sample.usable

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exploration: random motion that collects training data.
 
-The preset draws the steps (`Preset.exploration`). Preset `default` draws some joints' targets at
-their limits, because joint-sensor offsets are identified from the stops (`learning.stops`). Of
-several random T_const it uses the one that presses these joints most strongly against their stops.
+The preset draws the steps (`Preset.exploration`). Preset `default` puts the targets of some joints
+at their limits, because the learner identifies joint-sensor offsets from joints at their stops
+(`learning.stops`). Of several random T_const, this preset uses the one that presses these joints
+most strongly against their stops.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -24,7 +25,7 @@ from musculoskeletal_ae.robot.tension import holding_tension
 
 TRIES = 1000  # largest number of random postures in which holdable ones are sought
 AT_LIMITS = 0.25  # fraction of each joint's targets that are at one of its limits
-SMALL = 1e-9  # smallest torque by which pressures are divided [N·m]
+SMALL = 1e-9  # lower bound of the divisor by which torques are scaled [N·m]
 PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
 
 
@@ -40,7 +41,7 @@ class Step(NamedTuple):
 
 
 class Exploration:
-    """A reproducible stream of steps; a new iterator continues it at a new posture."""
+    """A reproducible stream of steps; a new iterator continues the stream at a new posture."""
 
     def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
         """Draw the steps of a preset for `robot`."""
@@ -156,6 +157,6 @@ class Exploring(ActivityControl):
     def theta(self) -> Array | None:
         """The posture to which the arm moves [rad], (D,); None before the first one.
 
-        It is no target of a user. Joints that a later target does not name keep their angles.
+        This is not a target of the user, and does not replace `Controller.target_state`.
         """
         return self._theta

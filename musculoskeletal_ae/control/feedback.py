@@ -13,7 +13,8 @@ from musculoskeletal_ae.robot.tension import least_tension
 REPLAN = 5.0  # change of a relevant tension limit that requires a new plan [N]
 CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times RACK [m]
 #: Largest estimated error that is not corrected [rad], for prismatic joints times RACK [m]. It is
-#: about the error of the estimate. Without a dead band, an arm with friction would never rest.
+#: about as large as the error of the estimate. Without this dead band, an arm with friction would
+#: never rest.
 DEADBAND = 0.03
 RELIEF_INTERVAL = 0.1  # time between two computations of the needless tension [s]
 SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
@@ -40,19 +41,20 @@ class RestFeedback:
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
         dr/dt = gain (T − T*)/K_stiff,           |r| ≤ R             where T > T*
               = gain min(T_end − T*, 0)/K_stiff                      elsewhere
-        (T and T_end are clipped to T_bias … T_limit)
+        (T and T_end are clipped to T_bias … T_limit; R is `Actuation.largest_relief`)
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
     Friction and network errors leave the arm away from its target; the estimate contains most of
-    this error (arXiv 2405.11808). They also cause antagonistic muscles to pull against each other,
-    because a length error causes a tension error of K_stiff times its size. T* exerts the joint
-    torque of T_end, so that the relief moves no joint. A tendon that was wound in is paid out until
-    friction no longer retains tension in it. A tendon that was paid out is not paid out further,
-    because friction already supports the arm there.
+    this error (arXiv 2405.11808). Friction and network errors also cause antagonistic muscles to
+    pull against each other, because a length error causes a tension error of K_stiff times the
+    length error. T* exerts the same joint torque as T_end, so that the relief moves no joint. A
+    tendon that was wound in is paid out until friction no longer retains tension in it. A tendon
+    that was paid out is not paid out further, because friction already supports the arm there.
 
     Position-controlled modules do not hold T_bias. For them K_stiff is the stiffness of the
-    series elastic element, T may be below T_bias, and R is larger: a slack tendon is wound in.
+    series elastic element, and T may be below T_bias. R is larger, so that slack tendons are wound
+    in.
 
     Attributes:
         correction: c [rad], (D,).
@@ -68,7 +70,10 @@ class RestFeedback:
         self.moving()
 
     def use(self, robot: Robot) -> None:
-        """Use another robot description, in which isolated muscles have no tension."""
+        """Use another robot description.
+
+        `robot` must already describe isolated muscles as muscles without tension.
+        """
         self._robot = robot
 
     def reset(self) -> None:
@@ -83,7 +88,7 @@ class RestFeedback:
     def step(
         self, error: Array, jacobian: Array, pull: Pull, limit: Array, gain: float, dt: float
     ) -> bool:
-        """Integrate over dt [s] if the arm rests; return whether it did so.
+        """Integrate the errors over dt [s] if the arm rests; return whether it rests.
 
         Args:
             error: θ_target − θ_estimated [rad], (D,).

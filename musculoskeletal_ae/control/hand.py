@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Converts poses and twists of the hand into joint trajectories.
 
-Inverse kinematics converts a pose into joint angles. It starts from the desired posture, so that it
-finds the nearest of several solutions. The solution has to be within the joint limits and holdable
-with the learned G; otherwise the pose is refused. With `unreachable: nearest` the hand moves as
-close to the pose as the joint limits and the muscles allow.
+Inverse kinematics converts a pose into joint angles. The search starts from the present setpoint,
+so that it finds the nearest of several solutions. The solution has to be within the joint limits
+and holdable with the learned G; otherwise the pose is refused. With `unreachable: nearest` the hand
+moves as close to the pose as the joint limits and the muscles allow.
 
 The hand moves to a single pose at `hand_speed`. Poses in quick succession form a path, which the
 hand follows at the speed at which they arrive. Each pose is reached when the next one is due, and
@@ -24,12 +24,12 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: tolerances [m] and [rad] of the inverse kinematics for a whole pose, and for its position only
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
-FAR = 0.005  # distance from a pose above which it counts as unreachable [m]
-TURNED = 0.05  # angle to the orientation of a pose above which it counts as unreachable [rad]
+FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
+TURNED = 0.05  # a pose is unreachable if the orientation of the hand differs by more [rad]
 SHORTEST = 0.3  # shortest movement to a single pose [s]
 PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
 PATH_INTERVAL = 0.25  # longest interval between two poses that form a path [s]
-PATH_SPEED = 1.0  # highest speed of the hand from pose to pose at which they form a path [m/s]
+PATH_SPEED = 1.0  # highest speed of the hand between two poses that form a path [m/s]
 INTERVAL_WEIGHT = 0.2  # weight of the newest interval in the average interval of a path
 JOINING = 0.1  # shortest time to join a path [s]
 RETURNING = 2.0 * STOPPING  # time to come to rest at the last pose of a path [s]
@@ -45,7 +45,7 @@ class Hand:
         self._robot = robot
         #: time [s], position [m] and posture θ [rad] of the last pose
         self._last: tuple[float, Array, Array] | None = None
-        self._interval = 0.0
+        self._interval = 0.0  # average time between the poses of a path [s]; 0 if there is no path
 
     def posture(
         self, mae: Mae, pose: pin.SE3, whole: bool, start: Array, nearest: bool
@@ -139,7 +139,7 @@ class Hand:
         moving = 0.5 * STARTING + np.array([0.0, TWIST_TIMEOUT, TWIST_TIMEOUT + 0.5 * STOPPING])
         theta = start.theta + 0.5 * STARTING * start.velocity + moving[:, None] * velocity
         inside = np.clip(theta, robot.lower, robot.upper)
-        # A joint that would exceed its limit stops there; the others continue.
+        # A joint that would exceed its limit stops at the limit; all other joints continue.
         free = (inside == theta).all(axis=0)
         if missing := lacking(robot, mae, inside[-1]):
             detail = f'at the end of this motion, the muscles lack {missing}'

@@ -17,22 +17,24 @@ winding in, or as soon as the measured tension is above the limit.
 
 If the measured tension exceeds the limit nevertheless, for example because K_stiff or a sensor is
 wrong, the feedback r pays the muscle out further. A muscle whose measured tension is above
-`tension.limit` is paid out faster than the rate limit. No muscle is wound in faster. This also
-holds for tensions in messages that are rejected because their lengths jumped.
+`tension.limit` is paid out faster than the rate limit. No muscle is wound in faster than the rate
+limit. Tensions in messages that are rejected because their lengths jumped are limited in the same
+way.
 
 Position-controlled modules turn a command into tension by stretching the series elastic elements:
 
     l_target ≥ l − SHARE (L_e(T_limit) − L_e(T′)) + r        while T ≤ T_limit, T′ = T + AHEAD dT/dt
-    l_target ≥ l + L_e(T) − L_e(T_limit) + r = l_exceeded    above it
-    l_target ≥ l_exceeded, which shortens at RECOVERY         afterwards
+    l_target ≥ l + L_e(T) − L_e(T_limit) + r = l_exceeded    while T > T_limit
+    l_target ≥ l_exceeded, which shortens at RECOVERY        after T has exceeded T_limit
 
-Here T is measured, so that the limit holds in any posture and for any error of the network. Tendon
-friction and the age of T would otherwise make a muscle at its limit oscillate (`recovered`). These
-modules receive length commands only: a desired tension becomes the length that corrects the
-fraction `ADMITTANCE` of the tension error.
+L_e is the elongation of the series elastic element; the constants are in `robot/actuation.py`.
+Since T is measured, the limit holds in any posture and for any error of the network. l_exceeded
+shortens slowly, because tendon friction and the age of T would otherwise make a muscle at its limit
+oscillate (`recovered`). These modules receive length commands only: a desired tension becomes the
+length that corrects the fraction `ADMITTANCE` of the tension error.
 
-The tension of a motor current is uncertain (`signals.friction.Transmission`). Its limit is lower by
-CONFIDENCE σ_T, so that the true tension does not exceed T_limit either.
+A tension that is computed from a motor current is uncertain (`signals.friction.Transmission`). The
+limit of this tension is lower by CONFIDENCE σ_T, so that the true tension does not exceed T_limit.
 
 T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
 (`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
@@ -42,7 +44,8 @@ tension commands are compared by the tension that they demand of a module:
 
     T_target = T_bias + max(0, K_stiff (l − l_target))
 
-All lengths beyond l demand T_bias; of these, the one nearest to the last published length is used.
+All commanded lengths above l demand T_bias. Of these lengths, the one nearest to the last published
+length is used.
 The first command keeps the present tensions, because a restarted controller does not know the
 earlier commands.
 """
@@ -67,7 +70,7 @@ POSTURES = 200  # number of random postures from which the longest muscle length
 #: largest difference between the lengths of a real muscle and of its model [m]
 LENGTH_MARGIN = 0.03
 LONGEST_INTERVAL = 0.05  # longest time between two messages for which a rate is computed [s]
-CONFIDENCE = 2.0  # number of standard deviations by which an uncertain tension may be too low
+CONFIDENCE = 2.0  # number of standard deviations by which a measured tension may be too low
 RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
 
 
@@ -87,7 +90,7 @@ class CommandLimiter:
         self._relief: Array = np.zeros(robot.muscle_count)  # relief r of each muscle [m]
         #: time [s], T [N] and dT/dt [N/s], (M,), of the last message
         self._tension: tuple[float, Array, Array] | None = None
-        #: lengths at which the tension limit was exceeded last, which recover slowly [m], (M,)
+        #: l_exceeded of each muscle (see the module's description) [m], (M,)
         self._exceeded: Array = np.full(robot.muscle_count, -np.inf)
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
@@ -146,7 +149,10 @@ class CommandLimiter:
         return np.clip(length, before - change, before + change)
 
     def largest_change(self, kind: str, dt: float) -> Array:
-        """Return the largest change of a command within dt [s]: [m] or [N], (M,)."""
+        """Return the largest change within dt [s] of a length command [m] or tension command [N].
+
+        The result has the shape (M,).
+        """
         actuation, bias = self._robot.actuation, self._robot.tension.bias
         rate = actuation.fastest(self._settings.rate_limit) * dt
         return rate if kind == LENGTH else rate * actuation.tension_per_length(bias)
@@ -187,7 +193,8 @@ class CommandLimiter:
         limit = np.minimum(tension_limit, self._robot.description.tension.limit)
         limit = self._certain(limit, sample)
         if kind == TENSION:
-            # The command of an isolated muscle is below T_bias; it rises at the limited rate.
+            # The last command of a muscle that was isolated may be below T_bias. Such a command
+            # rises to T_bias at the limited rate.
             least = np.minimum(self._robot.tension.bias, before)
             value = np.clip(value, least, limit)
         else:
@@ -207,9 +214,9 @@ class CommandLimiter:
         return self.command
 
     def _certain(self, limit: Array, sample: MuscleSample) -> Array:
-        """Return the highest T [N] (M,) whose true value is at most `limit` with confidence.
+        """Return `limit` [N], (M,), lowered by the uncertainty of the measured tension.
 
-        It is never lowered below T_bias, so that uncertainty alone does not make a tendon slack.
+        The result is not lowered below T_bias, so that uncertainty alone makes no tendon slack.
         """
         bias = self._robot.description.tension.bias
         spread = np.nan_to_num(sample.tension_spread)
@@ -219,8 +226,8 @@ class CommandLimiter:
         """Return the shortest length commands [m] (M,) that the rejected messages allow.
 
         A module compares l_target with its own reading of l. If this reading jumps, the module
-        winds in, and its tension rises beyond the limit. Therefore l_target follows the jump where
-        the tension is too high. Elsewhere, −∞ is returned.
+        winds in, and the tension rises beyond the limit. Therefore l_target follows the jump of a
+        muscle whose tension is too high. For all other muscles, −∞ is returned.
 
         Args:
             rejected: l [m] and T [N], (2, M); −∞ where they are implausible.
@@ -266,7 +273,7 @@ class CommandLimiter:
         exceeded = np.maximum(recovered, length - depth)
         self._exceeded = np.where(tension > limit, exceeded, recovered)
         shortest = np.maximum(length - depth + self._relief, self._exceeded)
-        # The rate limit is exceeded only if the measured tension is too high: a length sensor alone
-        # may be wrong.
+        # Exceed the rate limit only if the measured tension is too high. A length alone is no
+        # reason, because a length sensor may be wrong.
         too_tense = tension > robot.description.tension.limit
         return np.where(too_tense, shortest, np.minimum(shortest, before + change))

@@ -31,8 +31,8 @@ from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
 
-# Number of quadratic programmes, each with G at the last tension. A third one would change the
-# tension by well under a newton.
+# Number of quadratic programmes, each with G at the tension that the previous one found. A third
+# programme would change the tension by well under a newton.
 SOLVES = 2
 
 # Constants of `stiffness`
@@ -54,10 +54,10 @@ STEP = 0.05
 
 
 def check_method(robot: Robot, settings: Settings) -> None:
-    """Check that the robot's modules can do what the method needs.
+    """Check that the robot's muscle modules measure the tensions that the method needs.
 
     Raises:
-        MusculoskeletalError: If they cannot; the text names the reason and the legal methods.
+        MusculoskeletalError: If they do not; the text names the reason and the legal methods.
     """
     if robot.tension_source.is_current and settings.method in BY_TENSION:
         legal = tuple(method for method in METHODS if method not in BY_TENSION)
@@ -117,7 +117,7 @@ class LengthMethod(NamedTuple):
         command: Computes the command.
         takes_tension: Whether the command realises the tension that is passed to it; this tension
             is then limited.
-        follows_first: Whether the method `first` runs before it.
+        follows_first: Whether the method `first` runs before this method.
     """
 
     command: LengthCommand
@@ -173,7 +173,8 @@ class StiffnessModel(NamedTuple):
         cubic = np.empty((4, robot.muscle_count))
         for low, high in np.unique(ranges, axis=1).T:
             own = (ranges[0] == low) & (ranges[1] == high)
-            levels = np.linspace(low, max(high, low + 1.0), LEVELS)  # the range is 0 if isolated
+            # The tension range of an isolated muscle is empty, which `polyfit` does not allow.
+            levels = np.linspace(low, max(high, low + 1.0), LEVELS)
             cubic[:, own] = np.polyfit(levels, -lengths[:, own], 3)
         slope = mae.muscle_jacobian(theta, tension)
         step = STEP * robot.kinematics.radian
@@ -221,8 +222,9 @@ def stiffness_command(
 
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
-    `robot/stiffness.py` defines K_θ; here it includes the springs of the joints. Its G, ∂²l/∂θ² and
-    L_e(T) = −l(θ, T) + const come from ① of the network (paper, §III-E, third: variable stiffness).
+    `robot/stiffness.py` defines K_θ; here K_θ includes the springs of the joints. G, ∂²l/∂θ² and
+    L_e(T) = −l(θ, T) + const in K_θ come from ① of the network (paper, §III-E, third: variable
+    stiffness).
     Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. T_low lies
     above T_bias, because a muscle that MSC holds at T_bias is stiff in one direction only. K is
     nearly linear in T, so a few quadratic programmes around the last solution suffice.
@@ -235,7 +237,8 @@ def stiffness_command(
         desired: Desired diagonal entries of K_θ [N·m/rad], (D,). 0 leaves an entry unconstrained;
             values beyond the reachable range of a joint are clipped to it.
         limit: Highest tension that may be planned [N], scalar or (M,).
-        near: Tension of the last solution [N], (M,), from which one round suffices; or None.
+        near: Tension of a nearby solution [N], (M,), from which a single round suffices; None if no
+            such solution is known.
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))

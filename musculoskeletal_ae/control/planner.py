@@ -26,15 +26,15 @@ from musculoskeletal_ae.robot.robot import Robot
 #: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times RACK [m].
 #: The estimate of an arm that is held against a joint stop exceeds the limit by less.
 TOLERANCE = 0.01
-SAME = 1e-6  # difference below which two poses are equal
+SAME = 1e-6  # relative difference below which two poses count as equal
 
 
 class Plan(NamedTuple):
     """A trajectory that the arm can follow.
 
     Attributes:
-        trajectory: The trajectory, already slowed.
-        unreachable_reason: Reason why it does not end at the requested target, or ''.
+        trajectory: The trajectory, slowed to a speed that the muscle modules can follow.
+        unreachable_reason: Why the trajectory does not end at the requested target, or ''.
     """
 
     trajectory: Trajectory
@@ -71,8 +71,8 @@ class Planner:
             mae: The network in use.
             start: Setpoint from which the motion starts.
             theta: Target posture [rad], (D,).
-            duration: Shortest time for each segment of the path [s]; longer without some muscles,
-                if the remaining ones cannot accelerate the arm as fast.
+            duration: Shortest time for each segment of the path [s]. The motion takes longer if the
+                muscles that are not isolated cannot accelerate the arm enough.
             lag: Lag λ of the muscle modules [s].
         """
         way = reach.way(self._robot, mae, start.theta, theta)
@@ -81,7 +81,7 @@ class Planner:
         return Plan(planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower)))
 
     def through(self, mae: Mae, start: Setpoint, points: Points, passed: float) -> Plan:
-        """Plan a motion through points that started `passed` [s] ago."""
+        """Plan a motion through points; the time 0 of the points was `passed` [s] ago."""
         points = self._clipped(points)
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
@@ -124,7 +124,7 @@ class Planner:
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return a posture that is holdable without the isolated muscles, and a reason.
+        """Return θ, or a posture that is holdable without the isolated muscles, and the reason.
 
         Args:
             mae: The network in use.
@@ -154,10 +154,10 @@ class Planner:
         return held, f'{problem}; going there'
 
     def _clipped(self, points: Points) -> Points:
-        """Return the points within the joint limits, which they may exceed by `TOLERANCE`.
+        """Return the points clipped to the joint limits.
 
         Raises:
-            MessageError: If a point is further outside.
+            MessageError: If a point exceeds the joint limits by more than `TOLERANCE`.
         """
         robot = self._robot
         low, high = robot.lower[points.joints], robot.upper[points.joints]
@@ -174,18 +174,21 @@ class Planner:
         )
 
     def _slowed(self, mae: Mae, planned: Trajectory) -> Trajectory:
-        """Return a trajectory slowed for the muscle modules.
+        """Return the planned trajectory, slowed to a speed that the muscle modules can follow.
 
         Raises:
-            MessageError: If the slowed trajectory leaves the joint limits. This can happen if it
-                starts in motion, because its path then changes.
+            MessageError: If the slowed trajectory leaves the joint limits. This can happen because
+                slowing changes the path of a trajectory that starts in motion.
         """
         slower = planned.scaled(slowness(self._robot, mae, planned, self._settings))
         slower.check(self._robot)
         return slower
 
     def _within_limits(self, mae: Mae, planned: Trajectory) -> Trajectory:
-        """Return a slowed trajectory within the joint limits; it first comes to rest if needed."""
+        """Return the planned trajectory, slowed and within the joint limits.
+
+        The arm first comes to rest if the slowed trajectory would leave the joint limits.
+        """
         try:
             return self._slowed(mae, planned)
         except MessageError:

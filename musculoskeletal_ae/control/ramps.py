@@ -41,7 +41,10 @@ class Ramp:
     """A smooth transition from one command to another, both of shape (M,)."""
 
     def __init__(self, start: Array, goal: Array, duration: float, rate_limit: float) -> None:
-        """Plan a ramp of `duration` [s], or longer if the rate limit [1/s] requires it."""
+        """Plan a ramp of `duration` [s], or longer if the rate limit requires it.
+
+        The unit of `rate_limit` is the unit of the commands per second.
+        """
         self._start, self._goal, self._elapsed = start.copy(), goal, 0.0
         farthest = float(np.abs(goal - start).max())
         self.duration = max(duration, PEAK * farthest / rate_limit)
@@ -117,7 +120,7 @@ class LengthRamps:
         self.solution = None
 
     def pursue(self, goals: list[Goal]) -> None:
-        """Replace the pending goals."""
+        """Replace the pending goals; the first new one begins in the next step."""
         self._goals, self._remaining = list(goals), 0.0
 
     def solve_again(self) -> None:
@@ -154,7 +157,7 @@ class LengthRamps:
         if goal.method == SECOND and not actuation.knows_tension:
             goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit
-        self.solution = None  # in case the next line raises an exception
+        self.solution = None  # there is no solution if the next line raises an exception
         self.solution = self._solve(goal, inputs.mae, self._tension)
         length = np.where(self._robot.used, self.solution.length, self._command)
         rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Holdability: whether a posture is holdable, the nearest holdable one, and a holdable path.
 
-All functions use the learned G and the least tensions within the limits. Where the remaining
-muscles cannot hold an arm with isolated muscles, it falls until a joint's stop supports it. From
-there a straight path to a holdable posture may not exist. `way` returns the cheapest path through a
-roadmap of random postures,
+All functions use the learned G and the least tensions within the limits. An arm with isolated
+muscles falls where the remaining muscles cannot hold it, until a joint's stop supports it. From
+there, a straight path to a holdable posture may not exist. `way` returns the cheapest path through
+a roadmap of random postures, with
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
-Prismatic joints count as if a pinion of radius RACK turned them. Tensions are limited to
-T_bias + USED (T_limit − T_bias), so that the path keeps a reserve if possible; otherwise it
-minimises the missing torque. On an edge, tendon friction opposes the motion (`Limits`). In some
-postures of the roadmap, joints that rest at their stops stay there. An edge is evaluated only if
-the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000); until then its cost is
-approximated from the postures at its ends.
+where τ_missing,j is the torque of joint j that muscles and stops do not provide. Prismatic joints
+count as if a pinion of radius RACK turned them. Tensions are limited to
+T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If the path cannot
+keep it, the path minimises the missing torque. On an edge, tendon friction opposes the motion
+(`Limits`). A joint that is at a stop at the start is also at this stop in some postures of the
+roadmap. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and
+Kavraki 2000); until then its cost is approximated from the postures at its ends.
 
 The motion along the path must not be faster than the muscles can accelerate the arm
 (`exertion_slowness`).
@@ -95,14 +96,14 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
 
 
 def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) -> float:
-    """Return the factor by which a motion has to be slowed for the torque of the muscles.
+    """Return the factor by which to slow a motion so that the muscles can exert its torque.
 
         τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
-    The factor s is the smallest of `SLOWER` at which the missing torque of no moment exceeds that
-    of a very slow motion notably. Tensions are limited as on a path (`Limits`). Without isolated
-    muscles, the factor is 1.
+    The factor s is the smallest of `SLOWER` for which the missing torque, at every moment of the
+    motion, is at most NOTABLE above that of a very slow motion. Tensions are limited as on a path;
+    `Limits` defines loss. Without isolated muscles, the factor is 1.
 
     Args:
         robot: The robot; isolated muscles have no tension.
@@ -209,7 +210,7 @@ class PathCost:
         return np.where(m > NOTABLE, m, 0.0)
 
     def _stops(self, theta: Array) -> Array:
-        """Return G of the stops at which joints rest, (stops, D)."""
+        """Return the G of the stops at which joints rest, with a row for each stop, (stops, D)."""
         robot, joints = self._robot, np.eye(self._robot.joint_count)
         at_stop = AT_STOP * self._radian
         is_low, is_high = theta < robot.lower + at_stop, theta > robot.upper - at_stop
@@ -223,21 +224,28 @@ class PathCost:
         return length * (1.0 + PRICE * float(m.mean()))
 
     def of_ends(self, postures: Array) -> Array:
-        """Return the approximate cost between all postures [rad] (N, D), from the ends, (N, N)."""
+        """Return the cost of the edges between postures [rad], (N, D), as a matrix (N, N).
+
+        The cost is approximated from the missing torque at both ends of an edge. It is 0 for
+        postures between which the roadmap has no edge.
+        """
         apart = np.linalg.norm((postures[:, None] - postures) / self._radian, axis=2)
         m = self.missing(postures)
         near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
         cost = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
-        return np.where(near | near.T, cost, 0.0)  # 0: no edge
+        return np.where(near | near.T, cost, 0.0)
 
 
 class Roadmap:
-    """Random postures between a start (number 0) and a goal (number 1), and the edges' costs."""
+    """Random postures with the costs of the edges between them.
+
+    Posture 0 is the start of the path, and posture 1 its goal.
+    """
 
     def __init__(
         self, robot: Robot, cost: PathCost, start: Array, theta: Array, direct: float
     ) -> None:
-        """Draw the postures; `direct` is the cost of the straight path to the goal θ."""
+        """Draw the postures; `direct` is the cost of the straight path from `start` to θ."""
         self._cost = cost
         self._postures = np.vstack([start, theta, _random_postures(robot, start)])
         self._price = cost.of_ends(self._postures)

@@ -105,7 +105,8 @@ class Settings:
     )
     hold_time: float = settable(
         0.5,
-        'time for which a stop holds the last command; the arm resumes if data returns within it',
+        'time for which a stop holds the last command; if only data is missing and it returns '
+        'within this time, the arm resumes',
         's',
         0.0,
         60.0,

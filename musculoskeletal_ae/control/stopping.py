@@ -11,9 +11,9 @@ that its muscles carry is let down slowly. A muscle whose tension is not known i
 `Actuation.release`, counted from the start of the release.
 
 After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
-once the other muscles are paid out. Winding ends when its measured tension, or the tension that
-muscle stiffness control demands, has risen by `LARGEST_RISE`. It also ends when its command has
-fallen by `Actuation.winding_depth`, independently of its sensors.
+once the other muscles are paid out. Winding ends when the measured tension of the suspect, or the
+tension that muscle stiffness control demands, has risen by `LARGEST_RISE`. Independently of the
+sensors, winding also ends when the length command has fallen by `Actuation.winding_depth`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class SafeStop:
 
         Args:
             sample: The newest muscle states.
-            dt: Time since the last call that counts towards the stop [s].
+            dt: Time since the last call [s]; 0 if this time does not count towards the stop.
             is_fresh: Whether the sample is still up to date.
             may_wind: Whether the suspect may be wound in.
             releases_at_once: Whether to release the arm without holding the last command.

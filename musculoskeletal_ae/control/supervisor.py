@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The supervisor: decides what the arm does, when it stops and when it may continue.
 
-It has two state variables and is independent of muscles. The *activity* is what the arm does, or
-will do after a stop. The *stop state* determines whether it may. `TRANSITIONS` is the complete
-table of changes of the stop state; no other code changes it. Both together give the mode that users
-see.
+The supervisor has two state variables and is independent of muscles. The *activity* is what the arm
+does, or will do after a stop. The *stop state* determines whether the arm may do this.
+`TRANSITIONS` is the complete table of changes of the stop state; no other code changes it. Activity
+and stop state together give the mode that users see.
 """
 
 from __future__ import annotations
@@ -144,9 +144,10 @@ class Supervisor:
         self.activity, self.explored = activity, False
 
     def on_offsets(self, known: bool) -> None:
-        """Adapt the activity to whether the length offsets are known.
+        """Adapt the activity to new length offsets.
 
-        While they are unknown, the arm can only explore gently.
+        While they are unknown, the arm can only explore gently. A motion to a target ends, because
+        its trajectory was planned with the previous offsets.
         """
         if not known and self.activity is Activity.EXPLORING:
             self.activity = Activity.CALIBRATING
@@ -188,7 +189,7 @@ class Supervisor:
     def on_suspect(self, is_isolated: bool) -> None:
         """Start the verification of an isolated suspect, or end it if the estimator has stopped.
 
-        If the suspect is restored as healthy, the verification ends with the anomaly instead.
+        If the suspect is restored as healthy, `on_verified` ends the verification instead.
         """
         self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
 

@@ -26,12 +26,13 @@ class TorqueControl(ActivityControl):
     """Joint torque by muscle tension: the method `tension`.
 
         τ = g(θ) + effort + K_p (θ_target − θ) − K_d dθ/dt
-        T = least tension with −Gᵀ T = τ within [T_bias, T_limit], else the nearest
+        T = least tension with −Gᵀ T = τ within [T_bias, T_limit]; if there is none, the tension
+            whose torque −Gᵀ T is nearest to τ
 
     The network computes G at (θ, T) (paper, §III-E, third; Kawamura 2016), and θ is the
     low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius RACK.
-    With both gains zero, only gravity is compensated and `effort` exerted; the arm then does not
-    keep its posture.
+    With both gains zero, the muscles only compensate gravity and exert `effort`; the arm then does
+    not keep its posture.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -105,10 +106,10 @@ class GravityCompensation(TorqueControl):
         τ = g(θ) + HOLD (θ_held − θ) − DAMPING dθ/dt + WALL (clip(θ) − θ)
         θ_held ← clip(θ_held, θ − BAND, θ + BAND)
 
-    A spring holds the arm at θ_held, which follows once the spring is stretched by BAND. It acts
-    like joint friction, so that errors of the gravity model do not make the arm creep. Near the
-    joint limits, a wall pushes the arm back; clip(θ) limits θ to WALL_AT inside the joint
-    limits.
+    A spring holds the arm at θ_held. Once the spring is stretched by BAND, θ_held follows the arm.
+    The spring thus acts like joint friction, so that errors of the gravity model do not make the
+    arm creep. Near the joint limits, a wall pushes the arm back; clip(θ) limits θ to WALL_AT inside
+    the joint limits.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

@@ -7,9 +7,9 @@ As in joint_trajectory_controller, the interpolation depends on the fields of th
     positions, velocities                      cubics: velocity is continuous
     positions, velocities, accelerations       quintics: acceleration is continuous
 
-The curve begins at the setpoint at the start. Points whose time has passed are skipped. Joints that
-a message does not name keep their position at the start, and the position of the last point is
-held. An empty message brings the arm to rest.
+The curve begins at the setpoint that the arm follows when the message arrives. Points whose time
+has passed are skipped. Joints that a message does not name keep the position of this setpoint. The
+arm holds the position of the last point. An empty message brings the arm to rest.
 
 A trajectory is slowed as a whole by a factor s: all times are multiplied by s, velocities divided
 by s and accelerations divided by s². If it starts at rest, its path stays the same.
@@ -65,9 +65,9 @@ class Points(NamedTuple):
 
     joints: Ints  # indices in θ, (J,)
     time: Array  # times from the start [s], (K,)
-    position: Array  # (K, J)
-    velocity: Array | None
-    acceleration: Array | None
+    position: Array  # [rad], (K, J)
+    velocity: Array | None  # [rad/s], (K, J)
+    acceleration: Array | None  # [rad/s²], (K, J)
 
     def later(self, slower: float) -> Points:
         """Return the points slowed by the factor `slower`."""
@@ -171,7 +171,7 @@ class Trajectory:
         """Check that the curve stays within the joint limits between its points.
 
         Raises:
-            MessageError: If it leaves the limits by more than `BEYOND`.
+            MessageError: If the curve exceeds the limits by more than `BEYOND`.
         """
         _, theta = self.path
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)

@@ -68,7 +68,7 @@ class DataAge:
         return max(awake - before, 0.0) if before > -math.inf else 0.0
 
     def expect_later(self, cause: StopCause, now: float, within: float) -> None:
-        """Do not count data as old before `within` [s] have passed, because it begins anew."""
+        """Let data that will pause become old later, as if it arrived `within` [s] from now."""
         self._came_at[cause] = self.awake(now) + within
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
@@ -85,7 +85,13 @@ class DataAge:
         self._time, self.pace = math.nan, 1.0
 
     def step(self, now: float, time: float, is_stopped: bool) -> Step:
-        """Return the time since the last step."""
+        """Begin a step of control, and return the time since the previous step.
+
+        Args:
+            now: Time of the steady clock [s].
+            time: Time of the messages' clock [s].
+            is_stopped: Whether the arm is stopped.
+        """
         elapsed, passed = max(now - self.stepped_at, 0.0), time - self._time
         if self.stepped_at == -math.inf or math.isnan(passed):
             elapsed = passed = 0.0
@@ -153,7 +159,8 @@ class HeatLimit:
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
         """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
-        # The tension sensor of an isolated muscle may be faulty; its module is commanded T_bias.
+        # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, which its
+        # module is commanded.
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest[1], bias)
         tension = np.where(np.isnan(tension), sample.model_tension, tension)

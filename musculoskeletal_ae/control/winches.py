@@ -50,8 +50,8 @@ class Winches:
 
         `dt` [s] is the time since the previous call.
         """
-        # Medians of three messages are one message old. Therefore the time between two of them is
-        # counted only up to the previous call.
+        # `length` is a median of three messages and therefore one message old. Hence the time since
+        # the last length that was used ends at the previous call, not at this one.
         self._since, self._last = self._since + self._last, dt
         if self._length is not None and self._since < SPAN:
             return
