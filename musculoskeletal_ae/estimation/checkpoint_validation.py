@@ -85,7 +85,7 @@ class CheckpointValidator:
         self._messages.note(tension, length, now, theta, is_healthy=not self._is_anomaly)
 
     def start(self) -> None:
-        """Start again without a network."""
+        """Discard all networks and messages, and start again."""
         self._used.clear()
         self.forget()
 

@@ -148,8 +148,8 @@ class Estimator:
         starts again, because its estimate depends on the network.
 
         Raises:
-            numpy.linalg.LinAlgError: If its statistics are singular; the previous network stays in
-                use.
+            numpy.linalg.LinAlgError: If the network's statistics are singular; the previous network
+                then stays in use.
         """
         isolated = mae.isolated if self._follows_network else self.body.isolated
         reduced = mae.without(isolated)
@@ -216,11 +216,11 @@ class Estimator:
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
     ) -> None:
-        """Record the target lengths [m] or tensions [N], (M,), sent to the muscle modules."""
+        """Record the target lengths [m] (M,) or tensions [N] (M,) sent to the muscle modules."""
         self._commands.note(now, length, tension)
 
     def joints(self, theta: Array, now: float) -> None:
-        """Record θ [rad], (D,), measured by joint sensors."""
+        """Record θ [rad] (D,) as measured by the joint sensors at `now` [s]."""
         self._measured = now, theta
 
     def reset(self) -> None:
@@ -255,7 +255,12 @@ class Estimator:
         return self._take(partial(self.stream.take, message, time, now), now)
 
     def step(self, states: Array, time: float, now: float) -> Output | None:
-        """Estimate the state from raw l [m], T [N] and temperature [°C], (3, M), and monitor it.
+        """Estimate the state and check for faults.
+
+        Args:
+            states: Raw l [m], T [N] and temperature [°C], (3, M).
+            time: Time of the message [s].
+            now: Time on the steady clock [s].
 
         Returns:
             The results; None without a network, or before the first estimate of the length offsets.
@@ -344,7 +349,7 @@ class Estimator:
         self.stream.use_body(body)
 
     def _measured_theta(self, now: float) -> Array | None:
-        """Return θ from joint sensors [rad] (D,), or None unless all have reported just now."""
+        """Return θ [rad] (D,) from joint sensors, or None if a value is missing or too old."""
         time, theta = self._measured
         if theta is None or now - time >= JOINTS_AGE or not np.isfinite(theta).all():
             return None

@@ -61,7 +61,7 @@ class Finding:
 
     @property
     def remedy(self) -> tuple[Step, ...]:
-        """What ends the anomaly, unless a verification does."""
+        """The steps by which a user ends the anomaly, unless a verification ends it."""
         return _REMEDIES.get(self.kind, REPAIR)
 
 
@@ -73,7 +73,7 @@ class Observation:
         sample: The readings.
         estimate: The network's estimate.
         demand: T commanded to the muscle modules [N], (M,); None without a command.
-        dt: Time since the previous message [s], limited by the caller to some maximum.
+        dt: Time since the previous message [s]; the caller limits it after a pause.
         lengths_known: Whether the length offsets are known.
         measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
         command: l_target of the muscle modules [m], (M,); None without a command.
@@ -101,7 +101,7 @@ def observe(
     """Return the observation of recorded readings, whose temperatures are unknown.
 
     Args:
-        mae: The network that estimates, without the isolated muscles.
+        mae: The network; its isolated muscles are ignored.
         length: l with the length offset removed [m], (M,).
         motor_tension: T [N], (M,).
         bone_tension: T_end [N], (M,).

@@ -82,7 +82,10 @@ class HealthMonitor:
             detector.accept(muscles)
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Check the raw readings of a message, even of a rejected one; see `Detector`."""
+        """Check the raw readings of a message, even of a rejected one; return the first finding.
+
+        `Detector.read` describes the arguments. Without a finding, the result is None.
+        """
         findings = [detector.read(states, usable, now) for detector in self._detectors]
         return next(filter(None, findings), None)
 

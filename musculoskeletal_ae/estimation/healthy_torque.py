@@ -17,7 +17,7 @@ from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-MEMORY = 180.0  # largest time constant of the average; only motion counts [s]
+MEMORY = 180.0  # largest time constant of the average; only time in motion counts [s]
 #: norm of the joint velocities above which an arm moves [rad/s]; speeds of prismatic joints are
 #: divided by RACK
 MOVING = 0.05
@@ -59,7 +59,13 @@ class HealthyTorque:
         self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Update σ from T_read [N] and l [m], (M,), read dt [s] after the previous message."""
+        """Update σ with a message.
+
+        Args:
+            tension: T_read [N], (M,).
+            length: l [m], (M,).
+            dt: Time since the previous message [s].
+        """
         end = self._direction.end_tension(self._mae.transmission, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._contact.step(theta, end, dt).torque

@@ -27,7 +27,7 @@ FIT_INTERVAL = 2.0  # time between two later fits [s]
 #: time between messages [s], so that a fit takes equally long at any rate of the messages.
 PIECE_TIME = 0.005
 MOST_PIECES = 4  # largest number of pieces of work for one message
-#: median residual of a length above which a fit is rejected [m]; correct offsets have 0.0003 m
+#: median residual of a length above which a fit is rejected [m]; correct offsets leave 0.0003 m
 LARGEST_RESIDUAL = 0.02
 #: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
 #: wrong posture 1.1, and pure noise 0.95
@@ -44,7 +44,8 @@ class LengthCalibration:
 
     Attributes:
         posture: θ [rad] (D,) in which the arm stands, or None if it moves gently.
-        offsets: The newest estimate, known or not; None before the first one.
+        offsets: The newest estimate of the offsets, which may still be unreliable; None before the
+            first estimate.
     """
 
     def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
@@ -163,7 +164,12 @@ class LengthCalibration:
         self.offsets = LengthOffsets(offset, deviation)
 
     def _problem_of(self, fit: Fit, residual: Array) -> str:
-        """Return why a fit is not reliable, or ''; `residual` has the medians for l [m], (M,)."""
+        """Return why a fit is not reliable, or ''.
+
+        Args:
+            fit: The fit.
+            residual: Median residual of each length [m], (M,).
+        """
         if residual.max() > LARGEST_RESIDUAL:
             name = self._robot.muscles[int(residual.argmax())]
             limit = 1e3 * LARGEST_RESIDUAL

@@ -49,11 +49,11 @@ TENSION_OFFSET = 1.5
 JOINT_FRICTION = 0.03
 
 STICKING = 0.003  # motion after a reversal over which the friction of a joint changes sign [rad]
-#: smallest torque of the weight that is assumed, relative to the largest torque of the tensions
+#: lower limit of the largest torque of the weight, relative to the largest torque of the muscles at
 #: T_bias
 LEAST_WEIGHT = 0.1
 
-# The search for a start.
+# Constants of the search for initial values.
 DRAWN_POSTURES = 3200  # number of random first postures that are compared by torque
 FITTED_POSTURES = 400  # number of the best drawn postures, which are fitted coarsely to the lengths
 COMPARED_FITS = 30  # number of the best coarse fits, which are compared by torque as well

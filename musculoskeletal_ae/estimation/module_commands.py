@@ -18,18 +18,18 @@ class ModuleCommands:
         self._time = -math.inf  # time of the newest command [s]
 
     def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
-        """Store target lengths [m] or target tensions [N], (M,), that were sent at `now` [s]."""
+        """Store target lengths [m] (M,) or target tensions [N] (M,) that were sent at `now` [s]."""
         self._length, self._tension, self._time = length, tension, now
 
     def length(self, now: float) -> Array | None:
-        """Return l_target [m], (M,), or None without an up-to-date length command."""
+        """Return l_target [m] (M,), or None without an up-to-date length command."""
         return self._length if now - self._time <= COMMAND_AGE else None
 
     def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
-        """Return the tension that the newest command demands of each module [N], (M,), or None.
+        """Return the tension [N] (M,) that the newest command demands of the modules, or None.
 
-        Length commands demand a tension that depends on l [m] (M,). Nothing is demanded if the
-        command is out of date, or if the modules follow positions.
+        Length commands demand a tension that depends on `length`, which is l [m] (M,). The result
+        is None if the command is out of date, or if the modules follow positions.
         """
         if now - self._time > COMMAND_AGE:
             return None

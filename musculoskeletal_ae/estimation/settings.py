@@ -10,7 +10,7 @@ STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
 
 @dataclass(frozen=True)
 class Detection:
-    """Settings of the detectors, of the winding in of slack, and of the reaction to an anomaly."""
+    """Settings of the detectors, of winding in slack, and of the reaction to an anomaly."""
 
     anomaly_threshold: float = settable(
         0.0,

@@ -64,8 +64,9 @@ STRETCHED = 1.5  # stretch at which a healthy tendon has tension, relative to th
 LONGEST_WINDING = 2.5  # longest duration of winding in a slack tendon [s]
 BEHIND = 0.005  # decrease of a position command that a healthy module follows [m]
 STANDS = 0.0005  # largest motion of a jammed muscle module [m]
-HIGHEST_TENSION = 5000.0  # upper end of the search for T_ref of a position [N]
-HALVINGS = 40  # number of bisection steps of the search for T_ref of a position
+# T_ref of a position-controlled module is found by bisection.
+HIGHEST_TENSION = 5000.0  # upper end of the search [N]
+HALVINGS = 40  # number of bisection steps
 FROZEN = 1e-6  # range of the readings below which a sensor is frozen [m] or [N]
 
 
@@ -128,7 +129,7 @@ class _Row(NamedTuple):
 
 
 class ModuleLaw:
-    """T_ref of one module under muscle stiffness control."""
+    """Computes T_ref of one module under muscle stiffness control."""
 
     def __init__(self, bias: float, stiffness: float) -> None:
         """Describe a module with T_bias [N] and K [N/m]."""
@@ -144,7 +145,7 @@ class ModuleLaw:
 
 
 class PositionLaw(ModuleLaw):
-    """T_ref of one position-controlled module, by the stretch of its series elastic element."""
+    """Computes T_ref of one position-controlled module from the stretch of its elastic element."""
 
     def __init__(self, bias: float, elongation: Callable[[float], float]) -> None:
         """Describe a module with T_bias [N] and the function L_e(T) [m] of T [N]."""
@@ -159,7 +160,7 @@ class PositionLaw(ModuleLaw):
         return row.likely - row.length + self._elongation(row.tension)
 
     def demand(self, row: _Reading, is_reference: bool) -> float:
-        """Return T_ref [N]."""
+        """Return T_ref [N]; while `is_reference` is true, also store x_0 and T_0."""
         stretch = self.stretch(row)
         if is_reference:  # x_0 of a slack tendon is not known
             is_slack = row.tension < LIMITS.slack_share * self.bias

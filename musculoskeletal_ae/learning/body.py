@@ -55,7 +55,7 @@ class Layout:
     ) -> None:
         end = 3 * len(points)
         self.points = points  # indices of the muscle's route points
-        #: weight of each line between consecutive route points in the muscle's length
+        #: factor with which each line between consecutive route points counts in the length
         self.weights = weights
         self.attachment = slice(0, end)  # δ [m]
         #: κ: logarithms of force, rate and wire_stretch relative to their nominal values
@@ -76,7 +76,7 @@ class ResidualModel(NamedTuple):
 
     frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
     phase: Singles  # phases of the cosines [rad], (K,)
-    basis: Singles  # directions in the space of the features that vary most, (K, F)
+    basis: Singles  # directions in feature space along which the features vary most, (K, F)
 
     @classmethod
     def drawn(
@@ -155,7 +155,8 @@ class CalibratedBody:
         for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
-            weights = np.zeros(len(points) - 1)  # remains 0 between the end and start of branches
+            # A line from the end of one branch to the start of the next keeps the factor 0.
+            weights = np.zeros(len(points) - 1)
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, own.basis.shape[1], self._has_drive))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
@@ -222,7 +223,9 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return T_end [N] (N,) of one muscle, and its derivatives by μ, γ, b and F (N, 1 or 4).
+        """Return T_end [N] (N,) of one muscle, and its derivatives by μ, γ, b and F, (N, 4).
+
+        With tension sensors, only the derivative by μ is returned, (N, 1).
 
         Args:
             m: The muscle.
@@ -242,7 +245,11 @@ class CalibratedBody:
         return end, np.stack(slopes, axis=1) * np.append(1.0, self.drive_units[:, m])
 
     def crept(self, age: Array) -> Array:
-        """Return how much each muscle has crept since each sample [m], (N, M); `age` is a, (N,)."""
+        """Return how much each muscle has crept since each sample [m], (N, M).
+
+        Args:
+            age: Number of samples that came after each sample, (N,).
+        """
         rates = [p[at.creep] for p, at in zip(self.parameters, self.layouts, strict=True)]
         return age[:, None] * np.array(rates)
 

@@ -198,8 +198,8 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
     sound = ~_glitches(error)
     known = min(samples, healthy.rests)
     calibrated = bool(healthy.time >= LEAST_TIME) and known >= LEAST_SAMPLES
-    # Split before glitches are excluded: otherwise one glitch would move other messages to the
-    # other half.
+    # Split the messages before glitches are excluded. Otherwise a single glitch would move all
+    # later messages to the other half.
     first = np.arange(len(error)) % 2 == 0
     part = _statistics(error[sound & first], calibrated)
     statistics = _statistics(error[sound], calibrated)
@@ -218,7 +218,7 @@ def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | N
 
 
 def _spread_out(theta: Array, count: int) -> Array:
-    """Return at most `count` rows of θ (N, D), each the farthest from those already chosen."""
+    """Return at most `count` rows of θ (N, D), each the farthest from all rows chosen before it."""
     share = theta / (np.ptp(theta, axis=0) + 1e-9)
     distance, chosen = np.full(len(theta), np.inf), [0]
     for _ in range(min(count, len(theta)) - 1):

@@ -24,8 +24,8 @@ BODIES = 100
 POSTURES_PER_BODY = 10  # number of postures at which errors of each body are drawn
 #: Factor of the covariance without validation messages. It stands for errors that are common to
 #: all samples and that no prior describes, for example because tendons wrap round bones. With it,
-#: the ellipsoids of development individuals of both emulator models contain 95 % of their true
-#: angles (`python -m bench covariance`).
+#: the ellipsoids of development individuals of both emulator models contain 95 % of the true angles
+#: (`python -m bench covariance`).
 UNVALIDATED_FACTOR = 1.7
 CONTAINED_SHARE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
 
@@ -139,8 +139,8 @@ def _drawn_errors(
 def _spread(error: Array) -> Array:
     """Return a covariance whose 95 % ellipsoid contains 95 % of the errors (N, D).
 
-    The plain covariance would not, because the errors have heavier tails than a normal
-    distribution.
+    The ellipsoid of the plain covariance would contain fewer errors than that, because the errors
+    have heavier tails than a normal distribution.
     """
     covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
     covariance = 0.5 * (covariance + covariance.T)

@@ -48,7 +48,7 @@ class Fit(NamedTuple):
     noise: Array  # σ of each muscle's length [m], (M,)
     weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
     theta: Array  # fitted postures [rad], (N, D)
-    #: for each group, its muscles and R; the covariance of their parameters is (RᵀR)⁻¹
+    #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`postures`)
     root: list[tuple[Ints, Array]]
 
 
@@ -93,7 +93,8 @@ def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
     """Return the prior of a muscle around the geometric model."""
     layout = body.layouts[m]
     spread = PRIOR.spread(layout)
-    # The prior of the offset describes the tendon before it crept. Creep since then widens it.
+    # The prior of the offset describes the tendon before it crept. Creep since then widens the
+    # prior.
     spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
 
@@ -101,7 +102,11 @@ def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
 def _reopened(
     body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
 ) -> MusclePrior:
-    """Return a wide prior around a muscle's earlier parameters if it was changed, else `prior`."""
+    """Return the prior of muscle `m` after a possible change of the muscle.
+
+    If it was changed, its earlier parameters are fitted and set in `body`, and the result is a wide
+    prior around them. Otherwise the result is `prior`.
+    """
     # Exclude tensions of 0 N, which mean that the muscle was isolated.
     before = ~observed.known[:, m] & (observed.tension[:, m] != 0.0)
     if before.sum() < LEAST_BEFORE_CHANGE:
@@ -155,7 +160,7 @@ class MuscleFit:
         return minimise(self, start, ROUNDS, enough).point.parameters
 
     def point(self, parameters: Array) -> MusclePoint:
-        """Return a point with its residuals."""
+        """Return the point of `parameters`, with residuals and derivatives."""
         m, observed = self._m, self._observed
         of_all = list(self._body.parameters)
         of_all[m] = parameters

@@ -101,10 +101,17 @@ class CheckpointKeeper:
     def observe(
         self, message: MuscleSample, dt: float, is_anomaly: bool, theta: Array | None = None
     ) -> None:
-        """Process a plausible message, `dt` [s] after the previous one, and measured θ (D,)."""
+        """Use a plausible message for later validations, and to measure the healthy torque.
+
+        Args:
+            message: The message.
+            dt: Time since the previous message [s].
+            is_anomaly: Whether an anomaly is present.
+            theta: Measured θ [rad], (D,), or None.
+        """
         self._time += dt
         self.validation.message(message.learned_tension, message.length, self._time, theta)
-        # The healthy torque is used for contact detection. It cannot be computed without tensions.
+        # The healthy torque, which contact detection uses, cannot be computed without tensions.
         if self.mae is not None and not is_anomaly and self._has_torque:
             self._torque.step(message.tension_read, message.length, dt)
 
@@ -152,7 +159,7 @@ class CheckpointKeeper:
         return True
 
     def numbered(self, mae: Mae) -> Mae:
-        """Return the network with a new version, higher than its own and than the one in use."""
+        """Return the network with a version above its own and that of the network in use."""
         before = 0 if self.mae is None else self.mae.version
         return replace(mae, version=1 + max(mae.version, before))
 
@@ -196,7 +203,10 @@ class CheckpointKeeper:
             self._state.keep(self._samples, self.publication.checkpoint, changed)
 
     def save(self) -> Path:
-        """Save samples and network at once, the network also as a checkpoint; return the directory.
+        """Save samples and network at once, and the network also as a checkpoint file.
+
+        Returns:
+            The state directory.
 
         Raises:
             StateError: If there is no directory, or it cannot be written.

@@ -11,7 +11,8 @@ Isolated muscles are not learned: samples do not describe them, and the publishe
 them.
 
 The caller supplies the time: the ROS clock, recorded time or simulated time. All timing rules use
-it. Therefore a recording is learned exactly as on a robot, except that training takes no time.
+this time. Therefore a recording is learned exactly as on a robot, except that training takes no
+time.
 """
 
 import math
@@ -116,7 +117,7 @@ class Learner:
         self._time = -math.inf  # time of the last message [s]
         self._jumps = 0  # number of jumps of lengths so far
         if self.samples:
-            # Continue after the body-state versions of the saved samples, so that none repeats.
+            # Use a higher body-state version than all saved samples, so that no version repeats.
             self._use_body(replace(self.body, version=self.samples.body_version + 1))
         if saved is not None:
             self._start(saved)
@@ -186,7 +187,7 @@ class Learner:
         return check.is_believed and not self.collector.has_jumped
 
     def _believe_offsets(self) -> None:
-        """Use length offsets that agree with the messages."""
+        """Use the present length offsets, because they agree with the messages."""
         before = self.offset_history.corrected
         self.offset_history.use(self.body.offsets.offset)
         if self.offset_history.corrected != before:
@@ -335,7 +336,7 @@ class Learner:
     # -- beginning and end ----------------------------------------------------------------------
 
     def begin(self, mae: Mae) -> None:
-        """Continue from a network if none was saved; samples are kept.
+        """Start from a network, because no saved network could be loaded; samples are kept.
 
         Raises:
             GateError: If the validation rejects the network.

@@ -13,8 +13,8 @@ from musculoskeletal_ae.learning.samples import Sample
 
 #: time before the detection of an anomaly and after its reset in which messages are not used [s]
 MARGIN = 2.0
-#: Largest number of messages held back. At 1 kHz fewer arrive within MARGIN; the number bounds the
-#: memory if the clock stands still.
+#: Largest number of messages held back, which bounds the memory if the clock stands still. Even at
+#: 1 kHz, fewer messages than this arrive within MARGIN.
 MOST_WAITING = 5000
 
 

@@ -61,7 +61,7 @@ class NetworkTrainer:
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def move(self, length: Array) -> None:
-        """Shift the network's muscle lengths by `length` [m], (M,), without training."""
+        """Shift the network's muscle lengths by `length` [m] (M,), without training."""
         for network in (self.network, self._raw):
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 

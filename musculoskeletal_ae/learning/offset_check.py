@@ -21,8 +21,8 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 SPACING = 0.1  # time between compared messages [s]
 COUNT = 20  # number of compared messages
 LARGEST_RATIO = 2.0  # largest accepted error, relative to the error with the previous offsets
-LEARNED_ERROR = 0.04  # error that is accepted of a network that has learned an arm [m]
-UNLEARNED_ERROR = 0.1  # error that is accepted of a network that has not learned an arm [m]
+LEARNED_ERROR = 0.04  # largest accepted error if the network has learned an arm [m]
+UNLEARNED_ERROR = 0.1  # largest accepted error if the network has not learned an arm [m]
 #: largest difference between two correct calibrations of the same arm [m]
 CALIBRATION_SPREAD = 0.008
 

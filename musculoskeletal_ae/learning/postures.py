@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 # RACK [m].
 GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
 FIRST_NOISE = 0.002  # initial σ of a length [m]
-LEAST_NOISE = 0.0008  # smallest σ of a length in the weights: error that no body explains [m]
+LEAST_NOISE = 0.0008  # smallest σ of a length in the weights, for errors of the body model [m]
 #: σ_τ as a share of the muscles' absolute torques at a joint. It is wide, because friction and the
 #: offsets of the tension sensors are common to all samples.
 TORQUE_NOISE = 0.3

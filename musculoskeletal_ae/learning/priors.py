@@ -26,7 +26,7 @@ LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
 
 @dataclass(frozen=True)
 class Prior:
-    """Standard deviations of the differences between a body and its geometric model."""
+    """Means and standard deviations σ of the differences between a body and its geometric model."""
 
     attachment: float = 0.007  # σ of each coordinate of each route point [m]
     elastic: float = 0.2  # σ of the logarithm of each elastic constant

@@ -30,7 +30,7 @@ CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
 #: typical moment arm, which converts lengths to angles where no joint angle was measured [m]
 MOMENT_ARM = 0.04
-#: threshold that replaces 0 [rad or N], so that any difference makes a sample new
+#: smallest threshold [rad or N]; it replaces a threshold of 0, with which any sample is new
 LEAST_DISTANCE = 1e-6
 
 
@@ -105,7 +105,7 @@ class Observations:
         return State(self.theta, self.tension, self.length)
 
     def end_tension(self, transmission: Transmission) -> Array:
-        """Return the tension at the elastic elements [N], (N, M), which a network takes as input.
+        """Return the tension at the elastic elements [N] (N, M), which is the input of a network.
 
         Args:
             transmission: Relation between the readings and the tension at the elastic elements.
@@ -113,7 +113,7 @@ class Observations:
         return transmission.end(self.tension, self.direction)
 
     def with_all_angles(self) -> Observations:
-        """Return the samples with all joint angles measured."""
+        """Return the samples in which all joint angles were measured."""
         return self[np.flatnonzero(np.isfinite(self.theta).all(axis=1))]
 
 
@@ -142,7 +142,7 @@ class SampleStore:
         return len(self.samples)
 
     def is_new(self, sample: Sample) -> bool:
-        """Return whether a sample differs enough from every stored one."""
+        """Return whether a sample differs from every stored one by more than the thresholds."""
         points = self._scaled([*self.samples, sample])
         return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 

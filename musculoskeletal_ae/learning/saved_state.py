@@ -127,7 +127,7 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
 def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
     """Add the saved samples to a store.
 
-    They do not describe muscles that were added to the robot after the state was saved.
+    The saved samples do not describe muscles that were added to the robot after the save.
     """
     places = list(robot.muscle_indices(state.muscles))
     for saved in state.samples:

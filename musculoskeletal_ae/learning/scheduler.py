@@ -78,5 +78,5 @@ class UpdateScheduler:
 
 
 def is_recent(then: float, now: float) -> bool:
-    """Return whether `then` is less than `LEAST_INTERVAL` before `now`, and not after it."""
+    """Return whether `then` is at most `now`, and less than `LEAST_INTERVAL` before it."""
     return 0.0 <= now - then < LEAST_INTERVAL

@@ -50,7 +50,7 @@ def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
 
 
 def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) -> Array:
-    """Return the derivative of K θ − b by α and β of some joints, (N, D, 2 · joints).
+    """Return the derivative of K θ − b by first all α, then all β of `joints`, (N, D, 2 · joints).
 
     Args:
         nominal: The springs that muscles.yaml states.
@@ -61,7 +61,7 @@ def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) 
     now = learned(nominal, springs)
     count, places = theta.shape
     result = np.zeros((count, places, 2 * len(joints)))
-    # α of joint j scales row and column j of K, each by half of it.
+    # α of joint j scales row and column j of K by e^{α/2} each.
     result[:, :, : len(joints)] = 0.5 * now.stiffness[:, joints] * theta[:, None, joints]
     torque = theta @ now.stiffness
     for k, j in enumerate(joints.tolist()):

@@ -50,7 +50,7 @@ OWN_DIFFERENCE = 0.01  # smallest difference of the reading [rad]
 
 
 def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tuple[Array, Array]:
-    """Return the joint-sensor offsets and their standard deviations [rad or m], (D,) each.
+    """Return the joint-sensor offsets and their standard deviations, both [rad or m] (D,).
 
     Args:
         read: Sensor readings at rest, (N, D); NaN where nothing was measured.

@@ -56,7 +56,8 @@ class Update(NamedTuple):
 
     mae: Mae  # the trained network
     loss: float  # training loss
-    noise: Array = np.empty(0)  # σ of each length, as far as the body does not explain it [m], (M,)
+    #: σ of the part of each length that the body does not explain [m], (M,)
+    noise: Array = np.empty(0)
     #: index of a muscle whose newest samples contradict all older ones, and the number of these
     #: newest samples; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
@@ -236,7 +237,7 @@ class TrainerProcess(Trainer):
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT within a `with` block; child processes that are started there inherit this.
+    """Block SIGINT within a `with` block, and in child processes that are started there.
 
     Ctrl-C sends SIGINT to the whole process group, but only the node may end the child.
     """

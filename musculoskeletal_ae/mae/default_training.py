@@ -50,8 +50,8 @@ REFERENCE = 5 + 10  # D + M of the arm to which LAYERS and STEPS apply
 # no unknowns.
 COUNTED_MUSCLES = 2.5
 
-# Fraction of samples with tensions beyond tension.limit. Payloads can cause such tensions. An
-# estimator that was trained with a few of these samples loses accuracy only gradually there.
+# Fraction of samples with tensions beyond tension.limit. Payloads can cause such tensions. With
+# these samples, the estimator loses accuracy only gradually beyond the limit.
 OVERLOAD_SHARE = 0.2
 # Samples of θ exceed each joint limit by up to this fraction of the range. A network is least
 # accurate at the edge of its training data, and arms do rest at their limits.

@@ -21,12 +21,12 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def random_posture(robot: Robot, rng: np.random.Generator) -> Array:
-    """Return a random θ_target within the joint limits [rad], (D,)."""
+    """Return a random θ_target [rad] (D,) within the joint limits."""
     return robot.random_postures(1, rng)[0]
 
 
 def random_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:  # noqa: ARG001
-    """Return a random T_const in [T_bias, T_limit] [N], (M,)."""
+    """Return a random T_const [N] (M,) in [T_bias, T_limit]."""
     return rng.uniform(robot.tension.bias, robot.tension.limit, robot.muscle_count)
 
 

@@ -40,7 +40,7 @@ def random_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
 
 
 def loss(network: Network, values: Tensor, mask: Tensor) -> Tensor:
-    """Return L_initial (3), the mean over scaled (θ, T, l).
+    """Return L_initial (3), averaged over the states.
 
     Args:
         network: The network.

@@ -62,7 +62,7 @@ class DefaultPreset:
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detector of large residuals, and those of slack tendons and jammed modules."""
+        """Return the detectors of large residuals, and of slack tendons and jammed modules."""
         from musculoskeletal_ae.estimation.detectors.jammed_module import (
             JammedModule,
             JammedPosition,

@@ -82,7 +82,10 @@ class Preset(Protocol):
         """
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return a function of the robot and a random generator that draws the next steps."""
+        """Return a function that draws the next steps of exploration.
+
+        Its arguments are the robot and a random generator.
+        """
 
     # -- simulation -----------------------------------------------------------------------------
 

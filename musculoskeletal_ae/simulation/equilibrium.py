@@ -420,7 +420,10 @@ class QuasiStatics:
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
-        """Return the arms h [s] later; `SimulatedBody.step` describes the arguments."""
+        """Return the state of the arms after a step.
+
+        `SimulatedBody.step` describes the arguments.
+        """
         # Without a command, position-controlled modules hold their last position.
         held = self._robot.actuation.choose(command, state.followed)
         command = np.where(np.isfinite(command), command, held)

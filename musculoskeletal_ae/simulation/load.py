@@ -179,7 +179,7 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
 
 
 class Load:
-    """Torques that hold N arms against weight, springs and a wrench, and their gradient."""
+    """Computes the torques that hold N arms against weight, springs and a wrench."""
 
     def __init__(self, kinematics: Kinematics) -> None:
         kin, model = kinematics, kinematics.model
@@ -211,7 +211,7 @@ class Load:
 
         Args:
             theta: θ [rad], (N, D).
-            wrench: Wrench on the end effectors, axes of the root link [N, N·m], (N, 6), or None.
+            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6), or None.
         """
         wrench = np.zeros((len(theta), 6)) if wrench is None else wrench
         theta, wrench = np.ascontiguousarray(theta.T), np.ascontiguousarray(wrench.T)

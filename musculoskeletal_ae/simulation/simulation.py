@@ -46,13 +46,13 @@ class SimulatedBody(Protocol):
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
     ) -> ArmState:
-        """Return the arms h [s] later.
+        """Return the state of the arms after a step.
 
         Args:
             state: The arms now.
             command: l_target [m], (N, M); PAID_OUT for muscles without a command.
             h: Duration of the step [s].
-            wrench: Wrench on the end effectors, axes of the root link [N, N·m], (N, 6).
+            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).
             fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
         """
 
@@ -63,7 +63,7 @@ class Simulation:
     mae: Mae  # the learned body
     state: ArmState  # the arms now; assign an earlier state to return to it
     command: Array  # l_target [m], (N, M)
-    wrench: Array  # wrench on the end effectors, axes of the root link [N, N·m], (N, 6)
+    wrench: Array  # wrench on the end effectors in axes of the root link [N, N·m], (N, 6)
     fixed: Array  # angles that joints are forced to [rad], (N, D); NaN for a free joint
 
     def __init__(
@@ -101,7 +101,8 @@ class Simulation:
         """Set a new network; from their present state, the arms move to its equilibrium.
 
         Raises:
-            FloatingPointError: If it cannot be simulated; the current network then stays in use.
+            FloatingPointError: If the new network cannot be simulated; the current network then
+                stays in use.
         """
         self._body.use(mae if self._device is None else _on_device(mae, self._device), self.robot)
         self.mae = mae

@@ -42,11 +42,11 @@ class JammedModule(Detector):
         self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
-        """Restart the measurement of times."""
+        """Restart the measurement of how long winches have been stationary."""
         self._time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the winch that has been stationary longest, if JAM_TIME has passed."""
+        """Report the winch that has been stationary longest, if that is at least JAM_TIME."""
         is_far, length = self._is_far(observation), observation.sample.length
         if is_far is None:
             self._time[:] = 0.0
@@ -65,7 +65,7 @@ class JammedModule(Detector):
         return Finding(muscle, Kind.JAMMED_MODULE, 'its winch does not follow the commands')
 
     def _is_far(self, observation: Observation) -> Bools | None:
-        """Return which modules have not reached their command, (M,); None without a command."""
+        """Return a mask (M,) of modules that are far from T_ref, or None without a command."""
         tension, most = observation.sample.motor_tension, self._robot.tension.max
         if observation.demand is None:
             return None
@@ -78,7 +78,7 @@ class JammedPosition(JammedModule):
     """Measures how long each position-controlled winch has been stationary in the wrong place."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
-        """Return which modules have not reached their command, (M,); None without a command."""
+        """Return a mask (M,) of modules that are behind l_target, or None without a command."""
         if observation.command is None:
             return None
         tension, most = observation.sample.motor_tension, self._robot.tension.max

@@ -114,7 +114,7 @@ class JointDisagreement(Detector):
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the lengths or a joint sensor if Δ has exceeded its limits for LASTING."""
+        """Report the lengths or a joint sensor if Δ has exceeded its limits for LASTING seconds."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9 or self._mae is None:
             return None
@@ -147,7 +147,7 @@ class JointDisagreement(Detector):
             self._compute_usual()
 
     def _change(self, gap: Array) -> tuple[Array, Largest]:
-        """Return Δ [m] (M,) and its limits."""
+        """Return Δ [m] (M,) and its limits, or g and its limits while g_usual is unknown."""
         assert self._mae is not None
         statistics = self._mae.anomaly
         has_learned = statistics is not None and statistics.calibrated

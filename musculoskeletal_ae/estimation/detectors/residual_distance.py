@@ -193,7 +193,7 @@ class ResidualDistance(Detector):
         return f'{name} = {reached} exceeded {most}{where} in {IN_A_ROW} consecutive messages'
 
     def _least_likely(self, bone_tension: Array, length: Array, candidates: Bools) -> int:
-        """Return the muscle without which the remaining residual is most likely."""
+        """Return the candidate (index) without which the remaining residual is most likely."""
         assert self._mae is not None
         distance = np.full(len(candidates), np.inf)
         for muscle in np.flatnonzero(candidates).tolist():

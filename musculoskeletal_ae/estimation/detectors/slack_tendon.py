@@ -38,8 +38,7 @@ STRETCH = 1.5
 UNCALIBRATED_STRETCH = 3.0
 #: STRETCH with motor currents, whose tensions are uncertain because of drive friction
 CURRENT_STRETCH = 2.0
-#: number of messages that are kept; when a tendon has lost its tension, the oldest kept message is
-#: from the time before
+#: number of messages that are kept; the oldest one precedes a loss of tension in the newest one
 RECENT = 5
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
@@ -72,11 +71,11 @@ class SlackTendon(Detector):
         self._settings = settings
 
     def reset(self) -> None:
-        """Restart the measurement of times."""
+        """Restart the measurement of how long tendons have been slack."""
         self._slack_time[:] = self._idle_time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has been slack for DEAD_TIME and is not being wound in."""
+        """Report a muscle that has been slack for DEAD_TIME seconds and is not being wound in."""
         sample, theta, dt = observation.sample, observation.estimate.state.theta, observation.dt
         tension, length = sample.motor_tension, sample.length
         demand = self._demand(observation)
@@ -111,9 +110,9 @@ class SlackTendon(Detector):
         )
 
     def _demand(self, observation: Observation) -> Array | None:
-        """Return the demanded tension [N], (M,), or None if it is unknown.
+        """Return the demanded tension [N] (M,), or None if it is unknown.
 
-        Without a known command it is unknown, with one exception: while the estimate is
+        The demand is unknown without a command, with one exception: while the estimate is
         implausible, the controller sends no commands, and the modules hold T_bias. Then T_bias is
         returned, unless all muscles are slack.
         """
@@ -142,14 +141,14 @@ class StretchedTendon(SlackTendon):
         self._is_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
 
     def reset(self) -> None:
-        """Restart the measurement of times."""
+        """Restart the measurement of how long tendons have been stretched without tension."""
         super().reset()
         self._recent.clear()
         self._taut.clear()
         self._is_slack[:] = False
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has been stretched without tension for DEAD_TIME."""
+        """Report a muscle that has been stretched without tension for DEAD_TIME seconds."""
         sample, bias = observation.sample, self._robot.tension.bias
         is_slack = (sample.motor_tension < LIMITS.slack_share * bias) & self._robot.used
         if self._recent:

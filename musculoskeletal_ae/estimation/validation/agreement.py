@@ -71,14 +71,14 @@ class Comparison(NamedTuple):
 
 
 class AgreementCheck:
-    """Compares a candidate with the network in use, both without the isolated muscles.
+    """Compares candidates with joint sensors or with the network in use.
 
     Args:
         robot: The geometric model.
         postures: The fixed states.
         messages: The recent messages.
         in_use: The network in use.
-        isolated: Indices of the isolated muscles.
+        isolated: Indices of the isolated muscles, which are ignored.
     """
 
     def __init__(

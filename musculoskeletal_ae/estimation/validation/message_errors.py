@@ -19,7 +19,7 @@ FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
 
 
 def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:
-    """Return the median error of each muscle by name: T [N] and l [m], (M,).
+    """Return the median errors of T [N] and l [m] of each muscle, (M,) each, by the names in FLOOR.
 
     The errors of isolated muscles are 0. The result is empty if there are too few messages.
     """

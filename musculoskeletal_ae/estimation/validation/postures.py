@@ -107,7 +107,10 @@ class PostureCheck:
                 )
 
     def errors(self, mae: Mae) -> Iterator[tuple[str, Array] | None]:
-        """Yield the relative errors of each joint or muscle by name, or None in between."""
+        """Yield pairs of a name in LIMITS and the relative error of each joint or muscle.
+
+        After some pieces of work, None is yielded instead.
+        """
         own_length = mae.lengths(self.theta, self.tension)
         for mask, symbol in zip(Mask, '①②③', strict=True):
             restored = mae.decode(mae.encode(mask, self.theta, self.tension, own_length))

@@ -71,7 +71,10 @@ class RecentMessages:
             self._messages.popleft()
 
     def readings(self, mae: Mae) -> tuple[Array, Array]:
-        """Return T_end [N] and l [m] of the messages, (N, M), with the tendon friction of `mae`."""
+        """Return T_end [N] and l [m] of the messages, (N, M) each.
+
+        T_end is computed with the friction that the network `mae` has learned.
+        """
         tension = np.array([message.tension for message in self._messages])
         length = np.array([message.length for message in self._messages])
         direction = np.array([message.direction for message in self._messages])
