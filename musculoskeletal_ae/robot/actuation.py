@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What muscle modules make of their commands: `actuation` of muscles.yaml.
+"""How muscle modules turn commands into tensions. `actuation` in muscles.yaml selects the kind.
 
     StiffnessControl   T = T_bias + max(0, K_stiff (l − l_target))   (paper, §III-E, eq. 5)
     PositionControl    l → l_target; T results from the stretch of the series elastic elements
 
-Control, safe stop and detectors get from `Robot.actuation` what differs between them. Neither asks
-which modules the arm has.
+Control, safe stop and detectors call `Robot.actuation` wherever the two kinds of modules differ.
+They never ask which kind the arm has.
 """
 
 from __future__ import annotations
@@ -28,16 +28,18 @@ LENGTH, TENSION = 'length', 'tension'  # kinds of commands
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
 
 DESIRED_SHARE = 0.3  # tension of a well-tensed arm, relative to T_limit
-#: largest relief of needless tension by modules under stiffness control [m]; covers length errors
-#: and the tension that friction retains in a tendon
+#: largest length by which rest feedback pays out a needlessly tense muscle under stiffness control
+#: [m]; it covers length errors and the tension that friction retains in a tendon
 RELIEF = 0.01
-#: the same for position-controlled modules [m]; covers errors of a network that has not learned the
-#: arm yet, which these modules turn into slack or into tension
+#: largest length by which rest feedback pays out a muscle with a position-controlled module [m];
+#: such a module turns length errors of an untrained network into slack or into tension
 SLACK = 0.03
-#: fraction of the stretch left up to T_limit that a command to a position-controlled module may
-#: use; the rest covers errors of L_e and the age of T
+#: A tendon can stretch by a certain length before its tension reaches T_limit. A command to a
+#: position-controlled module may use this fraction of that length; the remainder covers errors of
+#: L_e and the age of T.
 SHARE = 0.7
-#: time for which a rise of the tension is extrapolated [s]: the age of T, and the lag of the module
+#: time for which a rise of the tension is extrapolated [s]; it covers the age of T and the lag of
+#: the module
 AHEAD = 0.04
 #: fraction of the tension error that one length command to a position-controlled module corrects
 ADMITTANCE = 0.5
@@ -49,18 +51,18 @@ DEPTH = 0.015
 
 
 class Actuation(ABC):
-    """How the modules of one arm turn commands into tensions, and what they report of them.
+    """How the muscle modules of one arm turn commands into tensions, and what they measure.
 
     Attributes:
         source: Source of the tensions.
         speed: Largest speed of each module [m/s], (M,); infinite if it is not known.
-        follows_tensions: Whether the modules follow tension commands, too.
+        follows_tensions: Whether the modules accept tension commands as well as length commands.
     """
 
     follows_tensions: bool
 
     def __init__(self, robot: Robot) -> None:
-        """Describe the modules of `robot`, in which isolated muscles have a bias of 0."""
+        """Describe the modules of `robot`, whose `tension.bias` must be 0 for isolated muscles."""
         description = robot.description
         self._robot, self._whole = robot, description.tension
         self._stiffness, self._stated_release = description.stiffness, description.release
@@ -80,9 +82,9 @@ class Actuation(ABC):
 
     @property
     def assumed_tension(self) -> Array:
-        """Tension that models and plans use where it is not known [N], (M,).
+        """Tension that models and plans assume where none is measured [N], (M,).
 
-        It is that of a well-tensed arm, by which `check_robot` judges.
+        It is the tension at which `check_robot` judges an arm: DESIRED_SHARE of T_limit.
         """
         return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
 
@@ -96,18 +98,18 @@ class Actuation(ABC):
 
     @abstractmethod
     def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:
-        """Return the one of two parts that belongs to these modules."""
+        """Return `by_stiffness` under stiffness control, `by_position` under position control."""
 
     @property
     @abstractmethod
     def kept_tension(self) -> Array:
-        """Tension that the modules keep by themselves [N], (M,)."""
+        """Tension that the modules maintain even if no command winds in the tendon [N], (M,)."""
 
     @abstractmethod
     def demanded(self, length: Array, command: Array) -> Array | None:
         """Return the tensions [N] (M,) that a length command demands, not limited to T_max.
 
-        None if length commands demand no tension.
+        Return None if the modules follow positions, because a position demands no tension.
 
         Args:
             length: l [m], (M,).
@@ -116,29 +118,32 @@ class Actuation(ABC):
 
     @abstractmethod
     def tension_per_length(self, tension: Array) -> Array:
-        """Return the change of tension per change of a length command [N/m], (M,), at T [N]."""
+        """Return the change of the tension T [N] per change of a length command [N/m], (M,)."""
 
     @abstractmethod
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
-        """Return the length command [m] (M,) that gives other tensions in the same posture.
+        """Return the length command [m] (M,) that changes T to T_wanted in the same posture.
 
         Args:
             length: l [m], (M,).
-            tension: T at that length [N], (M,).
+            tension: T at the length l [N], (M,).
             wanted: T_wanted [N], (M,).
         """
 
     @abstractmethod
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
-        """Return kind and value of the command that brings about tensions; see `length_for`."""
+        """Return the kind and the value of a command that moves T towards T_wanted.
+
+        The arguments are those of `length_for`.
+        """
 
     @abstractmethod
     def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the length command [m] (M,) that keeps T [N] at l [m]."""
+        """Return the length command [m] (M,) that keeps the tension T [N] at the length l [m]."""
 
     @abstractmethod
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:
-        """Return the tension command [N] (M,) that continues a length command.
+        """Return the tension command [N] (M,) that replaces a length command without a jump.
 
         Args:
             length: l [m], (M,).
@@ -148,11 +153,11 @@ class Actuation(ABC):
 
     @abstractmethod
     def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return which modules follow l_target instead of keeping T_bias, (M,)."""
+        """Return a mask (M,) of the modules that follow l_target instead of keeping T_bias."""
 
     @abstractmethod
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return the tension [N] (M,) that a module needs to turn.
+        """Return the tension above T_bias [N] (M,) that each module needs in order to turn.
 
         Args:
             lag: λ, time by which the modules lag behind [s].
@@ -160,7 +165,7 @@ class Actuation(ABC):
         """
 
     def fastest(self, rate_limit: float) -> Array:
-        """Return the largest rate of each length command [m/s] (M,), with a given limit."""
+        """Return the lower of `rate_limit` [m/s] and the speed of each module [m/s], (M,)."""
         return np.minimum(rate_limit, self.speed)
 
     # -- limits ----------------------------------------------------------------------------------
@@ -174,7 +179,7 @@ class Actuation(ABC):
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
         """Return by how much a command may be shorter than the measured length [m], (M,).
 
-        Negative where the muscle has to be paid out.
+        The value is negative where the muscle has to be paid out.
 
         Args:
             tension: T [N], (M,); NaN where it is not known.
@@ -184,7 +189,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def largest_depth(self, limit: Array) -> Array:
-        """Return the largest `depth` [m], (M,), for a T_limit [N]."""
+        """Return the largest possible `depth` [m], (M,), where `limit` is T_limit [N], (M,)."""
 
     @abstractmethod
     def usable_lead(self, lead: Array | float) -> Array | float:
@@ -196,10 +201,10 @@ class Actuation(ABC):
 
     @abstractmethod
     def recovered(self, shortest: Array, dt: float) -> Array:
-        """Return the shortest lengths [m] (M,) that a limit still imposes, dt [s] later.
+        """Return the shortest lengths [m] (M,) that may be commanded after T exceeded its limit.
 
         Args:
-            shortest: Lengths at which the tension limit was exceeded last [m], (M,).
+            shortest: Shortest lengths that were permitted at the last call [m], (M,).
             dt: Time since the last call [s].
         """
 
@@ -207,7 +212,8 @@ class Actuation(ABC):
     def release(self) -> Array:
         """Length that a stop pays out where no tension is known [m], (M,).
 
-        By default it is what takes a tension from T_limit to T_bias in the same posture.
+        By default it is the length that lowers the tension from T_limit to T_bias in the same
+        posture.
         """
         usual = self._robot.elongation(self._whole.limit) - self._robot.elongation(self._whole.bias)
         stated = self._stated_release
@@ -231,7 +237,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:
-        """Return by how much a muscle that is wound in pulls more than T_bias [N].
+        """Return by how much the tension of a suspect muscle that is wound in exceeds T_bias [N].
 
         Args:
             muscle: Index of the muscle.
@@ -242,7 +248,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def winding_depth(self, muscle: int) -> float:
-        """Return by how much a suspect muscle may be wound in, whatever its sensors read [m]."""
+        """Return the length [m] by which a suspect may be wound in, whatever its sensors read."""
 
 
 class StiffnessControl(Actuation):
@@ -305,11 +311,11 @@ class StiffnessControl(Actuation):
         return depth
 
     def usable_lead(self, lead: Array | float) -> Array | float:
-        """Return the lead: the motor takes K_stiff λ dl/dt of the demand to turn."""
+        """Return the whole lead, because the motor needs K_stiff λ dl/dt of the demand to turn."""
         return lead
 
     def recovered(self, shortest: Array, dt: float) -> Array:  # noqa: ARG002
-        """Return −∞: the modules regulate the tension by themselves."""
+        """Return −∞ (no restriction), because the modules regulate the tension by themselves."""
         return np.full_like(shortest, -np.inf)
 
     def released(
@@ -348,7 +354,7 @@ class PositionControl(Actuation):
         return np.zeros_like(self._bias)
 
     def demanded(self, length: Array, command: Array) -> None:  # noqa: ARG002
-        """Return None."""
+        """Return None, because a position demands no particular tension."""
         return
 
     def tension_per_length(self, tension: Array) -> Array:
@@ -363,7 +369,7 @@ class PositionControl(Actuation):
         return length + elongation(tension) - elongation(wanted)
 
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
-        """Return the lengths that move the measured tensions towards others (admittance)."""
+        """Return lengths that correct the fraction ADMITTANCE of T_wanted − T (admittance)."""
         measured = np.maximum(tension, 0.0)
         goal = measured + ADMITTANCE * (wanted - measured)
         return LENGTH, self.length_for(length, measured, goal)
@@ -381,20 +387,19 @@ class PositionControl(Actuation):
         return np.ones(np.shape(length), dtype=bool)
 
     def tension_of_lag(self, lag: float, speed: Array) -> Array:  # noqa: ARG002
-        """Return 0 N, (M,): the drive turns by itself."""
+        """Return 0 N, (M,), because a position-controlled drive turns without tension."""
         return np.zeros_like(speed)
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
         """Return SHARE (L_e(T_limit) − L_e(T + AHEAD dT/dt)) [m], (M,), but not less than 0.
 
-        If T exceeds the limit, return the negative L_e(T_limit) − L_e(T).
+        If T exceeds the limit, return the negative L_e(T_limit) − L_e(T). If T is not known, return
+        `release`, the stretch from T_bias to T_limit.
         """
         elongation = self._robot.elongation
         depth = elongation(limit) - elongation(tension)
         soon = elongation(limit) - elongation(tension + AHEAD * np.maximum(rate, 0.0))
         depth = np.where(depth > 0.0, SHARE * np.maximum(soon, 0.0), depth)
-        # Where the tension is not known, a command may not run further ahead of the module than
-        # what stretches it from T_bias to T_limit.
         return np.where(np.isfinite(tension), depth, self.release)
 
     def largest_depth(self, limit: Array) -> Array:  # noqa: ARG002
@@ -402,15 +407,15 @@ class PositionControl(Actuation):
         return self.release
 
     def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
-        """Return 0 m: the module would wind in by its lead even if the arm is blocked."""
+        """Return 0 m, because the module would wind in its lead even if the arm were blocked."""
         return 0.0
 
     def recovered(self, shortest: Array, dt: float) -> Array:
-        """Return lengths that shorten at RECOVERY.
+        """Return `shortest` reduced at the speed RECOVERY.
 
         Paying out reverses the friction of the tendon, so the tension falls by far more than the
-        elastic elements explain. Wound in again at full speed, the tendon would exceed its limit
-        again before the next reading arrives.
+        elastic elements explain. If the module wound in again at full speed, the tension would
+        exceed its limit again before the next reading arrives.
         """
         return shortest - RECOVERY * dt
 
@@ -418,7 +423,7 @@ class PositionControl(Actuation):
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,
         is_fresh: bool,
     ) -> Array:  # fmt: skip
-        """Return the lengths [m] (M,) at which T is T_bias, or `release` beyond the start."""
+        """Return the lengths [m] (M,) at which T is T_bias; without T, `start` plus `release`."""
         robot, bias = self._robot, self._whole.bias
         end = start + self.release
         if is_fresh:
@@ -426,7 +431,7 @@ class PositionControl(Actuation):
             is_known = np.isfinite(tension) & robot.used
             excess = robot.elongation(tension) - robot.elongation(bias)
             measured = length + np.maximum(excess, 0.0)
-            # Where the tension is low enough, the module stays where it is commanded to be.
+            # Where the tension does not exceed T_bias, the module keeps its last command.
             measured = np.where(tension > bias, np.maximum(measured, last), last)
             end = np.where(is_known, measured, end)
         return np.minimum(end, longest)

@@ -11,8 +11,8 @@ For postures drawn uniformly within the joint limits, the check computes
 To give all joints the same unit, a prismatic joint is treated as if a pinion of radius RACK moved
 it: a tendon parallel to its axis has r = RACK. doc/explanation/method.md ("An arm must be
 holdable") defines a sound arm. A joint with a spring of its own may have muscles on one side only,
-if these hold it. The report also shows the one-sided stiffness, in which muscles at the bias
-tension count as slack; it is not a criterion.
+if these muscles can hold the joint. The report also shows the one-sided stiffness, in which muscles
+at the bias tension count as slack. The one-sided stiffness is not a criterion.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
 
-#: smallest share of postures that a sound arm holds, and in which it is stiff
+#: share of postures that a sound arm must at least hold, and in which it must be stiff enough
 REQUIRED_SHARE = 0.95
 # The required stiffness is the smaller of REQUIRED_STIFFNESS and STIFFNESS_PER_LOAD times the
 # largest load of a joint. With the latter, a change of that load by a tenth moves no joint by more
@@ -52,9 +52,11 @@ SLACK_MARGIN = 1e-3
 COUNTED_ARM = 0.003  # moment arm with which a tension of 300 N produces about 1 N·m [m]
 COUNTED_ARM_SHARE = 0.1
 LEAST_COUNTED_ARM = 1e-4  # [m]
-#: length below which a moment arm of an emulated individual deviates by half or more [m]
+#: moment arms below this length deviate by half or more in emulated individuals [m]
 SHORT_ARM = 0.015
-TOLERATED_SHARE = 0.05  # share of postures in which a sign or a direction may be missing
+#: share of postures in which a muscle may act with the wrong sign, or a joint may lack muscles on
+#: one side
+TOLERATED_SHARE = 0.05
 LEAST_DETOUR = 1e-6  # length added by wrapping below which the value is a rounding error [m]
 LONGEST_ARM = 1.0  # moment arm above which the points are assumed to be in millimetres [m]
 MILLIMETRES = 5.0  # typical moment arm above which all points must be in millimetres [m]
@@ -82,7 +84,8 @@ class Finding(NamedTuple):
     kind: str  # an identifier, such as 'wrong_sign'
     message: str  # text that names the muscles and joints
     remedy: str = ''  # text; '' for 'not_held' and 'not_stiff', for which `remedies` computes it
-    joint: int = -1  # joint that is weakest most often, for 'not_held' and 'not_stiff'
+    #: for 'not_held' and 'not_stiff': index of the joint that is most often the weakest, or -1
+    joint: int = -1
 
 
 class Setting(NamedTuple):
@@ -95,7 +98,7 @@ class Setting(NamedTuple):
     theta: Array  # [rad] or [m], (N, D)
     jacobian: Array  # G [m/rad], (N, M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
-    torque: Array  # g + K θ − b, of weight and springs [N·m], (N, D)
+    torque: Array  # g + K θ − b, which holds the arm against weight and springs [N·m], (N, D)
     weight: Array  # g [N·m], (N, D)
     springs: Array  # K [N·m/rad], (D, D)
 
@@ -183,7 +186,8 @@ def judge(setting: Setting) -> RobotCheck:
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
-    # Position-controlled modules also hold a muscle at T_bias, so that it counts as taut.
+    # A position-controlled module holds its length, so its muscle resists even at T_bias and counts
+    # as taut.
     is_taut = tension[held] > robot.actuation.kept_tension + SLACK_MARGIN
     taut = np.where(is_taut, k, 0.0)
     full, sided = (
@@ -207,7 +211,8 @@ def judge(setting: Setting) -> RobotCheck:
 class ArmTerms(NamedTuple):
     """Unit and wording for moment arms at a joint.
 
-    At a prismatic joint, a moment arm is shown as the share of the tension along the joint's axis.
+    At a prismatic joint, a moment arm is shown as the share of the tension that acts along the axis
+    of the joint.
     """
 
     scale: float  # factor from a moment arm in metres to the shown number [1/m]
@@ -238,12 +243,12 @@ def required_stiffness(robot: Robot, required: float) -> str:
 
 
 def rounded_text(value: float, least: int = 1, largest: float | None = None) -> str:
-    """Return a value with two significant digits of the largest value beside it.
+    """Return a value as text, with the decimals that give `largest` two significant digits.
 
     Args:
         value: The value.
         least: Smallest number of decimals.
-        largest: The largest value that is shown beside it; by default the value itself.
+        largest: The largest of the values that are shown together; by default `value`.
 
     Returns:
         The number as text, without a sign if it rounds to zero.
@@ -259,7 +264,8 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     The result is empty if there is no such file.
 
     Raises:
-        RobotDescriptionError: If the file is invalid; names the line and the legal values.
+        RobotDescriptionError: If the file is invalid; the message names the line and the legal
+            values.
     """
     file = description.directory / DECLARATION_FILE
     legal = (description.muscles, description.joints, ('+', '-'))
@@ -293,7 +299,7 @@ def _finding(key: str, **fields: object) -> Finding:
 
 
 def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Yield declared signs that too many postures contradict."""
+    """Yield a fault for each declared sign that too many postures contradict."""
     for (muscle, joint), sign in read_declared_actions(robot.description).items():
         arm, terms = moment_arms[:, muscle, joint], arm_terms(robot, joint)
         against = np.mean(arm * sign <= 0.0)
@@ -309,7 +315,7 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
-    """Yield joints that have muscles on one side only in too many postures."""
+    """Yield a fault for each joint that has muscles on one side only in too many postures."""
     lacks = {
         '+': np.max(moment_arms, axis=1) <= matters,
         '-': np.min(moment_arms, axis=1) >= -matters,
@@ -336,7 +342,7 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
 
 
 def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
-    """Yield muscles that have no effective moment arm at any joint."""
+    """Yield a fault for each muscle that has no effective moment arm at any joint."""
     along = ', or parallel to that of a prismatic joint' * bool(robot.kinematics.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arms < matters).all():
@@ -362,7 +368,7 @@ def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
 
 
 def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Yield muscles whose main action changes its sign within the joint limits."""
+    """Yield a warning for each muscle whose main action changes its sign within joint limits."""
     for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
         if against > TOLERATED_SHARE:
             names = {'muscle': robot.muscles[m], 'joint': robot.joints[joint]}
@@ -378,7 +384,7 @@ def _millimetres(moment_arms: Array) -> Iterator[Finding]:
 
 
 def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Yield values that look like millimetres or degrees."""
+    """Yield a warning for each moment arm or joint limit that looks like millimetres or degrees."""
     longest, slides = np.abs(moment_arms).max(axis=0), robot.kinematics.slides
     for m, j in np.argwhere((longest > LONGEST_ARM) & ~slides).tolist():
         names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
@@ -391,7 +397,7 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Yield joints whose moment arms are short compared with the emulated and learned errors."""
+    """Yield a warning about the joints at which all moment arms are shorter than SHORT_ARM."""
     # Skip joints without muscles, which are reported as one-way joints.
     longest = np.abs(moment_arms).max(axis=(0, 1))
     small = np.flatnonzero((longest > LEAST_COUNTED_ARM) & (longest < SHORT_ARM)).tolist()
@@ -401,7 +407,7 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
-    """Yield muscles whose tendon slips over an object that it wraps around."""
+    """Yield a warning for each muscle whose tendon slips over an object that it wraps around."""
     for m, size, theta in jumping_muscles(robot):
         crossed = np.flatnonzero(robot.routes.crossed[m])
         place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in crossed)
@@ -409,7 +415,7 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
 
 
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
-    """Yield objects that a tendon should wrap around, but touches in no posture."""
+    """Yield a warning about objects of routes that the tendon touches in none of the postures."""
     described = [
         f'{muscle} ({"sphere" if item.axis is None else "cylinder"} of '
         f'{round(1e3 * item.radius, 1):g} mm on {item.link})'
@@ -423,7 +429,7 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
-    """Yield joints that move no mass."""
+    """Yield a fault for each joint that moves no mass."""
     kin = robot.kinematics
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
     for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):

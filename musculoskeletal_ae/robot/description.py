@@ -75,7 +75,7 @@ class RoutePoint(NamedTuple):
 class Wrap(NamedTuple):
     """A sphere, cylinder or ring around which the tendon wraps between two points.
 
-    Vectors are in the frame of the link.
+    Vectors are in the frame of `link`, except `side` if `side_link` is set.
     """
 
     link: str
@@ -101,7 +101,7 @@ Route = tuple[RoutePoint | Wrap, ...]
 
 
 def branches(route: Route) -> list[Route]:
-    """Return the branches of a route, which are not connected. Most routes have only one."""
+    """Return the branches of a route. The tendon does not connect them; most routes have one."""
     starts = [i for i, item in enumerate(route) if isinstance(item, RoutePoint) and item.divisor]
     ends = sorted({0, *starts, len(route)})
     return [route[start:end] for start, end in pairwise(ends)]
@@ -139,7 +139,7 @@ class RobotDescription:
     actuation: str  # STIFFNESS or POSITION of `robot.actuation`
     tension_source: TensionSource
     speed: Array  # speed of position-controlled modules [m/s], (M,); infinite for others
-    #: length that a stop pays out if tensions are unknown [m], (M,)
+    #: length that a stop pays out if tensions are unknown [m], (M,); NaN for the default
     release: Array
     end_effectors: tuple[str, ...]  # names of links; `end_effector` is the first of them
     couplings: dict[str, Coupling]  # coupling of each joint that follows another one
@@ -153,7 +153,7 @@ class RobotDescription:
 
     @property
     def held_joints(self) -> tuple[str, ...]:
-        """Movable joints of the URDF that are held fixed, being neither in θ nor coupled."""
+        """Movable joints of the URDF that are held fixed: all that are neither in θ nor coupled."""
         known = {*self.couplings, *self.joints}
         return tuple(name for name in self.model.names[1:] if name not in known)
 
@@ -194,7 +194,8 @@ def load_description(robot: str | Path) -> RobotDescription:
     """Read and check a robot description: a shipped name such as 'arm26', or a directory.
 
     Raises:
-        RobotDescriptionError: If it is invalid; names the file, the entry and the legal values.
+        RobotDescriptionError: If the description is invalid; the message names the file, the entry
+            and the legal values.
     """
     directory = find_robot(robot)
     urdf_file, muscle_file = directory / 'robot.urdf', directory / 'muscles.yaml'
@@ -307,7 +308,7 @@ def _joint_problem(name: str, model: pin.Model) -> str:
 def _read_couplings(
     content: MuscleFile, mimics: dict[str, Coupling], model: pin.Model, urdf: Path, fail: Fail
 ) -> dict[str, Coupling]:
-    """Return the coupling of each coupled joint to a joint that follows no other."""
+    """Return the coupling of each coupled joint to a master that follows no other joint."""
     listed = {
         c.joint: Coupling.of_terms(c.master, c.polynomial or (c.offset, c.ratio))
         for c in content.couplings
@@ -339,7 +340,7 @@ def _read_couplings(
         )
         if slave in listed or not is_elsewhere:
             raise refused(slave, problem)
-        del couplings[slave]  # for example a wheel; it is held fixed like all unlisted joints
+        del couplings[slave]  # The joint, for example of a wheel, is held fixed like its master.
     return couplings
 
 
@@ -404,7 +405,7 @@ def _read_tension(
 def _read_route(
     place: str, muscle: MuscleEntry, links: list[str], fail: Fail, warnings: list[str]
 ) -> Route:
-    """Return the route of a muscle without repeated points."""
+    """Return the route of a muscle; leave out repeated points, and append a warning for each."""
     route: list[RoutePoint | Wrap] = []
     for i, entry in enumerate(muscle.route):
         _check_link(f'{place}[{i}].link', entry.link, links, fail)
@@ -465,8 +466,8 @@ def _read_end_effectors(
             raise fail(f'{place}: expected a link that the joints move, {legal}; got {name!r}')
     if places:
         return tuple(places.values())
-    # Return the link that most joints move. Among several, return the one after most fixed joints,
-    # and among several of these the last one in the file.
+    # Choose the link that the largest number of joints move. If several links are equal in this,
+    # choose the one behind the largest number of fixed joints, and then the last one in the file.
     tips, last = _fixed_above(model), {link: i for i, link in enumerate(order)}
     return (max(links, key=lambda link: (links[link], tips[link], last[link])),)
 

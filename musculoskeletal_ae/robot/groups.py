@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of joints and muscles, such as the limbs of a body, derived from its routes."""
+"""Groups of joints and muscles, such as the limbs of a body, derived from the muscle routes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Group(NamedTuple):
         return cls(tuple(range(joints)), tuple(range(muscles)))
 
     def columns(self, joints: int, muscles: int) -> Ints:
-        """Return the indices of the group in (θ, T, l) of a body with D joints and M muscles."""
+        """Return the indices of the group's entries in the vector (θ, T, l) of the whole body."""
         own = joints + np.array(self.muscles)
         return np.concatenate([self.joints, own, muscles + own])
 

@@ -6,7 +6,8 @@
 (paper, §II-A) within the joint limits, by damped least squares (Levenberg–Marquardt) with
 pinocchio's Jacobian. Near a singular posture the pose determines some joints poorly, and camera
 noise would move them arbitrarily. Every step is therefore damped, and the search ends when a step
-gains less than the noise. A robot without joint sensors learns online from the θ that this yields.
+reduces the sum by less than the noise does. A robot without joint sensors learns online from the
+resulting θ.
 """
 
 from typing import NamedTuple
@@ -17,7 +18,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-#: standard deviations of a marker's pose from a typical camera, σ_p [m] and σ_R [rad], (6,)
+#: standard deviations of a marker's pose measured by a typical camera, σ_p [m] and σ_R [rad], (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
 #: standard deviations that leave the orientation free
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
@@ -78,7 +79,7 @@ def inverse_kinematics(
 
 
 def _error(robot: Robot, pose: pin.SE3, theta: Array, spreads: Array) -> Array:
-    """Return the weighted error of position and orientation, (6,)."""
+    """Return the errors of position and orientation at θ, divided by `spreads`, (6,)."""
     here = robot.kinematics.end_effector_pose(theta)
     turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
     error: Array = np.concatenate([pose.translation - here.translation, turn]) / spreads

@@ -44,17 +44,22 @@ class JointElasticity:
 
     @property
     def rest(self) -> Array:
-        """The posture at which no spring exerts torque [rad], (D,); 0 for joints without any."""
+        """Posture in which no spring exerts torque [rad], (D,); 0 for joints without a spring."""
         rest: Array = np.linalg.pinv(self.stiffness, hermitian=True) @ self.preload
         return rest
 
     def holding_torque(self, theta: Array) -> Array:
-        """Return K θ − b, the torque that holds the springs at θ [N·m], θ (..., D)."""
+        """Return K θ − b [N·m], the torque that holds the joints at θ (..., D) against springs."""
         torque: Array = theta @ self.stiffness - self.preload
         return torque
 
     def deviating(self, factor: Array, shift: Array) -> JointElasticity:
-        """Return springs with stiffness times `factor` (D,) and `rest` plus `shift` [rad] (D,)."""
+        """Return a copy in which the springs of the joints deviate.
+
+        Args:
+            factor: Factor of the stiffness of each joint, (D,).
+            shift: Displacement of `rest` [rad], (D,).
+        """
         scale = np.sqrt(factor)
         stiffness = scale[:, None] * self.stiffness * scale
         return JointElasticity(stiffness, stiffness @ (self.rest + shift), self.damping)

@@ -104,7 +104,7 @@ def polyval(x: Array, terms: Array) -> Array:
 
 
 def derivative(terms: Array) -> Array:
-    """Return the coefficients of the derivatives of polynomials; (..., K) maps to (..., K)."""
+    """Return the coefficients (..., K) of the derivatives of polynomials; the last one is 0."""
     result = np.zeros_like(terms)
     result[..., :-1] = terms[..., 1:] * np.arange(1, terms.shape[-1])
     return result
@@ -184,7 +184,7 @@ class JointTree:
             self.descends_from[i] |= self.descends_from[self.parent[i]]
 
     def in_parents(self, theta: Array) -> Array:
-        """Return homogeneous poses (N, J, 4, 4) of joints in their parents; θ (N, D)."""
+        """Return homogeneous poses (N, J, 4, 4) of all joints in their parents at θ (N, D)."""
         angle = theta[:, self.theta_index]
         if self.is_coupled:
             angle = polyval(angle, self.terms)
@@ -196,7 +196,7 @@ class JointTree:
         return self.placements + first * self.first + second * self.second
 
     def transforms(self, theta: Array) -> Array:
-        """Return homogeneous poses (N, J, 4, 4) of joints in the root link's frame; θ (N, D)."""
+        """Return homogeneous poses (N, J, 4, 4) of all joints in the root's frame at θ (N, D)."""
         poses = self.in_parents(theta)
         for i, parent in self._with_parent:
             poses[:, i] = poses[:, parent] @ poses[:, i]
@@ -210,16 +210,16 @@ class JointTree:
         return JointPoses(rotation, poses[..., :3, 3], axis)
 
     def angles(self, theta: Array) -> Array:
-        """Return q (..., J−1) of the tree's joints in pinocchio's order; θ (..., D)."""
+        """Return q (..., J−1) of the tree's joints in pinocchio's order at θ (..., D)."""
         q: Array = theta[..., self.theta_index[1:]]
         return polyval(q, self.terms[1:]) if self.is_coupled else q
 
     def ratios(self, theta: Array) -> Array:
-        """Return dq/dθ of each joint of the tree, (..., J−1); θ (..., D)."""
+        """Return dq/dθ (..., J−1) of each joint of the tree at θ (..., D)."""
         return polyval(theta[..., self.theta_index[1:]], derivative(self.terms[1:]))
 
     def curvatures(self, theta: Array) -> Array:
-        """Return d²q/dθ² of each joint of the tree, (..., J−1); θ (..., D)."""
+        """Return d²q/dθ² (..., J−1) of each joint of the tree at θ (..., D)."""
         terms = derivative(derivative(self.terms[1:]))
         return polyval(theta[..., self.theta_index[1:]], terms)
 
@@ -228,9 +228,14 @@ class JointTree:
         return self.ratios(theta)[:, None] * self.moved_by
 
     def of_theta(self, values: Array, theta: Array) -> Array:
-        """Convert torques, or derivatives with respect to q, of all joints of the tree to θ.
+        """Return Aᵀ v for torques or derivatives v of all joints of the tree with respect to q.
 
-        At θ (*N, D), values of shape (*N, ..., J−1) are mapped to (*N, ..., D).
+        Args:
+            values: v, (*N, ..., J−1).
+            theta: θ, (*N, D).
+
+        Returns:
+            Torques or derivatives with respect to θ, (*N, ..., D).
         """
         if not self.is_coupled:
             of_joints: Array = values[..., self.order]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find tendons whose length jumps while the arm moves smoothly.
 
-A tendon with a `side` can slip over the end of the object that it wraps around. As in MuJoCo, it
-then changes sides at once, and its length jumps by centimetres. No network can represent this.
+If muscles.yaml states on which `side` a tendon passes an object, the tendon can slip over the end
+of that object. As in MuJoCo, the tendon then changes sides at once, and its length jumps by
+centimetres. No network can represent such a jump.
 """
 
 from collections.abc import Callable
@@ -19,12 +20,12 @@ STEPS = 400  # number of postures along each line
 JUMP = 0.001
 LEAST_RANGE = 0.3  # smallest share of a joint's range that a suggested limit may leave
 RANGE_MARGIN = 0.03  # distance between a suggested limit and the jumps, as a share of the range
-#: largest number of times that the points of an emulated individual are drawn until no tendon jumps
+#: largest number of attempts to draw the points of an emulated individual so that no tendon jumps
 MOST_DRAWS = 50
 
 
 def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the largest jump of each length [m] (M,), and its θ [rad] (M, D).
+    """Return the largest jump of each length [m] (M,), and the θ [rad] (M, D) where it occurs.
 
     Args:
         lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
@@ -38,7 +39,10 @@ def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tupl
 def _second_differences(
     lengths: Callable[[Array], Array], lower: Array, upper: Array
 ) -> tuple[Array, Array]:
-    """Return second differences of lengths along lines [m] (N, M), and their θ [rad] (N, D)."""
+    """Return absolute second differences [m] (N, M) of lengths along random lines, and their θ.
+
+    θ [rad], (N, D), are the postures at the middle of each difference.
+    """
     joints = len(lower)
     ends = np.random.default_rng(0).uniform(lower, upper, (2, LINES, 1, joints))
     theta = ends[0] + np.linspace(0.0, 1.0, STEPS)[:, None] * (ends[1] - ends[0])
@@ -58,7 +62,7 @@ def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
 
 
 def jumping_muscles(robot: Robot) -> list[tuple[int, float, Array]]:
-    """Return the muscles whose lengths jump, with the largest jump [m] of each and its θ (D,)."""
+    """Return (index, largest jump [m], θ (D,) of this jump) of each muscle whose length jumps."""
     if robot.routes.objects is None:
         return []
     largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
@@ -108,7 +112,16 @@ def jump_choices(robot: Robot) -> list[str]:
 
 
 def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Return the joint limit that excludes jumps at θ (N, D) and keeps most of the range, or ''."""
+    """Return, as text, limits of one joint that exclude all jumps and keep most of its range.
+
+    Args:
+        robot: The geometric model.
+        there: Postures of the jumps [rad], (N, D).
+        crossed: Indices of the joints that may be limited.
+
+    Returns:
+        The name of the joint and its new limits; '' if less than LEAST_RANGE would remain.
+    """
     best, text = LEAST_RANGE, ''
     for j in crossed:
         low, high = robot.lower[j], robot.upper[j]

@@ -41,7 +41,7 @@ def body_frames(model: pin.Model) -> list[pin.Frame]:
 
 
 def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
-    """Return the joint of the tree that carries a link, and the link's pose in its frame."""
+    """Return the joint of the tree that carries a link, and the link's pose in the joint frame."""
     frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
     return int(frame.parentJoint), frame.placement
 
@@ -71,7 +71,7 @@ def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
 
 
 class Kinematics:
-    """Body side of a robot: link poses, torques of weight and springs, end-effector Jacobian."""
+    """Link poses, torques of weight and springs, and end-effector Jacobian of a robot."""
 
     def __init__(
         self,
@@ -121,12 +121,20 @@ class Kinematics:
         self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
-        """Return the joint of the tree that carries a link's point, and the point in its frame."""
+        """Return the joint of the tree that carries a link, and a link's point in its frame.
+
+        Args:
+            link: Name of the link.
+            xyz: The point in the frame of the link [m], (3,).
+
+        Returns:
+            Index of the joint, and the point in the frame of the joint [m], (3,).
+        """
         joint, placement = self.placement(link)
         return joint, placement.act(xyz)
 
     def placement(self, link: str) -> tuple[int, pin.SE3]:
-        """Return the joint of the tree that carries a link, and the link's pose in its frame."""
+        """Return the joint of the tree that carries a link, and the link's pose in that joint."""
         return link_placement(self.model, link)
 
     def with_elasticity(self, elasticity: JointElasticity) -> Kinematics:
@@ -183,7 +191,7 @@ class Kinematics:
         return result + self.elasticity.stiffness
 
     def joint_inertia(self, theta: Array) -> Array:
-        """Return the inertia at each joint while all others are held [kg·m² or kg], (D,).
+        """Return the inertia [kg·m² or kg] (D,) that each joint moves while all others are held.
 
         Args:
             theta: θ [rad], (D,).

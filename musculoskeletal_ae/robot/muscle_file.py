@@ -16,7 +16,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
-LARGEST = 1e8  # largest size of any number [SI units]
+LARGEST = 1e8  # largest absolute value of any number [SI units]
 LONGEST_LIST = 1000  # largest number of entries of a list: muscles, points of a route, joints
 SHORTEST_AXIS = 1e-6  # length below which a vector defines no direction
 
@@ -67,7 +67,8 @@ class RouteEntry(Strict, frozen=True):
     radius: Positive | None = None
     side: Vector | None = None
     side_link: Name | None = None  # link in whose frame `side` is given; default: `link`
-    divisor: Positive | None = None  # set at a point where another branch of the tendon begins
+    #: set at a point where another branch of the tendon begins, whose length counts 1/divisor
+    divisor: Positive | None = None
 
     def __post_init__(self) -> None:
         """Check that the keys suit the kind of entry, and check the geometry of a cylinder."""
@@ -149,13 +150,13 @@ class CouplingEntry(Strict, frozen=True):
 
 
 class JointElasticityEntry(Strict, frozen=True):
-    """Spring and damper of a joint; for a prismatic joint per metre instead of per radian."""
+    """Spring and damper of a joint; for a prismatic joint, [m] and [N] replace [rad] and [N·m]."""
 
     joint: Name
     stiffness: NotNegative = 0.0  # [N·m/rad]
     rest_angle: Number = 0.0  # angle at which the spring exerts no torque [rad]
     damping: NotNegative = 0.0  # [N·m·s/rad]
-    #: terms of the stiffness with other joints [N·m/rad]
+    #: off-diagonal entries of the stiffness matrix by the name of the other joint [N·m/rad]
     coupled: Annotated[dict[Name, Number], Meta(max_length=LONGEST_LIST)] = field(
         default_factory=dict
     )
@@ -169,10 +170,10 @@ class MuscleFile(Strict, frozen=True):
     series_elastic: ElasticEntry | None = None
     actuation: Literal['stiffness', 'position'] = 'stiffness'
     tension_source: Literal['sensor', 'current', 'none'] = 'sensor'
-    drive: DriveEntry | None = None  # of motors whose current is measured
+    drive: DriveEntry | None = None  # motors of all muscles, if their currents are measured
     stiffness: Positive | UnsetType = UNSET  # K_stiff of muscle stiffness control [N/m]
     speed: Positive | UnsetType = UNSET  # speed of a position-controlled module [m/s]
-    release: Positive | UnsetType = UNSET  # length that a stop pays out without a tension [m]
+    release: Positive | UnsetType = UNSET  # length that a stop pays out if T is unknown [m]
     tension: TensionEntry = TensionEntry()
     end_effector: Name | None = None
     end_effectors: Names | None = None

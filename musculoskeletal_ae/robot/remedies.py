@@ -83,7 +83,14 @@ def rounded(values: Array) -> Array:
 
 
 def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:
-    """Apply a change by a factor to an arm or to one joint; return the result and its text."""
+    """Return a setting with one change, and a text that describes the change.
+
+    Args:
+        setting: The unchanged setting.
+        what: The change, a key of CHANGES.
+        factor: Factor by which the change multiplies a value.
+        joint: Index of the joint to which 'limits' and 'moment arms' apply.
+    """
     robot = copy(setting.robot)
     if what == 'mass':
         text = f'links at {100 * factor:g} % of their mass'

@@ -35,7 +35,7 @@ class Robot:
         self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
         self.stiffness = description.stiffness
         self.tension_source = description.tension_source
-        #: what the modules make of commands, and what they report of tensions
+        #: how the modules turn commands into tensions, and what they measure
         self.actuation: Actuation = ACTUATIONS[description.actuation](self)
         #: root link of the URDF, the frame of poses and markers
         self.root_link = str(body_frames(description.model)[0].name)
@@ -80,7 +80,7 @@ class Robot:
         return Robot(description)
 
     def elongation(self, tension: Array) -> Array:
-        """Return L_e [m] (M,) at the tendon lengths of θ = 0 and T [N] (M,)."""
+        """Return L_e [m] (M,) for T [N] (M,); tendons have the lengths that they have at θ = 0."""
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
@@ -112,9 +112,12 @@ class Robot:
         return reduced
 
     def with_elasticity(self, elasticity: JointElasticity | None) -> Robot:
-        """Return a copy with learned springs and dampers, or with the described ones for None.
+        """Return a copy with learned springs and dampers.
 
         The copy shares the geometry with the original.
+
+        Args:
+            elasticity: The learned springs and dampers; None for those of the description.
         """
         own = self.description.joint_elasticity if elasticity is None else elasticity
         if own is self.kinematics.elasticity:
@@ -130,7 +133,9 @@ class Robot:
         return relative - self.series_elastic.elongation(absolute, tension)
 
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
-        """Return the highest load on each joint by a torque and the muscles at T_bias [N·m], (D,).
+        """Return the highest load of each joint in N postures [N·m], (D,).
+
+        The load is the size of a torque, plus the sizes of the torques of all muscles at T_bias.
 
         Args:
             torque: Torque that holds the arm in N postures [N·m], (N, D).

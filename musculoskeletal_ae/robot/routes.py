@@ -10,7 +10,7 @@ velocity of its end points, ∂p/∂θ_k = a_k × (p − o_k), projected onto th
 segment that may wrap around a sphere or cylinder (`wrapping`), G is the velocity of the end points
 relative to that object's link, projected onto the directions in which the tendon leaves them.
 A tendon may have several branches, joined by pulleys. The length of each branch counts 1/divisor,
-and each branch carries that share of the tension.
+and the branch carries 1/divisor of the tension.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ class Routes:
         self._kinematics = kinematics
         links = ([kinematics.placement(item.link)[0] for item in route] for route in routes)
         carried_by = [kinematics.tree.descends_from[joints, 1:] for joints in links]
-        # A joint of the tree changes a route's length only if it carries some of its points, but
-        # not all. Coupled joints are considered one by one: two of them may carry a whole route
-        # together and still change its length.
+        # A joint of the tree changes the length of a route only if the joint carries some, but not
+        # all, of the route's points. Coupled joints are considered one by one: two of them may
+        # carry a whole route together and still change its length.
         crossed = np.array([some.any(axis=0) & ~some.all(axis=0) for some in carried_by])
         #: whether each muscle crosses each joint of θ or a joint coupled to it, (M, D)
         self.crossed: Bools = crossed @ (kinematics.tree.moved_by > 0.0)
@@ -96,7 +96,8 @@ class Routes:
         ends = self.first[self.wrapping], self.second[self.wrapping]
         #: point at which each force acts, (Q,)
         self._force_point = np.concatenate([self.first, *ends])
-        #: ±1 where a joint of the tree lengthens or shortens the force's segment, (Q, J−1)
+        #: ±1 where a joint of the tree moves only one of the two bodies between which a force acts,
+        #: else 0, (Q, J−1)
         carried, moved = 1.0 * kinematics.tree.descends_from[:, 1:], self.joint
         self._share = carried[moved[self.second]] - carried[moved[self.first]]
         if self.objects is not None:
@@ -216,8 +217,8 @@ class Routes:
             point: Points in the frames of their joints [m], (P, 3).
 
         Returns:
-            Lengths [m], (N, M), and the derivative of the length of each point's muscle by the
-            point in the frame of its joint, (N, P, 3).
+            Lengths [m], (N, M), and for each point the derivative of its muscle's length with
+            respect to the point's position in the frame of its joint, (N, P, 3).
         """
         points = self.placed(poses, point)
         line = points[:, self.second] - points[:, self.first]

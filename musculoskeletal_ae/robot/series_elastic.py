@@ -28,7 +28,7 @@ class SeriesElastic:
     wire_stretch: Array  # stretch of the tendon per metre and newton [1/N]
 
     def of(self, muscle: int) -> SeriesElastic:
-        """Return the constants of one muscle, of shape ()."""
+        """Return the constants of the muscle with this index, as scalars."""
         return SeriesElastic(*(values[muscle] for values in vars(self).values()))
 
     def elongation(self, absolute_length: Array, tension: Array | float) -> Array:

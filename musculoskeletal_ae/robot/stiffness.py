@@ -5,7 +5,8 @@
 
 `check_robot` takes G and L_e from the geometric model, the controller from the network. A muscle
 that MSC holds at T_bias does not resist shortening. The one-sided stiffness therefore counts it as
-slack, with k = 0. An external wrench meets K_θ + ∂g/∂θ, because the arm's weight moves as well.
+slack, with k = 0. The stiffness against an external wrench is K_θ + ∂g/∂θ, because the torque of
+the arm's weight changes with θ as well.
 """
 
 from collections.abc import Callable
@@ -18,9 +19,11 @@ LEAST_COMPLIANCE = 1e-7  # smallest plausible ∂L_e/∂T of an elastic element 
 
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:
-    """Return k [N/m] of MSC (K_stiff [N/m]) and elastic element (∂L_e/∂T [m/N]) in series.
+    """Return the stiffness k [N/m] of a muscle module and its elastic element in series.
 
-    K_stiff of a position-controlled module is infinite.
+    Args:
+        module: K_stiff [N/m]; infinite for a position-controlled module.
+        compliance: ∂L_e/∂T [m/N].
     """
     return 1.0 / (1.0 / module + np.maximum(compliance, LEAST_COMPLIANCE))
 

@@ -26,7 +26,7 @@ from musculoskeletal_ae.robot.robot import Robot
 FAILING_SHARE = 0.02
 PENALTY = 10.0  # weight of failed requirements in the cost; the first term of the cost is below 1
 START_SPREAD = 0.2  # initial standard deviation of x
-TRIES = 40  # number of evaluations for each coordinate of a via point
+TRIES = 40  # number of evaluated candidates per coordinate of all via points
 RESOLUTION = 1e-4  # step to which displacements of via points are rounded [m]
 THIN = 0.003  # width of a muscle in the picture [m]
 
@@ -105,9 +105,9 @@ def moved(robot: Robot, change: Array) -> Robot:
 
 
 def lacking(check: checks.RobotCheck) -> float:
-    """Return a measure of the requirements that an arm fails and via points influence.
+    """Return by how much an arm misses the requirements of the check that via points can change.
 
-    It is 0 if the arm meets all of them with a margin.
+    The result has no unit. It is 0 if the arm meets all these requirements with a margin.
     """
     arms, least = check.moment_arms, check.matters
     torque = np.linalg.norm(check.missing_torque, axis=1)

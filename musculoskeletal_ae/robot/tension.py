@@ -4,8 +4,8 @@
     hard:   min ‖T − T_desired‖²         subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
 
-(Kawamura 2016). T_desired = 0 gives the least tension that holds τ, which is also the QP bound of
-the control experiment. `check_robot` uses T_desired = 0.3 T_limit, a well-tensioned arm.
+(Kawamura 2016). T_desired = 0 gives the least tension that holds τ; the control experiment reports
+it as the QP bound. `check_robot` uses T_desired = 0.3 T_limit, the tension of a well-tensed arm.
 """
 
 from functools import cache
@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.robot import Robot
 #: smallest gap between the limits of a muscle [N]; without it, rounding would make the problem
 #: infeasible for quadprog if a muscle is fixed at one tension (hot, ruptured)
 LEAST_GAP = 1e-8
-#: ε [(N·m/N)²], which is small for torques of some N·m and tensions of some hundred N
+#: ε [(N·m/N)²]; with torques of some N·m and tensions of some hundred N, the second term is small
 SOFT_WEIGHT = 1e-7
 
 
@@ -35,8 +35,8 @@ class Exertion(NamedTuple):
 class TensionProgramme:
     """Quadratic programmes over the tensions that produce a torque within limits.
 
-    All methods raise an `InfeasibleError` if no such tension exists. The constructor and `minimum`
-    also raise it if an entry is not finite, for which quadprog would silently return zeros.
+    All methods raise an `InfeasibleError` if no tension meets the constraints. The constructor and
+    `minimum` also raise it if an entry is not finite, because quadprog would silently return zeros.
     """
 
     def __init__(
@@ -97,11 +97,13 @@ def holding_tension(
     Args:
         robot: The robot.
         theta: θ [rad], (D,).
-        desired: Of all such tensions, the one nearest to this is returned [N], scalar or (M,).
+        desired: Desired tension [N], scalar or (M,). Of all tensions that hold the posture, the one
+            nearest to it is returned.
         jacobian: G [m/rad], (M, D); by default computed by the geometric model.
 
     Raises:
-        InfeasibleError: If no such tension exists, or if an entry is not finite.
+        InfeasibleError: If no tension within the limits holds the posture, or if an entry is not
+            finite.
     """
     jacobian = robot.routes.muscle_jacobian(theta) if jacobian is None else jacobian
     torque, limits = robot.kinematics.holding_torque(theta), robot.tension

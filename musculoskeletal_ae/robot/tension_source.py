@@ -34,7 +34,7 @@ class TensionSource:
 
     @property
     def is_known(self) -> bool:
-        """Whether tensions are known at all."""
+        """Whether tensions are measured, by sensors or as motor currents."""
         return self.kind != NONE
 
     @property
@@ -58,7 +58,7 @@ class TensionSource:
         return tension if self.is_known else np.full_like(tension, np.nan)
 
     def measured(self, rows: Array) -> Array:
-        """Return those of the rows l and T_read, (2, ...), that are measured."""
+        """Return the measured rows of (l, T_read), (2, ...): both, or only l if T is unknown."""
         return rows if self.is_known else rows[:1]
 
     def to_message(self, tension: Array) -> Array:

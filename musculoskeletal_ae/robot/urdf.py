@@ -20,11 +20,11 @@ from musculoskeletal_ae.robot.joint_tree import Coupling
 
 #: largest number of links and joints; recursive parsers overflow their stack at thousands of links
 MOST_PARTS = 2000
-#: largest depth of nested elements, which is also the limit of the parser of MuJoCo and pinocchio
+#: largest depth of nested elements; the parser that MuJoCo and pinocchio use has the same limit
 DEEPEST = 500
 #: elements below <robot> that only a preprocessor understands, besides xacro's own elements
 PREPROCESSED = 'include', 'macro', 'property'
-LARGEST = 1e6  # largest size of any number except efforts and velocities [SI units]
+LARGEST = 1e6  # largest absolute value of any number except efforts and velocities [SI units]
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
 ONE_AXIS = *LIMITED, 'continuous'  # types of joints with one axis
@@ -52,8 +52,8 @@ def read_urdf(file: Path, text: str) -> pin.Model:
         text: Its content.
 
     Raises:
-        RobotDescriptionError: If it is invalid; names the file, the link or joint, and the legal
-            values.
+        RobotDescriptionError: If the URDF is invalid; the message names the file, the link or
+            joint, and the legal values.
     """
     root = parse_xml(file, text)
     _check_expanded(file, root)
@@ -166,7 +166,7 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     """Reject links and joints that do not form a tree.
 
-    The parser would report this on stderr only, and would use the last joint of each link.
+    Pinocchio's parser would only report them on stderr, and would use the last joint of each link.
     """
     links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
     for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():

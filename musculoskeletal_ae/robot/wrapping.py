@@ -14,8 +14,8 @@ On a cylinder the tendon also advances evenly along the axis, which gives √(le
 
 The tangents are chosen as by MuJoCo's `mju_wrap`, so that imported models keep their lengths.
 Where the tendon lifts off, the arc has length zero and the tangents lie on the straight line.
-Length and moment arm are therefore continuous there. A point on the rim of the object is attached
-to it: within RIM · r of the surface it counts as outside, where MuJoCo lets rounding decide.
+Length and moment arm are therefore continuous there. A point within RIM · r of the surface counts
+as lying on the rim, that is, outside the object. In MuJoCo, rounding decides about such points.
 
 The functions are compiled by numba. The geometric model evaluates many segments at once, and the
 emulator evaluates one segment after another in each step.
@@ -34,7 +34,8 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12  # smallest divisor
-RIM = 1e-6  # distance from the surface, divided by the radius, within which a point is outside
+#: distance from the surface, divided by the radius, within which a point counts as outside
+RIM = 1e-6
 Vector = tuple[float, float, float] | Array
 
 
@@ -84,10 +85,11 @@ def _cross_each_other(a: complex, b: complex, c: complex, d: complex) -> bool:
 
 @njit(cache=True)
 def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, complex, complex]:
-    """Return the results of `_round` for a tendon through a ring, which it touches from inside.
+    """Return what `_round` returns, for a tendon that runs through a ring of radius r.
 
-    At the point of contact, both straight parts make the same angle with the radius. Its sine z is
-    the root of asin(r z / a) + asin(r z / b) − 2 asin z + (angle between the ends) = 0.
+    At the point of contact, both straight parts make the same angle with the radius. The sine z of
+    this angle is the root of asin(r z / |a|) + asin(r z / |b|) − 2 asin z + (angle between the
+    ends) = 0.
     """
     straight = False, 0.0, 0j, 0j
     d, far, near = b - a, abs(a), abs(b)
@@ -152,10 +154,10 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
             good = -1e4
         if good > best:
             best, arc = good, (way * (end - start)) % (2.0 * math.pi)
-            # Exclude almost full turns, because rounding may make one of an arc of length zero.
+            # Rounding may turn an arc of length zero into an almost full turn, so exclude these.
             wraps = not crosses and arc < 2.0 * math.pi - 1e-9
             length = math.sqrt(far**2 - r * r) + math.sqrt(near**2 - r * r) + r * arc
-            # The tangent at the point of contact has the direction of rotation.
+            # Each straight part has the direction of the tangent at its point of contact.
             result = wraps, length, way * 1j * u / r, -way * 1j * v / r
     return result
 
