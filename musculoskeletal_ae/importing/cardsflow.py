@@ -3,9 +3,9 @@
 
 CARDSflow states via points relative to a link's centre of mass, in the axes of the link; those of
 the link 'world' are fixed. SPHERICAL and CYLINDRICAL via points (axis z) become wraps, and a MESH
-becomes its point. `joint_limits.yaml` in the same directory may list angles of each joint; the
-smallest and the largest are its limits. A URDF alone gives a skeleton of muscles.yaml, with one
-muscle per joint that has to be replaced.
+via point becomes a fixed point. `joint_limits.yaml` in the same directory may list angles of each
+joint; the smallest and the largest of them become the limits of the joint. A URDF alone gives a
+skeleton of muscles.yaml, with a placeholder muscle for each joint. The user has to replace it.
 """
 
 import os
@@ -36,11 +36,12 @@ from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_
 Limits = dict[str, tuple[float, float]]  # lower and upper limit of each joint [rad] or [m]
 
 ROUND = 'SPHERICAL', 'CYLINDRICAL'  # via points that are wraps
-FRAMES = 'relative_to', 'expressed_in', 'rotation_format'  # attributes of later versions of SDF
+#: attributes that SDF 1.6 does not have, and that change the meaning of poses and axes
+FRAMES = 'relative_to', 'expressed_in', 'rotation_format'
 
 
 def read_cardsflow(file: Path, root: ET.Element) -> Source:
-    """Read a cardsflow.xml and the model in its directory."""
+    """Return the robot of a cardsflow.xml and of the model.urdf or model.sdf beside it."""
     limits_file = file.parent / 'joint_limits.yaml'
     limits = _read_limits(limits_file)
     for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
@@ -127,7 +128,10 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
 
 
 def _measure(source: Source) -> None:
-    """Provide CARDSflow's lengths of straight routes for the comparison."""
+    """Set `source.lengths` to a function that computes the lengths of all straight routes.
+
+    CARDSflow also connects the points of such a route by straight lines.
+    """
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
     if not straight or not joints:
@@ -143,7 +147,7 @@ def _measure(source: Source) -> None:
 
 
 def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
-    """Read a URDF, and add a placeholder muscle over each joint."""
+    """Return the robot of a URDF, with a placeholder muscle over each joint."""
     source, _ = _read_urdf(file, root)
     carried = {source.place(link)[0]: link for link in reversed(source.links)}
     names = distinct(safe_name(f'muscle_of_{joint}', '') for joint in source.model.names[1:])
@@ -158,7 +162,7 @@ def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
 
 
 def _endless(*ends: str | None) -> bool:
-    """Return whether limits are placeholders for no limits, such as 1e16."""
+    """Return whether one of the limits is a placeholder for no limit, such as 1e16."""
     try:
         return any(abs(float(end or 0.0)) > 1e6 for end in ends)
     except ValueError:
@@ -208,16 +212,15 @@ def _read_urdf(
 def _read_sdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the first model of an SDF as `_read_urdf` does."""
+    """Return the links and joints of an SDF with one model, and each link's centre of mass."""
     model = root.find('.//model')
     if root.tag != 'sdf' or model is None:
         raise refuse(file, 'expected an <sdf> element with a <model>')
     if len([*root.iter('model')]) > 1 or model.find('include') is not None:
         raise refuse(file, 'expected a single <model> without <include>; merge all models into one')
     version = [int(part) for part in root.get('version', '1.6').split('.')]
-    frame_of_axis = (
-        '1' if version < [1, 5] else '0'
-    )  # the frame of the model before 1.5, then that of the joint
+    # Before SDF 1.5, an axis was given in the frame of the model, since then in that of the joint.
+    frame_of_axis = '1' if version < [1, 5] else '0'
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
     source.given_limits, source.limits_file = limits_and_file
     for element in model.iter():

@@ -32,7 +32,8 @@ from musculoskeletal_ae.robot.urdf import parse_xml
 
 LARGEST = 20_000_000  # largest file [bytes]
 WARM_UP, PLAYED = 0.1, 1.0  # simulated times before and during the speed test [s]
-REAL_TIME = 0.5  # CPU time per second of model time that is fast enough beside the other nodes [s]
+#: largest CPU time per second of model time that leaves enough for the other nodes [s]
+REAL_TIME = 0.5
 SLOW = 3  # exit status for a model that is slower than real time
 OPENSIM = (
     'OpenSim models are not read; convert it to MJCF with MyoConverter '
@@ -50,27 +51,28 @@ class Imported(NamedTuple):
     """An imported robot."""
 
     robot: Robot
-    notes: tuple[
-        str, ...
-    ]  # properties that were chosen, dropped, held fixed, renamed or approximated
-    comparison: Comparison | None  # with the source's own engine; None if it computes no lengths
+    #: properties that were chosen, dropped, held fixed, renamed or approximated
+    notes: tuple[str, ...]
+    #: comparison with the source's own engine; None if this engine computes no lengths
+    comparison: Comparison | None
 
 
 def read_source(file: Path) -> Source:
-    """Read a file of any supported format, which the root element identifies.
+    """Return the robot of a file of any supported format, which the root element identifies.
 
     Raises:
-        SourceError: If the file is not valid; names the file, the problem and the legal values.
-        RobotDescriptionError: If its URDF is not valid.
+        SourceError: If the file is not valid; the message names the file, the problem and the legal
+            values.
+        RobotDescriptionError: If a URDF is not valid.
     """
     text = read_text(file, refuse, LARGEST)
-    # Check this before parsing, because some tags of OpenSim are not valid XML.
+    # Look for OpenSim before parsing, because some of its tags are not valid XML.
     if '<OpenSimDocument' in text:
         raise refuse(file, OPENSIM)
     try:
         root = parse_xml(file, text)
     except RobotDescriptionError as error:
-        # MuJoCo accepts some invalid XML, such as attributes without a space in between.
+        # MuJoCo accepts some invalid XML, such as two attributes without a space between them.
         loose = isinstance(error.__cause__, ET.ParseError)
         if not (loose and re.match(r'(\s|<\?.*?\?>|<!--.*?-->)*<mujoco[\s/>]', text, re.DOTALL)):
             raise
@@ -101,7 +103,8 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
 
     Raises:
         SourceError: If the file cannot be imported.
-        RobotDescriptionError: If the result is not a valid robot, for example because of inertias.
+        RobotDescriptionError: If the result is not a valid robot, for example because an inertia is
+            not physical.
     """
     source = read_source(file)
     cut(source, **chain)
@@ -112,7 +115,7 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     try:
         write(source, out)
         robot = Robot.load(out)
-    except BaseException:  # also on Ctrl-C, leave no partial robot
+    except BaseException:  # leave no partial robot, even after Ctrl-C
         for file in out.glob('*'):  # the directory was empty before
             file.unlink()
         if not there and out.exists():
@@ -144,7 +147,10 @@ def run(args: Namespace) -> int:
 
 
 def play(robot: Robot, file: Path) -> int:
-    """Simulate the file for a second, and print how long this takes; return 0, or SLOW.
+    """Simulate the file for a second, and print the CPU time that the simulation takes.
+
+    Returns:
+        0 if the file can be simulated in real time, otherwise SLOW.
 
     Raises:
         MusculoskeletalError: If the file cannot be simulated.
@@ -171,7 +177,7 @@ def play(robot: Robot, file: Path) -> int:
 
 
 def length_verdict(comparison: Comparison | None) -> str:
-    """Return a text on the differences of lengths from the source's own."""
+    """Return a text about the differences between our lengths and those of the source's engine."""
     errors = comparison.lengths if comparison else None
     if not errors:
         return 'lengths: not compared, because the source computes none'
@@ -183,7 +189,7 @@ def length_verdict(comparison: Comparison | None) -> str:
 
 
 def arm_verdict(comparison: Comparison) -> str:
-    """Return a text on the differences of moment arms from the source's own, and of their signs."""
+    """Return a text about moment arms that differ in size or sign from the source's engine."""
     worst = sorted(comparison.arms.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
     verdict = f'largest moment arm error over {ARM_POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'

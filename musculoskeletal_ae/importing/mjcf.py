@@ -7,8 +7,8 @@ of massless links, and a ball joint becomes three hinges. `equality/joint` becom
 Springs and dampers of joints, and springs of fixed tendons, become `joint_elasticity`.
 
 If a site lies on the rim of an object that its tendon wraps around, rounding decides in MuJoCo
-whether the tendon wraps. Here the site is attached to the rim (`robot/wrapping.py`). For MuJoCo,
-the radius of the object is reduced by a share 2·RIM, which leads to the same decision.
+whether the tendon wraps. In this package, the site counts as outside (`robot/wrapping.py`). The
+radius of the object in MuJoCo is reduced by a share 2·RIM, so that MuJoCo decides alike.
 """
 
 from collections import defaultdict
@@ -44,23 +44,24 @@ COUNTS = {
 }  # fmt: skip
 RANGE_POSTURES = 200  # postures in which the range of a tendon's length is measured
 LEAST_REACH = 1e-3  # smallest distance of a far end from the origin of its body [m]
-STRONGEST = 1e6  # [N]; MuJoCo assigns more to muscles without an initial moment arm
+#: largest plausible force of an actuator [N]; MuJoCo computes larger forces for muscles without an
+#: initial moment arm
+STRONGEST = 1e6
 
 
 def read_mjcf(file: Path, root: ET.Element) -> Source:
-    """Read an MJCF file.
+    """Return the robot of an MJCF file, whose root element is `root`.
 
     Raises:
-        SourceError: If MuJoCo cannot load it.
+        SourceError: If MuJoCo cannot load the file.
     """
     for item in root.iter('include'):
         included = file.parent / (name := item.get('file', ''))
         if included.exists() and not included.is_file():
             raise refuse(file, f'the included file {name!r} is not a regular file')
     warnings: list[str] = []
-    mujoco.set_mju_user_warning(
-        warnings.append
-    )  # by default MuJoCo writes a file into the working directory
+    # By default, MuJoCo writes warnings to a file in the working directory.
+    mujoco.set_mju_user_warning(warnings.append)
     try:
         model = open_mjcf(file).compile()
     except (ValueError, mujoco.FatalError) as error:
@@ -81,7 +82,7 @@ def open_mjcf(file: Path) -> Any:
 
 
 def resting_joints(model: Any) -> list[float]:
-    """Return the position at which `import_robot` holds each joint if it leaves it out."""
+    """Return the position of each joint of a model at which `import_robot` would hold the joint."""
     reader = _Reader(model, '')
     source = reader.source
     source.couplings = resolved(source.couplings)
@@ -90,10 +91,12 @@ def resting_joints(model: Any) -> list[float]:
 
 
 def tie_rims(model: Any) -> list[tuple[int, int]]:
-    """Reduce the radius of geoms by a share 2·RIM if a site of a wrapping tendon lies on the rim.
+    """Reduce the radius of each geom that has a site of a tendon that wraps around it on its rim.
+
+    The radius is reduced by a share 2·RIM.
 
     Returns:
-        Each such tendon with its geom (indices).
+        Indices (tendon, geom) for each of these sites.
     """
     data, types, tied = mujoco.MjData(model), mujoco.mjtWrap, []
     mujoco.mj_kinematics(model, data)
@@ -119,10 +122,13 @@ def tie_rims(model: Any) -> list[tuple[int, int]]:
 
 
 def far_end(model: Any, data: Any, body: int) -> Array | None:
-    """Return the point of a body's geometry that is farthest from its joint, in its frame [m].
+    """Return the point of a body's geometry that is farthest from the body's last joint.
 
-    Geoms that tendons wrap around count only if the body has no others. The result is None without
-    geometry, or if it lies at the origin.
+    Geoms that tendons wrap around count only if the body has no other geoms.
+
+    Returns:
+        The point in the frame of the body [m], (3,); None if the body has no geometry, or if the
+        point lies at the origin of the body.
     """
     turn, origin = data.xmat[body].reshape(3, 3), data.xpos[body].copy()
     anchor = origin
@@ -173,10 +179,10 @@ class _Reader:
         mujoco.mj_kinematics(model, self.start)
         self.names = {kind: self._names(kind) for kind in COUNTS}
         self.balls: dict[int, list[str]] = {}
-        #: joint that is coupled, its master (−1: none), and the polynomial
+        #: by coupled joint: its master (−1: none) and the coefficients, the highest power first
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
-        self.radius = model.geom_size[:, 0].copy()  # as in the file
+        self.radius = model.geom_size[:, 0].copy()  # as in the file, before `tie_rims` changes it
         self._tie_rims()
         self._bodies()
         self._points()
@@ -220,7 +226,7 @@ class _Reader:
             source.springs.append(Spring(shares, float(m.tendon_stiffness[t]), float(low), name))
 
     def _is_fixed(self) -> Bools:
-        """Return which tendons are fixed, that is, have no route, (tendons,)."""
+        """Return a mask (tendons,) of the fixed tendons, which have no route."""
         fixed: Bools = self.model.wrap_type[self.model.tendon_adr] == mujoco.mjtWrap.mjWRAP_JOINT
         return fixed
 
@@ -244,7 +250,7 @@ class _Reader:
             self.source.note('dropped', f'contacts: {touching} geoms may touch each other')
 
     def _bodies(self) -> None:
-        """Add links and joints; a joint starts at its anchor with the rotation of its body."""
+        """Add links and joints; a joint's frame lies at its anchor and has the axes of its body."""
         m, data, at_start = self.model, self.start, {0: (0, pin.SE3.Identity())}
         for i in range(m.nbody):
             turn, carrier, stand = data.xmat[i].reshape(3, 3), *at_start[m.body_parentid[i]]
@@ -267,7 +273,11 @@ class _Reader:
                 self.source.above[link[0]] = self.names['body'][m.body_parentid[i]]
 
     def _joint(self, j: int, carrier: int, at: pin.SE3) -> int:
-        """Add a joint with an initial pose in the frame of its carrier; return its index."""
+        """Add joint j with the initial pose `at` in the frame of joint `carrier`.
+
+        Returns:
+            The index of the new joint; of the last one if a ball joint became three joints.
+        """
         m, source, types, name = self.model, self.source, mujoco.mjtJoint, self.names['joint'][j]
         low, high = m.jnt_range[j] if m.jnt_limited[j] else (-np.inf, np.inf)
         kind, rest = m.jnt_type[j], float(m.qpos0[m.jnt_qposadr[j]])
@@ -340,7 +350,7 @@ class _Reader:
             source.note('chosen', 'no actuator pulls a tendon, so every tendon is a muscle')
 
     def _strength(self, a: int) -> float:
-        """Return the largest tension of an actuator [N]; inf without a limit in the file."""
+        """Return the largest tension of actuator a [N]; infinity if the file states no limit."""
         m, ends = self.model, np.array([-np.inf, np.inf])
         gain, gear = m.actuator_gainprm[a], m.actuator_gear[a][0]
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
@@ -353,7 +363,7 @@ class _Reader:
         ):  # a motor
             ends = gain[0] * m.actuator_ctrlrange[a]
         elif m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED and m.actuator_ctrllimited[a]:
-            # A servo, as of position: force = gain · control + b₀ + b₁ · gear · length.
+            # A servo such as `position`: force = gain · control + b₀ + b₁ · gear · length.
             length, bias = self._tendon_range(int(m.actuator_trnid[a][0])), m.actuator_biasprm[a]
             control, follows = gain[0] * m.actuator_ctrlrange[a], bias[1] * gear * length
             ends = bias[0] + np.array(
@@ -386,7 +396,7 @@ class _Reader:
             else:
                 round_axis = kind == types.mjWRAP_CYLINDER
                 parts[-1].append(self._wrap(i, int(m.wrap_prm[w]), round_axis))
-        # A branch of one site has no length.
+        # Leave out branches with a single site, because they have no length.
         self.source.routes[name] = tuple(item for part in parts if len(part) > 1 for item in part)
 
     def _wrap(self, geom: int, site: int, round_axis: bool) -> Wrap:
@@ -401,12 +411,12 @@ class _Reader:
         if axis is not None and side is not None and side_link is None:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
-                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # like in MuJoCo
+                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo does
         link = self.names['body'][body]
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)
 
     def _tie_rims(self) -> None:
-        """Make objects thinner whose rim carries a site of a tendon that wraps around them."""
+        """Call `tie_rims` on the model, and add a note for each site that it attached to a rim."""
         for tendon, geom in tie_rims(self.model):
             body = self.names['body'][self.model.geom_bodyid[geom]]
             site = (
@@ -418,7 +428,7 @@ class _Reader:
             )
 
     def _points(self) -> None:
-        """Name the far ends of geometry and the sites; those on tendons come last."""
+        """Set `source.points`: far ends of bodies first, then sites, and sites on tendons last."""
         m, source, points = self.model, self.source, dict[str, tuple[str, Array]]()
         for i in range(1, m.nbody):
             if (far := far_end(m, self.start, i)) is not None:
@@ -448,7 +458,7 @@ class _Reader:
         return data
 
     def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
-        """Return MuJoCo's own lengths."""
+        """Return the tendon lengths that MuJoCo computes [m], (N,) each; see `source.Lengths`."""
         m, data, start = self.model, mujoco.MjData(self.model), self.model.qpos0
         address = {self.names['joint'][j]: at for j, at in enumerate(m.jnt_qposadr.tolist())}
         lengths = []
@@ -463,7 +473,7 @@ class _Reader:
                     'XYZ', angles
                 )
                 data.qpos[at] = np.roll(turn.as_quat(), 1)
-            for _ in self.polynomials:  # couplings may be chained
+            for _ in self.polynomials:  # repeated, because a master may be a coupled joint itself
                 for slave, (master, terms) in self.polynomials.items():
                     at = m.jnt_qposadr[[slave, master]]
                     moved = (data.qpos - start)[at[1]] if master >= 0 else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body read from another format: reduce it, write it as a robot directory, and compare it."""
+"""A body that was read from another format: reduce it to a chain, write it, and compare it."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -21,18 +21,17 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES, ARM_POSTURES = 1000, 200  # postures in which lengths and moment arms are compared
-TURN = 1e-5  # [rad], [m] step of the differences for moment arms
-SHORT_ARM = 1e-3  # [m]; signs of shorter moment arms are not compared
+POSTURES, ARM_POSTURES = 1000, 200  # numbers of postures to compare lengths, and moment arms
+TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad] or [m]
+SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
 LISTED = 12  # largest number of names in a message
 STRENGTH = 'tension.limit is the largest tension in the source, bias 0.1 and max 1.5 times that'
 EARTH = 9.81  # [m/s²]
-UNLIMITED = {
-    False: np.pi,
-    True: 0.5,
-}  # ± limits of revolute [rad] and prismatic joints [m] without limits
+#: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
+UNLIMITED = {False: np.pi, True: 0.5}
 
-#: computes absolute lengths [m] (N,) of muscles from positions (N,) of joints; others are at rest
+#: function that computes the absolute length of each muscle in N postures [m], (N,), from the
+#: positions of joints, (N,) each; joints without positions are at rest
 Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
@@ -41,7 +40,7 @@ class SourceError(MusculoskeletalError):
 
 
 def refuse(file: Path, problem: str) -> SourceError:
-    """Return the error for a problem of a file."""
+    """Return an error whose message names the file and the problem."""
     return SourceError(f'{file}: {problem}')
 
 
@@ -61,9 +60,7 @@ class Source:
     name: str
     model: pin.Model = field(default_factory=pin.Model)
     links: list[str] = field(default_factory=list)  # the root comes first
-    rest: dict[str, float] = field(
-        default_factory=dict
-    )  # positions of joints whose rest position is not 0
+    rest: dict[str, float] = field(default_factory=dict)  # rest positions of joints; 0 if missing
     fixed: list[str] = field(default_factory=list)  # joints that are fixed in the source
     couplings: dict[str, Coupling] = field(default_factory=dict)
     routes: dict[str, Route] = field(default_factory=dict)
@@ -75,13 +72,13 @@ class Source:
     end_effector: str = ''
     #: named points that may be the end effector: link, and position in its frame [m]
     points: dict[str, tuple[str, Array]] = field(default_factory=dict)
-    #: joint limits of a separate file, and that file
+    #: joint limits in a separate file, and the name of this file
     given_limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     limits_file: str = ''
     above: dict[str, str] = field(default_factory=dict)  # parent of each link, if known
 
     def note(self, kind: str, text: str) -> None:
-        """Add a line to the report; `kind` is 'chosen', 'dropped', 'held fixed' or 'renamed'."""
+        """Add the line '`kind`: `text`' to the report; kinds are 'chosen', 'dropped' and others."""
         self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:
@@ -100,7 +97,11 @@ class Source:
             self.note('renamed', f'{kind} {original} is {name} here')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
-        """Return the limits of a joint: of the separate file, of the model, or chosen."""
+        """Return the limits of a joint.
+
+        These are the limits in the separate file, else `low` and `high` if they are usable, else
+        those of UNLIMITED, with a note.
+        """
         if joint in self.given_limits:
             return self.given_limits[joint]
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
@@ -132,13 +133,13 @@ class Source:
     def add_link(
         self, name: str, joint: int, at: pin.SE3, inertia: pin.Inertia | None = None
     ) -> None:
-        """Add a link at a pose in a joint's frame, with its inertia in its own frame."""
+        """Add a link at a pose in the frame of a joint; `inertia` is in the frame of the link."""
         kind, weight = pin.FrameType.BODY, inertia or pin.Inertia.Zero()
         self.model.addFrame(pin.Frame(name, joint, 0, at, kind, weight))
         self.links.append(name)
 
     def place(self, link: str) -> tuple[int, pin.SE3]:
-        """Return the joint that carries a link, and the link's pose in its frame."""
+        """Return the joint that carries a link, and the link's pose in the frame of the joint."""
         return link_placement(self.model, link)
 
     def span(self, joint: str) -> tuple[float, float]:
@@ -156,7 +157,7 @@ class Source:
             self.rest[slave] = float(c.value(self.rest.get(c.master, 0.0)))
 
     def point_link(self, name: str) -> str:
-        """Return a link by its name; for the name of a point, add a link."""
+        """Return `name`; if it is the name of a point, add a link of this name at the point."""
         if name in self.links or name not in self.points:
             return name
         link, xyz = self.points[name]
@@ -178,7 +179,11 @@ def tip_name(link: str) -> str:
 
 
 def tip(source: Source) -> str:
-    """Return the link at the end of the longest chain: most joints, then most links on the last."""
+    """Return the link at the end of the longest chain.
+
+    The longest chain has the most joints that are not coupled, and then the most links after the
+    last joint.
+    """
     model, depth = source.model, [0]
     for i in range(1, model.njoints):
         depth.append(depth[model.parents[i]] + (model.names[i] not in source.couplings))
@@ -196,7 +201,7 @@ def numbers(text: str | None, count: int, where: str) -> Array:
     """Return the numbers in an XML text.
 
     Raises:
-        ValueError: If they are not valid; names the place.
+        ValueError: If the text is not `count` finite numbers; the message names `where`.
     """
     try:
         values = np.array([float(word) for word in (text or '').split()])
@@ -211,7 +216,7 @@ def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.In
     """Return the inertia of a link.
 
     Raises:
-        ValueError: If it is not physical; names the link.
+        ValueError: If the inertia is not physical; the message names the link.
     """
     try:
         return pin.Inertia(mass, centre, tensor)
@@ -240,7 +245,7 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
     """Return legal and unique names of all elements of a kind; unnamed ones are numbered."""
     safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
-    return distinct(safe, ['universe'])  # a name of pinocchio
+    return distinct(safe, ['universe'])  # pinocchio's name of the world
 
 
 def unique(
@@ -269,8 +274,16 @@ def cut(
 ) -> None:
     """Reduce the source in place to a chain.
 
-    Joints that are not requested are held fixed, with a note. Links that do not descend from the
-    base are removed, with their muscles. Muscles that move no joint are removed as well.
+    All other joints are held fixed, with a note. Links that do not descend from the base are
+    removed, with their muscles. Muscles that move no joint are removed as well.
+
+    Args:
+        source: The source.
+        joints: Joints that stay movable; by default all.
+        muscles: Muscles that stay; by default all.
+        without: Muscles to remove.
+        base: The new root link; by default the present one.
+        end: The end effector, a link or a point; by default it is chosen, with a note.
     """
     model, links = source.model, source.links
     if base and base not in links:
@@ -340,7 +353,7 @@ def cut(
 
 
 def _choose_end(source: Source) -> None:
-    """Choose the far end of the last link's geometry as the end effector; note the alternatives."""
+    """Choose the far end of the link `tip` as the end effector, and note the alternatives."""
     link = tip(source)
     leaves = [name for name in source.links if name not in source.above.values()]
     others = [name for each in leaves for name in (tip_name(each), each)]
@@ -358,7 +371,7 @@ def _text(values: Any) -> str:
 
 
 def urdf(source: Source) -> str:
-    """Return the text of a URDF, without the weight of the root, whose z axis points upwards."""
+    """Return the text of a URDF. Its root link has no mass and a z axis that points upwards."""
     model, root, (_, pose) = source.model, source.links[0], source.place(source.links[0])
     upright, size = pin.SE3(pose.rotation, np.zeros(3)), np.linalg.norm(model.gravity.linear)
     if size < 1e-6:
@@ -368,7 +381,7 @@ def urdf(source: Source) -> str:
         upright = pin.SE3(down.matrix(), np.zeros(3)) * upright
         if abs(size - EARTH) > 0.02:
             source.note('chosen', f'gravity: {EARTH} m/s², although the source has {size:.4g} m/s²')
-    carriers = {0: root}  # link of each joint
+    carriers = {0: root}  # link in whose frame each joint of the tree is
     if not upright.isIdentity(1e-9):
         (carriers[0],) = distinct([f'{root}_upright'], source.links)
         reason = f'because the z axis of the root must point upwards, and {root} is rotated'
@@ -429,7 +442,7 @@ def write(source: Source, out: Path) -> None:
 
 
 def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]:
-    """Return the entries of muscles.yaml for springs and dampers.
+    """Return the entries of `joint_elasticity` in muscles.yaml.
 
     A spring of a linearly coupled joint becomes a spring of its master.
     """
@@ -475,7 +488,7 @@ def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]
 
 
 def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
-    """Return an entry of muscles.yaml."""
+    """Return an entry of `couplings` in muscles.yaml."""
     entry: dict[str, Any] = {'joint': slave, 'master': coupling.master}
     if coupling.higher:
         return {**entry, 'polynomial': list(coupling.terms)}
@@ -486,8 +499,9 @@ class Comparison(NamedTuple):
     """Differences between an imported robot and the source's own engine, by muscle."""
 
     lengths: dict[str, float]  # largest error [m]
-    arms: dict[str, float]  # largest error of a moment arm [m], or of a length per length
-    flips: dict[str, float]  # share of the postures in which a moment arm has the wrong sign
+    arms: dict[str, float]  # largest error of a moment arm [m]; at prismatic joints, [m/m]
+    #: share of postures with a moment arm of the wrong sign, at the joint where it is largest
+    flips: dict[str, float]
 
 
 def compare(source: Source, robot: Robot) -> Comparison | None:
