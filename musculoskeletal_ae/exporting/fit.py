@@ -8,8 +8,8 @@
 
 f is the length of the route with displaced points p + δ, wrapping included; κ are logarithmic
 changes of the elastic constants c, and o is a length offset. Each muscle is fitted separately, by
-the Levenberg–Marquardt method of SciPy. The residual is the part of the network that such a body
-cannot represent.
+the Levenberg–Marquardt method of SciPy. The residual is the part of the network's lengths that this
+parametric body cannot represent.
 """
 
 from dataclasses import dataclass
@@ -26,11 +26,12 @@ from musculoskeletal_ae.robot.routes import Routes
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 STATES = 1000  # number of random states in the fit
-#: σ [m]: the network's lengths are about 0.5 mm off, and alike in some forty neighbouring states
+#: σ [m]. The lengths of the network have errors of about 0.5 mm. Some forty neighbouring states
+#: share an error, so they count as one state: σ ≈ 0.5 mm · √40.
 NOISE = 3e-3
 ATTACHMENT, ELASTIC, OFFSET = 0.01, 0.5, 0.05  # s_δ [m], s_κ, s_o [m]
 LARGEST_LOG = 1.5  # bound on |κ|
-ENOUGH = 1e-4  # the search ends at a smaller relative improvement
+ENOUGH = 1e-4  # relative improvement of the sum below which the search ends
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class FittedBody:
 
 
 class _States(NamedTuple):
-    """Lengths that one muscle shall have in N states."""
+    """N states of one muscle, and the lengths that the fit should reproduce."""
 
     poses: JointPoses  # poses of the joints at θ, with θ = 0 as an additional last row
     tension: Array  # T [N], (N,)
@@ -51,7 +52,7 @@ class _States(NamedTuple):
 
 
 def fit(robot: Robot, mae: Mae, seed: int = 0) -> FittedBody:
-    """Fit the parametric body to the lengths of a network over the workspace."""
+    """Return the parametric body that is fitted to a network's lengths over the workspace."""
     rng = np.random.default_rng([seed, 0xE2])
     theta = robot.random_postures(STATES, rng)
     tension = rng.uniform(robot.tension.bias, robot.tension.limit, (STATES, robot.muscle_count))
@@ -72,7 +73,7 @@ def fit(robot: Robot, mae: Mae, seed: int = 0) -> FittedBody:
 
 
 class _Muscle:
-    """One muscle; its parameters are δ (three for each route point), κ (3) and o, in a vector."""
+    """One muscle. The vector of its parameters has δ (three for each route point), κ (3) and o."""
 
     def __init__(self, routes: Routes, elastic: SeriesElastic) -> None:
         self._routes, self._elastic = routes, elastic
@@ -84,7 +85,7 @@ class _Muscle:
         return parameters[:-4].reshape(-1, 3)
 
     def elastic(self, parameters: Array) -> SeriesElastic:
-        """Return the elastic constants, of shape ()."""
+        """Return the elastic constants c e^κ, as scalars."""
         factors = np.exp(np.clip(parameters[-4:-1], -LARGEST_LOG, LARGEST_LOG))
         nominal = vars(self._elastic).values()
         return SeriesElastic(*(value * f for value, f in zip(nominal, factors, strict=True)))
@@ -111,7 +112,7 @@ class _Muscle:
         return found.x, NOISE * found.fun[: len(states.length)]
 
     def _linearised(self, parameters: Array, states: _States) -> tuple[Array, Array]:
-        """Return the muscle's lengths [m], (N,), and their derivatives by the parameters."""
+        """Return the muscle's lengths [m], (N,), and their derivatives (N, K) by K parameters."""
         point = self._routes.point + self.shift(parameters)
         whole, by_point = self._routes.moved(states.poses, point)
         absolute, by_shift = whole[:, 0], by_point.reshape(len(whole), -1)

@@ -2,8 +2,8 @@
 """Export a learned body as an MJCF model, and compare the model with the network.
 
 Links, joints, limits and masses are those of the robot directory. Route points are learned; `fit`
-computes them. Each tendon has an actuator that represents the series elastic element in series with
-a motor, whose length is the control:
+computes them. Each tendon has an actuator that represents a motor and its series elastic element.
+The control u is the length of the tendon at which the element is slack:
 
     pull = k (L − u),   0 ≤ pull ≤ T_max,   k = dT/dx at T_mid = (T_bias + T_limit) / 2
 
@@ -33,7 +33,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 POSTURES = 1000  # postures in which the model and the network are compared
-#: damping of a joint, or times joint_gear [N·m·s/rad]; chosen for a stable simulation
+#: damping of a joint, multiplied by its `joint_gear` [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
 THIN = 0.008  # radius of the capsules that draw bones [m]
 TIMESTEP = 0.002  # [s]
@@ -57,7 +57,7 @@ class Report(NamedTuple):
     torque: Array  # largest difference of the torque that holds the weight [N·m], (D,)
     stretch: Array  # largest error of the linear spring within [T_bias, T_limit] [m], (M,)
     warnings: tuple[str, ...]  # warnings of MuJoCo about the model
-    mjx: str  # whether MJX can load the model
+    mjx: str  # text that says whether MJX can load the model
 
     def text(self, robot: Robot, offsets: Array) -> str:
         """Return the report as a text."""
@@ -80,7 +80,7 @@ class Report(NamedTuple):
 
 
 def loads_in_mjx(model: Any) -> str:
-    """Return a text on whether MJX can load a model."""
+    """Return a text that says whether MJX can load a model."""
     try:
         from mujoco import mjx
     except ImportError:
@@ -152,7 +152,7 @@ def _springs(robot: Robot, elastic: SeriesElastic) -> Springs:
 
 
 def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
-    """Return the routes with points displaced in the frames of their joints by (P, 3) [m]."""
+    """Return the routes with their points displaced by `shift` [m] (P, 3), in joint frames."""
     left = iter(shift)
 
     def item(part: Any) -> Any:
@@ -165,7 +165,7 @@ def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
 
 
 def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
-    """Return the MuJoCo model of a robot with learned route points."""
+    """Return the MjSpec of a robot with learned route points, tendon friction and actuators."""
     exact, once = Draw(0, NONE), np.zeros(robot.muscle_count, dtype=np.int64)
     spec, bodies = mjcf.skeleton(robot, exact)
     mjcf.add_routes(robot, exact, once, spec, bodies)
@@ -237,7 +237,7 @@ def _compare(
         mujoco.mju_sparse2dense(dense, data.ten_J, *rows)
         arms[n] = kin.tree.of_theta(dense[tendons][:, tree], row)
         torques[n] = kin.tree.of_theta((data.qfrc_bias - data.qfrc_passive)[tree], row)
-    # The elongation of the spring at T_mid is constant.
+    # At T_mid, the elongation of the spring is the same in all postures.
     off = theirs - springs.elongation - lengths
     return Report(
         lengths=off.std(axis=0),
