@@ -30,9 +30,8 @@ from musculoskeletal_ae.robot.robot import Robot
 SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]
 # Joints.
 ARMATURE = 0.004  # rotor and bearing inertia of a joint module [kg·m²]; chosen by hand
-STICKING_ANGLE = (
-    0.003  # angle over which joint friction builds up (of the pinion if prismatic) [rad]
-)
+#: angle over which joint friction builds up [rad]; at a prismatic joint, angle of its pinion
+STICKING_ANGLE = 0.003
 VISCOUS = 0.5  # viscous friction of a joint [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # of the joint limits [N·m/rad], [N·m·s/rad]
 STOP_LOAD = 40.0  # load by weight and muscles at T_bias above which stops are stiffer [N·m]
@@ -80,7 +79,7 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def make_handle(parts: Parts) -> Handle:
-    """Return a handle to the parts, the argument of a compiled step."""
+    """Return a handle to `parts`, which `muscle_step` takes as an argument."""
     return Handle(parts)
 
 
@@ -235,8 +234,8 @@ class EmulatedArm(modules.Arm):
 
             q̈ = A θ̈ + Ȧ θ̇,   θ̈ = (Aᵀ M A)⁻¹ Aᵀ (τ − h − M Ȧ θ̇)
 
-        M includes the armature. Joints that follow a curve get the q̈ that puts them onto the curve
-        at the end of the step.
+        M includes the armature. If a coupling is nonlinear, q̈ is corrected so that all couplings
+        hold exactly at the end of the step.
         """
         model, data, joint, kin = self._model, self._data, self._joint, self.robot.kinematics
         theta, gear = self.theta, kin.tree.transmission(self.theta)

@@ -6,14 +6,14 @@ A built robot never equals its description exactly. The seed draws these differe
     attachment points    σ = 10 % of the muscle's typical moment arm, at most 5 mm, each coordinate
     slack                σ = 5 % of the typical moment arm, at most 2 mm, of each tendon's length
     elastic elements     up to 20 % stiffer or softer
-    tendon friction      15 to 20 % of the tension along the route, where the file has none
+    tendon friction      15 to 20 % of the tension along the route, if the file states none
     joint friction       1.1 to 1.5 % of the joint's largest load by weight and muscles at T_bias
     masses               σ = 10 % of the mass of each body, with its inertia
     tension sensors      σ = 2 % of the gain, 1 % of T_limit of the offset
     joint sensors        σ = 1° of the offset
 
-The typical moment arm is the root mean square over the workspace. The deviations of a finger are
-therefore in proportion to those of a shoulder.
+The typical moment arm is the root mean square over the workspace. The muscles of a finger, which
+have short moment arms, therefore deviate by less than the muscles of a shoulder.
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ POSTURES = 200  # number of postures over which moment arms are averaged
 
 
 def effects(robot: Robot) -> Effects:
-    """Return the deviations of sensors, series elastic elements and friction."""
+    """Return the sizes of the deviations of sensors, series elastic elements and friction."""
     return replace(
         NONE,
         stiffness=0.2,
@@ -58,7 +58,7 @@ def typical_arms(robot: Robot) -> Array:
 
 
 def slack(robot: Robot, draw: Draw) -> Array:
-    """Return the initial offset of each length sensor [m], (M,)."""
+    """Return a random slack of each tendon [m], (M,), which offsets its length sensor."""
     sigma = np.minimum(SLACK * typical_arms(robot), LONGEST)
     return sigma * draw.rng('slack').normal(size=len(sigma))
 
@@ -67,7 +67,7 @@ class Attachments:
     """Random displacements of the sites of a model's tendons, which can be redrawn by muscle."""
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
-        """Take a model whose tendons have the names of the robot's muscles, and move its sites."""
+        """Move the sites of `model`, whose tendons must have the names of the robot's muscles."""
         self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
         sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
         self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]
@@ -79,7 +79,7 @@ class Attachments:
         self.move(np.ones(len(self._sites), dtype=bool))
 
     def move(self, muscles: Bools) -> None:
-        """Draw the positions of the sites of some muscles (M,).
+        """Draw new positions for the sites of the muscles in the mask `muscles`, (M,).
 
         A site that would lie inside an object that a tendon wraps around keeps its original
         position.
@@ -100,7 +100,7 @@ def _sites(model: Any, tendon: int) -> Array:
 
 
 def _is_inside(model: Any, site: int) -> bool:
-    """Return whether a site lies inside a wrapped geom of its own body."""
+    """Return whether a site lies inside a geom of its own body that a tendon wraps around."""
     kinds = mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER
     for w in np.flatnonzero(np.isin(model.wrap_type, kinds)).tolist():
         geom = model.wrap_objid[w]

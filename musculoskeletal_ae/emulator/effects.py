@@ -23,31 +23,27 @@ class Effects:
 
     # Body
     attachment: float = 0.0105  # σ of each coordinate of each route point [m]
-    kinks: float = 0.01  # detour of a tendon round bones' heads and other muscles [m]
+    kinks: float = 0.01  # detour of a tendon around the heads of bones and other muscles [m]
     slip_over: float = 0.0057  # jump when a tendon slips over a ridge, in 5 % of postures [m]
     give: float = 5e-5  # displacement of a route point under its load [m/N]
-    joint_friction: float = (
-        0.02  # relative to a joint's largest load by weight and muscles at T_bias
-    )
-    links: float = (
-        0.0  # multiple of these σ: lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
-    )
+    #: friction of a joint, relative to its largest load by weight and muscles at T_bias
+    joint_friction: float = 0.02
+    #: factor of these σ: link lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
+    links: float = 0.0
     springs: float = 0.25  # σ of the logarithm of the stiffness of each joint's spring
-    spring_rest: float = (
-        0.08  # σ of the rest angle of each spring [rad]; prismatic joints: times RACK [m]
-    )
+    #: σ of the rest angle of each spring [rad]; prismatic joints: times RACK [m]
+    spring_rest: float = 0.08
     # Series elastic elements, made of rubber
     stiffness: float = 0.4  # largest relative deviation from the data sheet
     laws: float = 1.0  # share of the muscles whose law differs from the data sheet
     hysteresis: float = 0.2  # width of the loop, relative to the elongation
     creep: float = 0.05  # creep per decade of time, relative to the elongation
     # Tendons
-    recovery: float = (
-        0.45  # delayed share of the stretch; most of it comes within 40 min, all within 12 h
-    )
+    #: share of the stretch that is delayed, most of it by up to 40 min, all of it by up to 12 h
+    recovery: float = 0.45
     bedding: float = 0.005  # lengthening of a tendon in its first hours [m]
     knot: float = 0.0034  # slip of one knot, once [m]
-    guide_friction: float = 0.4  # relative tension loss along the route at mid-range
+    guide_friction: float = 0.4  # relative tension loss along the route, joints at mid-range
     stiction: float = 0.34  # relative increase of friction at the start of a motion
     # Sensors
     tension_gain: float = 0.05  # σ of the relative error of the gain
@@ -61,9 +57,8 @@ class Effects:
     length_drift: float = 0.001  # σ of the drift of the offset [m/h]
     joint_zero: float = np.radians(2.0)  # σ of the offset [rad]; prismatic joints: times RACK [m]
     joint_bend: float = 0.01  # non-linearity, relative to the joint's range
-    backlash: float = np.radians(
-        1.0
-    )  # backlash of the joint sensor [rad]; prismatic joints: times RACK [m]
+    #: backlash of the joint sensor [rad]; prismatic joints: times RACK [m]
+    backlash: float = np.radians(1.0)
     # Messages
     delay: float = 0.02  # delay of joint angles, and of lengths and tensions [s]
     jitter: float = 0.005  # range of the delay [s]
@@ -74,21 +69,24 @@ NONE = Effects(**{field.name: 0.0 for field in fields(Effects)})
 
 
 class Draw:
-    """Random draws of one individual; each named draw is independent of the other effects."""
+    """Random draws of one individual. Each draw depends only on the seed and on its own name."""
 
     def __init__(self, seed: int, effects: Effects) -> None:
         self._seed, self.sizes = seed, effects
 
     def rng(self, name: str) -> np.random.Generator:
-        """Return the random number generator of a name."""
+        """Return a new random generator that depends on the seed and on `name`."""
         return np.random.default_rng([self._seed, zlib.crc32(name.encode())])
 
     def normal(self, name: str, shape: int | tuple[int, ...]) -> Array:
-        """Return normally distributed values whose σ is an effect's size."""
+        """Return normally distributed values whose σ is the size of the effect `name`."""
         return float(getattr(self.sizes, name)) * self.rng(name).normal(size=shape)
 
     def about(self, name: str, count: int, signed: bool = False) -> Array:
-        """Return `count` values from 3/4 to all of an effect's size; random signs if `signed`."""
+        """Return `count` values between 3/4 and 1 times the size of the effect `name`.
+
+        With `signed`, each value has a random sign.
+        """
         rng = self.rng(name)
         value: Array = getattr(self.sizes, name) * rng.uniform(0.75, 1.0, count)
         return value * rng.choice([-1.0, 1.0], count) if signed else value

@@ -2,8 +2,8 @@
 """Faults of tendons, motors, sensors and communication that can be switched while the arm moves.
 
 A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
-'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. Without a name it affects all
-muscles.
+'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. If the line names no muscle or
+joint, the fault affects all muscles.
 """
 
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ SPIKE_SHARE = 0.05  # fraction of the readings in which one muscle has a spike
 
 
 class Kind(NamedTuple):
-    """Properties of a kind of fault, and the meaning of its size."""
+    """Properties of a kind of fault."""
 
     meaning: str
     size: float = 0.0  # default size
@@ -72,7 +72,7 @@ class Fault(NamedTuple):
 
 
 def read_fault(line: str, robot: Robot) -> Fault:
-    """Parse one line.
+    """Return the fault that a line describes.
 
     Raises:
         MusculoskeletalError: If the line is not legal; the message lists the legal forms.
@@ -88,7 +88,7 @@ def read_fault(line: str, robot: Robot) -> Fault:
     elif kind.of_quantity and words and words[0] in robot.joints:
         quantities = ('theta',)
     elif kind.size:
-        quantities = quantities[:1]  # a spike or bias without a quantity is one of length
+        quantities = quantities[:1]  # without a quantity, spikes and biases affect lengths
     if quantities and kind.size:
         size, largest, unit = SIZES[quantities[0]]
         unit, smallest = f'{unit} of {quantities[0]}', -largest
@@ -119,7 +119,7 @@ class Faults:
         self._robot, self._rng = robot, rng
         self._faults: tuple[Fault, ...] = ()
         self._frozen: dict[tuple[str, int], float] = {}
-        self._reordered: Readings | None = None  # arrives after the next readings
+        self._reordered: Readings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, Readings]] = []
         # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
         # tendon [m], offset of the length sensor [m], minimum temperature of the housing [°C].

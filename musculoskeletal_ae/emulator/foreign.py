@@ -39,10 +39,10 @@ OTHER_ROUTE = 0.02  # tolerated difference of a file's route lengths [m]
 
 
 class ForeignBody:
-    """True lengths, moment arms, elastic laws and sensor errors of one arm at rest, when new."""
+    """True lengths, moment arms, elastic laws and sensor errors of one new arm at rest."""
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
-        """Take a MuJoCo model whose joints and tendons have the robot's names."""
+        """Describe `model`, whose joints and tendons must have the names of the robot's."""
         self._robot, self._model = robot, model
         self._data = mujoco.MjData(model)
         names, count = robot.kinematics.model.names[1:], robot.muscle_count
@@ -65,7 +65,7 @@ class ForeignBody:
     def _routed(self, theta: Array) -> Any:
         """Return data with lengths and moment arms of the tendons at θ [rad] (D,).
 
-        Without contacts, which would take most of the time in some files.
+        Contacts are not computed, because they would take most of the time in some files.
         """
         data = self._data
         data.qpos[self.tree] = self._robot.kinematics.tree.angles(theta)
@@ -97,10 +97,11 @@ class ForeignBody:
 
 
 def _individual_model(robot: Robot, draw: Draw) -> Any:
-    """Return the model of a robot directory with the differences of an individual.
+    """Return the MuJoCo model of a robot directory, with the deviations of an individual.
 
-    Route points are redrawn until no tendon slips, by centimetres, over the end of a described
-    object that it wraps around. No one would route a tendon there.
+    A tendon jumps by centimetres if it slips over the end of a described object. No one would route
+    a tendon there, so route points are redrawn until only those tendons jump that also jump in the
+    description.
     """
     again = np.zeros(robot.muscle_count, dtype=np.int64)
     model = mjcf.from_directory(robot, draw, again).compile()
@@ -118,7 +119,7 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
 
 def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
-    """Make the body of a file an individual; its tendons jump only where those of the file do."""
+    """Change the model of a file into an individual, without adding tendons that jump."""
     smooth = ~jumping(ForeignBody(robot, copy.copy(model), draw).absolute_lengths, robot)
     attachments = deviation.Attachments(robot, model, draw)
     for _ in range(MOST_DRAWS):
@@ -232,9 +233,14 @@ class ForeignArm(Arm):
     ) -> None:
         """Build an individual at rest, with its modules in the safe state and calibrated effects.
 
-        With `file`, the arm is the user's MJCF model instead. It then has the effects of the file
-        and none of `Effects`. If it deviates, it is an individual that differs from the file
-        (`emulator/deviation.py`).
+        Args:
+            robot: The robot to emulate.
+            seed: Selects the individual.
+            effects: Sizes of the effects; by default the calibrated ones. Ignored with `file`,
+                except that a `joint_friction` of 0 removes all friction of the file.
+            file: MJCF model of the arm, instead of a body that is built from the robot directory.
+            deviates: Whether the arm is an individual that differs from `file`
+                (`emulator/deviation.py`).
 
         Raises:
             MusculoskeletalError: If the robot or the file cannot be built.
@@ -307,8 +313,9 @@ class ForeignArm(Arm):
     def _root_pose(self) -> pin.SE3:
         """Return the pose of the robot's root link in the file's world frame, at mid-range.
 
-        `import_robot` may rename or remove links, and adds an upright root below a tilted one. The
-        pose therefore follows from the link nearest to the root that the file contains.
+        `import_robot` may rename or remove links, and adds an upright root to a tilted one. The
+        pose is therefore computed from the link that the file contains and that is nearest to the
+        root.
         """
         robot, model, data = self.robot, self._model, self._data
         known = mjcf.bodies_as_imported(model)
@@ -392,7 +399,7 @@ class ForeignArm(Arm):
         self._sensors.append(self._sensed_quantities())
 
     def _sensed_quantities(self) -> Array:
-        """Return true θ, the modules' readings of l and T, and housing temperatures, in a row."""
+        """Return true θ, the modules' readings of l and T, and housing temperatures, joined."""
         memory, muscle = self._memory, self._muscle
         return np.concatenate([self.theta, memory.reading, memory.cell, muscle.housing])
 

@@ -30,8 +30,8 @@ class Spread:
     wrap: float = 0.4
     elastic: float = 0.15  # standard deviation of the logarithm of each elastic constant
     tendon_friction: float = 0.095  # mean relative tension loss along the route (capstan exponent)
-    #: mean Coulomb torque of a joint, as a share of its load: the largest torque by the arm's
-    #: weight, plus the largest by muscles at T_bias in one direction
+    #: mean Coulomb torque of a joint, as a share of its load (`Robot.joint_load`): the largest
+    #: holding torque, plus the torques of all muscles at T_bias
     joint_friction: float = 0.0133
     length_bias: float = 0.0005  # standard deviation of each length sensor's offset [m]
     tension_bias: float = 1.0  # standard deviation of each tension sensor's offset [N]
@@ -104,10 +104,16 @@ class Individual:
     def _redraw_jumping_routes(
         self, robot: Robot, off: Array, again: Array, routes: Callable[[Array], WrappedRoutes]
     ) -> None:
-        """Redraw points' deviations (P, 3) until tendons jump only where those of the model do.
+        """Redraw route points until only those tendons jump that also jump in the model.
 
         A tendon jumps by centimetres if it slips over the end of an object that it wraps around. No
-        one would route a tendon there. `again` holds the deviations to try.
+        one would route a tendon there.
+
+        Args:
+            robot: The geometric model.
+            off: Deviations of the route points [m], (P, 3), changed in place.
+            again: Deviations to try one after another [m], (..., P, 3).
+            routes: Function that returns the true routes for deviations.
         """
         nominal = robot.routes
         smooth = ~jumping(nominal.absolute_lengths, robot)
@@ -144,9 +150,9 @@ def _objects(
     """Return the object that each segment wraps around: a described one, or a bone's head.
 
     A described object has a slightly different radius than in the description. A bone's head is
-    centred at the joint nearest to the tendon. The tendon touches it in a share `quantile` of the
-    postures. Its radius is small enough that the tendon cannot slip over to the other side, and
-    that it encloses neither the described attachments nor the true ones, `point`.
+    centred at the joint nearest to the tendon. The tendon touches the head in a share `quantile` of
+    the postures. The radius of the head is so small that the tendon cannot slip over to the other
+    side, and that the head encloses neither the described route points nor the true ones, `point`.
     """
     kin, routes = robot.kinematics, robot.routes
     count = len(routes.first)
@@ -173,7 +179,7 @@ def _objects(
             scale = min(described[s], 0.95 * least / objects.radius[s])
             objects.radius[s] *= scale
             if objects.side_joint[s] == objects.joint[s]:
-                objects.side[s] *= scale  # a ring stays one
+                objects.side[s] *= scale  # so that a ring stays a ring
             continue
         between = (
             kin.tree.descends_from[routes.joint[ends[0]]]

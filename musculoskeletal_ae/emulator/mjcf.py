@@ -28,13 +28,14 @@ from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames, link_placement
 from musculoskeletal_ae.robot.robot import Robot
 
-ARMATURE, DAMPING = 0.005, 0.4  # [kg·m²], [N·m·s/rad] of a joint module; chosen
-LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # [m], [rad] of `Effects.links`
-MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # share, [m]
-THICKEST = 0.045  # radius of a bone's head or a muscle [m]
-POSTURES = 300  # random postures over which their radii are fitted
-# MuJoCo ignores the ratio of a coupling when it scales its stiffness. With the default, a prismatic
-# joint that follows a revolute one would lag by centimetres.
+ARMATURE, DAMPING = 0.005, 0.4  # of a joint module [kg·m²], [N·m·s/rad]; chosen by hand
+# The following four are the σ that `Effects.links` multiplies.
+LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # of link lengths [m] and joint axes [rad]
+MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # of the logarithm of masses, and of their centres [m]
+THICKEST = 0.045  # largest radius of the head of a bone, or of a muscle [m]
+POSTURES = 300  # number of random postures in which the radii of heads and muscles are fitted
+# Constraint stiffness (solimp) of couplings. With MuJoCo's default, which disregards the ratio of a
+# coupling, a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 HAND, SPRING = 'hand of the emulator', 'spring'
 OF_MOTORS = (
@@ -74,7 +75,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     springs = _drawn_springs(robot, draw)
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
-        # Joints at a common point stay there.
+        # Joints with a common origin keep it.
         is_apart = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD
         place = at.translation + LENGTH_SPREAD * off[i, 0] * is_apart
         placement = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
@@ -119,9 +120,10 @@ def _drawn_springs(robot: Robot, draw: Draw) -> JointElasticity:
 
 
 def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
-    """Add the springs of the joints; those that couple joints become fixed tendons.
+    """Add the springs of the joints; springs that couple joints become fixed tendons.
 
-    K is the sum of one spring for each of its eigenvectors v, along the coordinate v · θ.
+    The stiffness matrix of the coupled joints is represented by one spring for each of its
+    eigenvectors v. Each spring acts along the coordinate v · θ.
     """
     off = springs.stiffness - np.diag(np.diag(springs.stiffness))
     for k in np.flatnonzero(~off.any(axis=1)).tolist():
@@ -136,7 +138,7 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
         if value <= 1e-9 * values[-1]:
             continue
         if vector @ springs.rest[coupled] < 0.0:
-            vector = -vector  # a length of −1 means another thing to MuJoCo
+            vector = -vector  # for MuJoCo, a spring length of −1 means that none is given
         names = ', '.join(robot.joints[k] for k in coupled)
         tendon = spec.add_tendon(name=f'{SPRING} {len(spec.tendons)} of {names}')
         for k, share in zip(coupled, vector, strict=True):
@@ -194,7 +196,7 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
 
 
 def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
-    """Return the centre and direction of every section of every muscle at mid-range."""
+    """Return the muscle, centre and direction of every section of a route, joints at mid-range."""
     kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
     poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
@@ -270,7 +272,7 @@ def _turn(rotation: Array) -> Array:
 
 
 def _add_hand(body: Any, at: pin.SE3) -> None:
-    """Add the end effector in the axes of its link; it carries the payload."""
+    """Add a body that represents the end effector, at the pose `at`, and carries the payload."""
     hand = body.add_body(name=HAND, pos=at.translation, quat=_turn(at.rotation))
     hand.explicitinertial, hand.ipos = True, np.zeros(3)
 
@@ -359,9 +361,9 @@ def from_file(robot: Robot, file: Path) -> Any:
 
 
 def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
-    """Return the end effector's pose in its own link and in all links rigidly connected to it.
+    """Return the pose of the end effector in the frame of each link that does not move against it.
 
-    The first links are the end effector itself and those that carry it.
+    The first link is the end effector itself; the links that carry it come next.
     """
     model, name = robot.description.model, robot.description.end_effector
     joint, hand = link_placement(model, name)
@@ -377,7 +379,7 @@ def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
 
 
 def _split_balls(spec: Any, followers: list[str]) -> None:
-    """Replace ball joints by three hinges where the robot has their parts."""
+    """Replace each ball joint by three hinges, if the robot has at least one of these hinges."""
     wanted = set(followers)
     for ball in [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_BALL]:
         parts = [f'{safe_name(ball.name, "")}_{axis}' for axis in 'xyz']
@@ -413,7 +415,7 @@ def _placements_of_held(
 ) -> list[tuple[Any, dict[str, Array]]]:
     """Return the bodies and joints whose placement in their parent depends on held joints.
 
-    Each comes with its values for the model without the held joints.
+    Each is paired with the values that it needs in the model without the held joints.
     """
     rest, data = resting_joints(model), mujoco.MjData(model)
     for joint in held:
@@ -440,7 +442,14 @@ def _placements_of_held(
 def _rename_as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> str:
     """Give joints and tendons the names that `import_robot` gives them; return the hand's body.
 
-    The hand's body is the first of `hands` that the file contains.
+    Args:
+        spec: The model of the file, changed in place.
+        file: The file, for messages.
+        wanted: Names of joints and tendons that the robot needs.
+        hands: Names of links that may carry the end effector, the best first.
+
+    Returns:
+        The name of the first body in `hands` that the file contains.
     """
     kinds = {'joint': spec.joints, 'tendon': spec.tendons, 'body': spec.bodies}
     bodies = {body.name for body in spec.bodies}
@@ -458,7 +467,7 @@ def _rename_as_imported(spec: Any, file: Path, wanted: list[str], hands: list[st
         renamed = list[tuple[Any, str]]()
         for thing, name in zip(ordered, names, strict=True):
             before = thing.name
-            # This also renames a thing whose name another one needs.
+            # Also rename an element whose own name another element needs.
             is_renamed = kind != 'body' and not {before, name}.isdisjoint(wanted)
             if kind == 'joint' and before in bound and name != before and is_renamed:
                 problem = f'import_robot renames joint {before!r} to {name!r}, but MuJoCo cannot'

@@ -8,7 +8,7 @@
 
 In MSC and motor control, l and T are the readings of the module's own sensors. `muscles.yaml` says
 whether the modules follow MSC or positions (`actuation`). A position-controlled module holds its
-length while it gets no commands, and gives way to more than T_max.
+length while it gets no commands, and pays out while its tension exceeds T_max.
 """
 
 import math
@@ -31,7 +31,7 @@ STEP = 0.001  # [s]
 # Modes of a module.
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
-# These values are chosen; those of Musashi are not public.
+# The following values are chosen by hand, because those of Musashi are not public.
 #: rate at which a module in the safe state approaches T_bias [N/s]
 RELEASE_RATE = 100.0
 MOTOR_GAIN = 0.004  # [m/s/N]
@@ -42,10 +42,10 @@ AMBIENT = 25.0  # [°C]
 LOSS = 20.0  # heat loss of a motor at T_limit [W]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
 WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
-HEAT_SPREAD = 0.15  # standard deviation of the logarithm of each of these five constants
+HEAT_SPREAD = 0.15  # standard deviation of the logarithm of LOSS, the capacities and resistances
 
-# Sensors; these values are chosen. Noise is one standard deviation. Readings are rounded to the
-# resolution, which is a power of two as for an A/D converter.
+# Sensors. The values are chosen by hand. Noise is one standard deviation. Readings are rounded to
+# the resolution, which is a power of two as for an A/D converter.
 ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]; prismatic joints: times RACK [m]
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
@@ -59,9 +59,10 @@ MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
 
 
 def joint_gear(kinematics: Kinematics) -> Array:
-    """Return the factors of drag, stops and inertia of the joint modules, (J,) of the tree.
+    """Return the factor of damping, stops and inertia for each joint of the tree, (J,).
 
-    The factor is 1 for revolute joints, and that of the pinion [1/m²] for prismatic joints.
+    The factor is 1 for revolute joints. A prismatic joint is driven by a pinion of radius RACK, so
+    its factor is 1/RACK² [1/m²].
     """
     gear: Array = np.where(kinematics.tree.prismatic, RACK**-2, 1.0)
     return gear
@@ -123,7 +124,11 @@ def wind(
     modules: Modules, muscle: MuscleState, kind: int, command: Command, m: int,
     reading: float, tension: float,
 ) -> float:  # fmt: skip
-    """Move motor m by its length [m] and tension [N] readings; return the wound-in length [m]."""
+    """Turn motor m for one STEP as its control law demands; return the wound-in length [m].
+
+    `reading` [m] and `tension` [N] are what the sensors of the module read; `kind` is SAFE,
+    FOLLOW_LENGTH or FOLLOW_TENSION.
+    """
     previous, bias = muscle.reference[m], modules.tension_bias[m]
     most = min(modules.speed[m], SPEED_LIMIT * (1.0 - command.stuck[m]))
     if modules.follows_position[m] > 0.0:
@@ -158,7 +163,7 @@ def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
 
 @njit(cache=True)
 def heat(modules: Modules, muscle: MuscleState, command: Command, m: int) -> None:
-    """Heat module m by its tension for one STEP."""
+    """Update the temperatures of module m after one STEP at its present tension."""
     inner = (muscle.winding[m] - muscle.housing[m]) / modules.winding_resistance[m]
     outer = (muscle.housing[m] - AMBIENT) / modules.housing_resistance[m]
     loss = modules.loss[m] * muscle.tension[m] * muscle.tension[m]
@@ -194,21 +199,20 @@ class Arm(ABC):
 
     individual: Any  # the true body that the seed selects
     warnings: tuple[str, ...] = ()  # warnings to report when the arm is started
-    _angles: Array  # of all joints
-    _rates: Array  # velocities of all joints
+    _angles: Array  # positions of all joints of the tree [rad] or [m]
+    _rates: Array  # velocities of all joints of the tree [rad/s] or [m/s]
     _order: Ints  # indices of the joints of θ in `_angles` and `_rates`
 
     def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
         """Build the modules; `length_bias` [m] (M,) are the offsets of their length sensors."""
         self.robot, self._length_bias = robot, length_bias
-        self.command_timeout = (
-            0.5  # time without a command until the modules go to their safe state [s]
-        )
+        #: time without a command after which the modules go to their safe state [s]
+        self.command_timeout = 0.5
         self._rng = np.random.default_rng([seed, 0x5E45])
         self._heat_rng = np.random.default_rng([seed, 0x4EA7])
         self.faults = Faults(robot, np.random.default_rng([seed, 0xFA17]))
         rng, count = np.random.default_rng([seed, 0xD21E]), robot.muscle_count
-        #: of readings of motor currents: factor of the tension, offset [N], drive friction [N]
+        #: errors of motor currents: factor of the tension, offset [N] and drive friction [N], (M,)
         self._current_scale = np.exp(rng.normal(0.0, CURRENT_SCALE, count))
         self._current_zero = rng.normal(0.0, CURRENT_ZERO, count)
         share = DRIVE_FRICTION * rng.uniform(0.5, 1.5, count)
@@ -358,7 +362,9 @@ class Arm(ABC):
         self._attach(repaired)
 
     def set_faults(self, lines: Iterable[str]) -> None:
-        """Activate the faults of the lines and end all others; shortened tendons take up T_bias.
+        """Activate the faults of the lines and end all others.
+
+        Tendons that become shorter, because a 'slack' fault ends, return to T_bias.
 
         Raises:
             MusculoskeletalError: If a line is not legal; nothing changes then.

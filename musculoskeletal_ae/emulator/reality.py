@@ -28,15 +28,15 @@ def make_arm(
         seed: Selects the emulated individual, and seeds its noise.
         reality: The emulator model. The body of 'kin' differs from the geometric model only in ways
             that the learner can fit; 'foreign' has mechanics that the learner does not model.
-            Otherwise the path of an MJCF file whose joints and tendons have the names of the
-            robot's joints and muscles.
-        friction: False for the same body without tendon friction and joint friction.
+            Any other value is the path of an MJCF file, whose joints and tendons have the names of
+            the robot's joints and muscles.
+        friction: Whether the body has tendon friction and joint friction.
         deviates: Whether the body of an MJCF file is an individual that differs from the file
             (`emulator/deviation.py`). By default it equals the file.
 
     Raises:
-        MusculoskeletalError: If the reality is neither a model nor a file, or the file lacks a
-            name.
+        MusculoskeletalError: If `reality` is neither an emulator model nor a file, or if a joint or
+            muscle of the robot is missing in the file.
     """
     if reality == KIN:
         individual = Individual(robot, seed)

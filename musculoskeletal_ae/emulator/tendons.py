@@ -25,7 +25,7 @@ from musculoskeletal_ae.robot.robot import Robot
 # Modelling constants, chosen by hand. The magnitudes of the effects are in `effects.py`.
 SLIDING = 0.0003  # sliding distance over which friction builds up [m]
 BREAKING = 0.0005  # sliding distance that ends stiction [m]
-STICKING = 0.5  # time at rest after which stiction is back [s]
+STICKING = 0.5  # time constant with which stiction builds up at rest [s]
 #: elongation over which rubber changes from one side of its hysteresis loop to the other [m]
 LOOP = 0.003
 RIDGE = 5.0  # percentage of a route's lengths that lie beyond the ridge [%]
@@ -35,7 +35,7 @@ SPOOL = 0.01  # radius of the spool [m]
 # Time constants [s]: four of creep, at a constant rate over four decades of time, and two of a
 # tendon's delayed stretch.
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
-LATE = np.array([0.75, 0.25])  # fractions of the delayed stretch that follow the last two of them
+LATE = np.array([0.75, 0.25])  # shares of the delayed stretch with the last two time constants
 KNOTS = 200  # number of entries of the table of an elastic law
 GIVING = 0.1  # time constant with which a route point follows its load [s]
 
@@ -46,7 +46,7 @@ class Springs:
     def __init__(self, robot: Robot, at_zero: Array, draw: Draw) -> None:
         """Draw the laws; `at_zero` are the tendon lengths at θ = 0 [m], (M,).
 
-        The robot's series elastic elements are the data sheet from which the laws differ.
+        The robot's series elastic elements serve as the data sheet, from which the laws deviate.
         """
         sheet, limit, count = robot.series_elastic, robot.tension.limit, robot.muscle_count
         self.tension: Array = np.linspace(0.0, 1.5, KNOTS)[:, None] * robot.tension.max
@@ -80,7 +80,7 @@ class Springs:
         self.spacing: Array = even[1]
 
     def elongation(self, tension: Array) -> Array:
-        """Return the immediate elongation [m] in the middle of the loop, for T [N] (..., M)."""
+        """Return the immediate elongation [m] for T [N] (..., M), without hysteresis."""
         return self._read(self.table, tension)
 
     def compliance(self, _absolute: Array, tension: Array) -> Array:
@@ -161,7 +161,7 @@ def make_tendons(
 
 @njit(cache=True)
 def law(tendons: Tendons, m: int, elongation: float) -> float:
-    """Interpolate T [N] of element m at an elongation [m]; extrapolate beyond the table."""
+    """Return T [N] of element m at an elongation [m]; beyond its table, T is extrapolated."""
     if elongation <= 0.0:
         return 0.0
     at, table = min(elongation / tendons.spacing[m], 10.0 * KNOTS), tendons.table[m]
@@ -190,7 +190,7 @@ def load_cell(tendons: Tendons, m: int, tension: float, temperature: float) -> f
 
 @njit(cache=True)
 def read(tendons: Tendons, muscle: MuscleState, memory: Memory, command: Command, m: int) -> None:
-    """Read the sensors of module m."""
+    """Write the readings of the sensors of module m into `memory`."""
     memory.reading[m] = spooled(tendons, m, muscle.length[m])
     memory.reading[m] += command.length_error[m] + command.zero[m]
     memory.cell[m] = load_cell(tendons, m, muscle.tension[m], muscle.housing[m])
@@ -205,7 +205,7 @@ GuideParts = namedtuple('GuideParts', 'guides tension bend')
 
 @njit(cache=True)
 def make_handle(parts: TendonParts | GuideParts) -> Handle:
-    """Return a handle to the parts, the argument of a compiled step."""
+    """Return a handle to `parts`, which `tendons_step` or `guides_step` takes as an argument."""
     return Handle(parts)
 
 
@@ -245,9 +245,9 @@ def tendons_step(arm: Handle, kind: int, absolute: Array, control: Array) -> Non
 
 @njit(cache=True)
 def guides_step(arm: Handle, duration: float) -> None:
-    """Compute the bends of the tendons; let route points follow their load for a time [s].
+    """Update the bends of the tendons, and let route points yield to their load.
 
-    `arm` is a handle to GuideParts.
+    `arm` is a handle to GuideParts; `duration` is the time since the last call [s].
     """
     guides, tension, bend = arm.held
     line, load, i = np.zeros(3), np.zeros(3), 0
