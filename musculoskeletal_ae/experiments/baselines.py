@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Earlier estimators of joint angles, evaluated on the same data as the autoencoder.
 
-They learn from the rest samples of the autoencoder. These are too few postures for a table search.
-Therefore both estimators are also evaluated after learning from the whole stream at 10 Hz.
+The polynomial filter and the table search learn from the rest samples of the autoencoder. Since
+these postures are too few for a table search, both estimators are also evaluated after learning
+from the whole stream at 10 Hz.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ def baseline_errors(
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error on the held-out motion before and after learning [rad].
 
-    All start from the geometric model. Unweighted least squares on it has nothing to learn.
+    All start from the geometric model. The unweighted least squares estimate does not learn, so its
+    two errors are equal.
     """
     part = stream.part(np.s_[::STREAM_STRIDE])
     moving = RestSamples(part.theta_sensor, part.tension, part.length)
@@ -50,8 +52,8 @@ def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> flo
 def without_elongation(robot: Robot, tension: Array, length: Array) -> Array:
     """Return the length if the series elastic element were not stretched, l + L_e(l_abs, T) [m].
 
-    The stretch shortens the measured l, so L_e is added. L_e is evaluated twice: at the measured
-    length, and at the length that the first result corrects.
+    The stretch shortens the measured l, so L_e is added. L_e is evaluated at the measured length
+    first, and then at the length that the first L_e corrects.
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)
@@ -100,7 +102,7 @@ class PolynomialFilter:
         return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Fit the mapping to samples (N, D), (N, M), (N, M), with the present one as the prior."""
+        """Fit the mapping to samples θ (N, D), T (N, M), l (N, M); the prior is the present one."""
         design = self._monomials(theta)
         target = without_elongation(self._robot, tension, length)
         for m in range(self._robot.muscle_count):
@@ -161,7 +163,7 @@ class TableSearch:
         self._lengths = cKDTree(robot.routes.relative_lengths(self._theta))
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Replace the table with samples (N, D), (N, M), (N, M)."""
+        """Replace the table with samples θ (N, D), T (N, M) and l (N, M)."""
         self._theta = theta
         self._lengths = cKDTree(without_elongation(self._robot, tension, length))
 

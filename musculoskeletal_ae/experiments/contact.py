@@ -19,14 +19,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CONTACT_STREAM = 7000
-POSTURES, COLLISIONS, FLOATS = 15, 20, 4
+POSTURES, COLLISIONS, FLOATS = 15, 20, 4  # numbers of tests at rest, in motion, and with `float`
 TRIES_PER_COLLISION = 20  # largest number of tries, because a collision needs a moving arm
 HEALTHY = 3600.0  # duration of healthy exploration, shared by the individuals [s]
 LEAST, MOST = 10.0, 50.0  # range of the external forces [N]
 LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide an arm in method `float` [N]
 MOVE = 4.0  # duration of the motion to a posture [s]
 PUSH = 1.5  # duration of a push at rest [s]
-EVALUATED = 0.5  # duration of its last part, over which estimates are averaged [s]
+EVALUATED = 0.5  # duration of the last part of a push, over which estimates are averaged [s]
 APART = 3.0  # longest time between collisions [s]
 FLOATING = 30.0  # duration of the drift test [s]
 MOVED = 1.0  # duration of a collision, and of guiding the hand [s]
@@ -58,7 +58,7 @@ class ContactLoop(ClosedLoop):
         return [self.contact(exploring) for _ in range(round(duration / SAMPLE_TIME))]
 
     def rest(self, theta: Array) -> None:
-        """Move to θ [rad] (D,), after a reset if a push stopped the arm."""
+        """Reset the controller, which a push may have stopped, and move to θ [rad] (D,)."""
         self.push(np.zeros(3))
         self.core.reset(self._now)
         self.target(theta)
@@ -119,7 +119,10 @@ def _errors(true: Array, estimated: Array) -> tuple[Array, Array]:
 
 
 def _force(robot: Robot, rng: np.random.Generator, least: float, most: float) -> Array:
-    """Draw a force [N] (3,) in directions that produce joint torques (in the plane if planar)."""
+    """Return a random force [N] (3,) along axes of the root link that produce joint torques.
+
+    On a planar arm, the force therefore lies in the plane of the arm.
+    """
     postures = robot.random_postures(20, rng)
     jacobians = [robot.kinematics.end_effector_jacobian(theta)[:3] for theta in postures]
     observable = np.abs(np.concatenate(jacobians, axis=1)).max(axis=1) > 1e-6

@@ -57,9 +57,8 @@ class GraspAndRupture:
         # Start with the second muscle, which the paper deactivates.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))]
         self.rupture = np.full(count, np.nan)  # time of each muscle's rupture [s], (M,)
-        self.carried: Bools = np.zeros(
-            count, dtype=bool
-        )  # whether each muscle carried tension when it ruptured, (M,)
+        #: whether each muscle carried tension when it ruptured, (M,)
+        self.carried: Bools = np.zeros(count, dtype=bool)
         self._robot = robot
         self._wait = np.random.default_rng([seed, 0xC7]).uniform(0.0, LONGEST_WAIT, count)
 
@@ -74,7 +73,7 @@ class GraspAndRupture:
         return rows_between(start + SLACKENING, start + RUPTURE_TIME)
 
     def disturbed(self, count: int) -> Bools:
-        """Return during which of `count` messages a muscle is ruptured or the arm recovers."""
+        """Return a mask of `count` messages: whether a muscle is ruptured or the arm recovers."""
         disturbed = np.zeros(count, dtype=bool)
         for start in self.rupture.tolist():
             disturbed[rows_between(start, start + RUPTURE_TIME + RECOVERY)] = True
@@ -225,7 +224,7 @@ def anomaly_levels(
 
 
 def alarm_starts(alarm: Bools) -> Bools:
-    """Return the messages at which an alarm starts; continued alarms do not count."""
+    """Return a mask of the messages at which an alarm starts; continued alarms do not count."""
     return alarm & ~np.append(False, alarm[:-1])
 
 

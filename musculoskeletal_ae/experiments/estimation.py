@@ -72,11 +72,7 @@ OFF_TIME = 40.0  # duration of the motion before muscles are switched off [s]
 #: times of the pictures [s], at ends of the motion's cycles without and with the payload
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
 OFF = 'switched_off'
-OFF_KEYS = (
-    'detection_s',
-    'detected_share',
-    'named_share',
-)  # keys reported for switched-off muscles
+OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for switched-off muscles
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -146,7 +142,7 @@ def _preset(
 ) -> tuple[dict[str, Any], dict[str, DetectorOutput], dict[str, DetectorOutput]]:
     """Return a preset's numbers, and its outputs for the ruptures and for the switched-off muscles.
 
-    The keys of the outputs are `before` and `after` (learning).
+    The keys of the outputs are 'before' and 'after', which refer to learning.
     """
     robot, networks = study.robot, study.networks(seed, preset)
     plan, faulty, healthy, plan_off, switched_off = recordings

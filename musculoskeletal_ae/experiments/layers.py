@@ -38,7 +38,8 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
-#: units of the encoder's hidden layers. The decoder has the reverse, the latent layer D + M units.
+#: units of the encoder's hidden layers. The decoder has the same layers in reverse order, and the
+#: latent layer has D + M units.
 HIDDEN = {
     'as in the paper: 200, 30': (200, 30),
     'fewer layers: 200': (200,),
@@ -68,7 +69,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the mean of each number over trainings, and the range of the two errors."""
+    """Return the mean of each number over trainings, and the ranges of the numbers in ERRORS."""
     summary = dict[str, float | None]()
     for key in rows[0]:
         known = [row[key] for row in rows if row[key] is not None]
@@ -80,7 +81,7 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _trained(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> dict[str, Any]:
-    """Return the numbers of one training; a kept part of an interrupted run is used again."""
+    """Return the numbers of one training, from a saved part if an earlier run was interrupted."""
     part = f'layers_{seed}_{"_".join(map(str, hidden))}_{training}'
     numbers: dict[str, Any] = study.remember(part, partial(_learn, study, seed, hidden, training))
     return numbers
@@ -99,7 +100,7 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
     numbers['before_rad'] = estimation_error(initial, held_out)
     try:
         learner = Learner(robot, initial, PAPER_PRESET, training)
-    except GateError:  # checkpoint validation rejects a network that is this inaccurate
+    except GateError:  # checkpoint validation rejects the initial network as too inaccurate
         return numbers | {'after_rad': None}
     teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
     numbers['after_rad'] = estimation_error(learner.mae, held_out)

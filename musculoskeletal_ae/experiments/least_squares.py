@@ -4,9 +4,9 @@
     min_θ Σ_m (l_m − l_m(θ, T))² / (σ_l² + (∂L_e/∂T)² (σ_T² + (μ_m T_m)²))
 
 With the true routes and elastic constants, this is the oracle: a reference that estimators without
-further knowledge can hardly beat. It takes friction as zero and does not know the sensors' offsets.
-With the geometric model, it is the classical estimator without learning. With the calibrated body
-of a learner, it separates the error of the body from that of the network.
+further knowledge can hardly beat. The oracle takes friction as zero and does not know the offsets
+of the sensors. With the geometric model, this is the classical estimator without learning. With the
+calibrated body of a learner, its error shows which part of the network's error is due to the body.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ DIFFERENCE = 1e-4  # step of finite differences [rad]
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Levenberg–Marquardt on a body model for many samples at once, within the joint limits."""
+    """Estimator that solves many messages at once by Levenberg–Marquardt, within joint limits."""
 
     robot: Robot
     lengths: Callable[[Array, Array], Array]  # maps θ (N, D) and T [N] (N, M) to l [m] (N, M)
@@ -71,26 +71,26 @@ class LeastSquares:
         return theta
 
     def error(self, recording: Recording, rows: slice = EVERY) -> float:
-        """Return the mean error on some messages, by default every tenth [rad]."""
+        """Return the mean error [rad] over `rows` of a recording, by default every tenth row."""
         part = recording.part(rows)
         return mean_error(self.estimate(part.tension, part.length), part.theta)
 
 
 def oracle(robot: Robot, true: Individual) -> LeastSquares:
-    """Return least squares on the true body."""
+    """Return the estimator that uses the true body of an individual."""
     model = true.muscle_lengths, true.muscle_jacobian, true.length_at_zero, true.elastic
     return LeastSquares(robot, *model)
 
 
 def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
-    """Return least squares on the geometric model."""
+    """Return the estimator that uses the geometric model."""
     routes = robot.routes
     model = robot.muscle_lengths, routes.muscle_jacobian, routes.length_at_zero
     return LeastSquares(robot, *model, robot.series_elastic, tension_noise)
 
 
 def on_calibrated_body(robot: Robot, body: CalibratedBody) -> LeastSquares:
-    """Return least squares on a calibrated body, averaged over both friction directions."""
+    """Return the estimator that uses a calibrated body, averaged over both friction directions."""
 
     def lengths(theta: Array, tension: Array) -> Array:
         return body.lengths(theta, tension, np.zeros_like(tension))[0]
@@ -106,7 +106,7 @@ def on_calibrated_body(robot: Robot, body: CalibratedBody) -> LeastSquares:
 
 
 def oracle_errors(arm: Arm, seed: int, recording: Recording) -> dict[str, float]:
-    """Return the errors of least squares on an arm's true body [rad].
+    """Return the errors of the oracle on messages of an arm [rad].
 
     `oracle_rad` uses the recorded messages. `sensor_rad` uses messages that are recomputed without
     friction, so that only noise and offsets of the sensors act.

@@ -61,9 +61,8 @@ PHASES = (
 )
 SETTLING = Phase('settling', 5.0)  # the emulated arm comes to rest before the experiment
 SHARED = PHASES[:3]  # phases that the emulated arm goes through as well
-ENDS = (
-    np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1
-)  # index of the last step of each phase
+#: index of the last step of each phase
+ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -90,7 +89,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
-    """Return the state of arm and simulators at the end of each phase, by its name.
+    """Return the states of arm and simulators at the end of each phase, by name of the phase.
 
     `flexed_rad` and `forced_rad` are the angles of the joint to flex and of the joint to force.
     `error_rad` and `error_n` are the distances of a simulator from the arm.
@@ -117,7 +116,7 @@ def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
 
 
 def _command(robot: Robot, mae: Mae, theta: Array, preset: str) -> Array:
-    """Return the lengths that a preset's `proposed` commands to hold a posture, with a network."""
+    """Return the length command [m] (M,) by which `proposed` of a preset holds θ [rad] (D,)."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
         return robot.muscle_lengths(theta, np.full(robot.muscle_count, robot.tension.bias))

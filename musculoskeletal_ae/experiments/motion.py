@@ -61,10 +61,10 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 DURATIONS = (1.0, 2.0)  # durations of the motions [s]
-MOTIONS, CIRCLES = 6, 3
+MOTIONS, CIRCLES = 6, 3  # numbers of motions of each duration, and of circles
 STARTING = 3.0  # duration of the motion to the first posture [s]
 REST = 0.6  # duration of the rest after a motion [s]
-SETTLED = 0.5  # time in this rest at which the settled error is read [s]
+SETTLED = 0.5  # time after the end of a motion at which the settled error is read [s]
 OURS = 'trajectory'
 METHODS = {
     OURS: plots.AFTER,
@@ -99,8 +99,8 @@ class TrackedMotion(NamedTuple):
 
 
 def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> ClosedLoop:
-    """Return a loop whose arm has moved to a posture [rad] (D,)."""
-    # `second` needs half of the time for its second movement.
+    """Return a loop for motions of `duration` [s] by a method; its arm is at `start` [rad] (D,)."""
+    # Method `second` needs half of the time for its second movement.
     ramp = duration / RAMP_SHARE
     first_part = 0.5 * ramp if method == 'second' else ramp
     settings = Settings(rate_limit=SPEED_LIMIT)
@@ -120,7 +120,7 @@ def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> C
 def follow(
     loop: ClosedLoop, start: Array, goal: Array, method: str, duration: float
 ) -> TrackedMotion:
-    """Move between two postures [rad] (D,) in a time [s] by a method."""
+    """Move from `start` to `goal` [rad] (D,) in `duration` [s] by a method; return the motion."""
     core, arm = loop.core, loop.arm
     planned = Trajectory.to(Setpoint.resting(start), goal, duration)
     if method == OURS:
@@ -147,7 +147,7 @@ def follow(
 
 
 def settling(loop: ClosedLoop, goal: Array) -> float:
-    """Return the time from a target [rad] (D,) until the arm stays near it [s]."""
+    """Return the time [s] from the target `goal` [rad] (D,) until the arm stays WITHIN of it."""
     last = 0
     loop.target(goal)
     for n in range(round(SETTLING_TIME / SAMPLE_TIME)):

@@ -60,17 +60,18 @@ from musculoskeletal_ae.presets.registry import PAPER_PRESET, PRESETS, preset_na
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
-FIRST_ERRORS = 10.0  # the mean error of this time [s] is the start of the exponential fit
+FIRST_ERRORS = 10.0  # time whose mean error is the initial guess of b in the exponential fit [s]
 PUBLISHED_MINUTES = 10.0
 PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
-#: number of steps of a shortened initial training; with fewer, preset `paper` is rejected
+#: number of steps of a shortened initial training; after fewer steps, checkpoint validation rejects
+#: the network of preset `paper`
 QUICK_STEPS = 600
-NOTE_EVERY = 25  # mini-batches between two records of the training errors
+NOTE_EVERY = 25  # number of mini-batches from one record of the training errors to the next
 TEST_STATES = 1000  # number of test states
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
-#: returns the θ [rad] (D,) that the learner receives, or None. Arguments: the learner, the index of
-#: the message, the true θ, and the joint-sensor readings
+#: function that returns the θ [rad] (D,) that the learner receives, or None. Its arguments are the
+#: learner, the index of the message, the true θ, and the joint-sensor readings.
 JointView = Callable[[Learner, int, Array, Array], Array | None]
 
 
@@ -87,7 +88,7 @@ def teach(
     stream: Iterable[tuple[Array, ...]],
     view: JointView = lambda _learner, _n, _true, read: read,
 ) -> None:
-    """Feed messages, rows of a recording, to a learner as the node would.
+    """Feed the rows of a recording to a learner one by one, as the node feeds messages.
 
     The learner receives the joint-sensor readings, unless `view` replaces them.
     """
@@ -98,7 +99,11 @@ def teach(
 def teach_and_evaluate(
     learner: Learner, stream: Iterable[tuple[Array, ...]], held_out: Recording
 ) -> tuple[Curve, Recording]:
-    """Feed messages to a learner and evaluate it on the held-out motion; return the messages."""
+    """Feed messages to a learner, and evaluate each of its networks on the held-out motion.
+
+    Returns:
+        The course of learning, and the messages.
+    """
     samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
     errors, mae, direction = list[float](), None, FrictionDirection()
     error = make_error_function(held_out, CURVE_STRIDE)
@@ -118,7 +123,7 @@ def teach_and_evaluate(
 
 
 def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:
-    """Yield messages of an arm that explores for a time [s], always with the learner's network."""
+    """Yield the messages of `duration` [s] of exploration with the learner's latest network."""
     for _ in range(round(duration / SAMPLE_TIME)):
         if learner.mae is not loop.mae:
             loop.use(learner.mae)
@@ -146,7 +151,7 @@ def train_initial(study: Study, preset: str) -> None:
 
 
 def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
-    """Return a learner that starts with the initial network and learns from θ of a `source`."""
+    """Return a learner with the initial network, which learns from the θ of `source`."""
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
 
@@ -154,7 +159,7 @@ def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> L
 def new_learner_and_loop(
     study: Study, arm: Arm, seed: int, preset: str
 ) -> tuple[Learner, ClosedLoop]:
-    """Return a learner that starts with the initial network, and the loop of the arm to explore."""
+    """Return a learner with the initial network, and a closed loop in which the arm explores."""
     learner = new_learner(study, seed, preset)
     settings = Settings(preset=preset)
     return learner, ClosedLoop(arm, learner.mae, settings, EXPLORATION_STREAM + seed)

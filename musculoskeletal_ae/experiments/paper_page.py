@@ -3,9 +3,9 @@
 
     python -m musculoskeletal_ae.experiments.paper_page doc/results/paper.md
 
-rewrites a page from the results and pictures in the folder beside it (`paper/` beside `paper.md`).
-`experiment paper --page doc/results/paper.md` first copies its own results and plots there. The
-text is in paper.md.jinja, and the rows of the tables are in paper.yaml.
+This command rewrites the page from the results and pictures in the folder beside the page (`paper/`
+beside `paper.md`). `experiment paper --page doc/results/paper.md` copies its own results and plots
+to that folder first. The text is in paper.md.jinja, and the rows of the tables are in paper.yaml.
 """
 
 import shutil
@@ -24,7 +24,7 @@ from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 
 TEMPLATE = 'paper.md.jinja'  # a file in the folder of this module
-#: rows of the tables, by the table's name in the template; each experiment is named once
+#: rows of the tables, by the name of the table in the template
 TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[Row, ...]])
 #: pictures of the page: file name, and the plot of an experiment that it shows
 PICTURES = {
@@ -44,11 +44,11 @@ PICTURES = {
 LARGEST = 60_000  # largest size of a picture [bytes]
 WIDEST = 1000  # largest width of a picture [pixels]
 COLOURS = 128  # number of colours; a small palette makes small files
-SMALLER = 0.9  # a picture that is too large is repeatedly reduced by this factor
+SMALLER = 0.9  # factor by which the width of a picture is reduced until the file is small enough
 
 
 def update_page(page: Path, measured: Path | None = None) -> list[Path]:
-    """Rewrite the page; return the files written.
+    """Rewrite the page; return the files that were written.
 
     Args:
         page: File of the page; results and pictures are in the folder of the same name beside it.
@@ -141,7 +141,7 @@ def _who(result: Mapping[str, Any]) -> str:
 
 
 def _reduced(file: Path) -> bytes:
-    """Return a picture as a small PNG with a palette."""
+    """Return the picture in a file as a PNG of at most LARGEST bytes, with a palette."""
     from PIL import Image  # matplotlib depends on it
 
     with Image.open(file) as opened:

@@ -13,8 +13,8 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 
-# Distinguishable with colour-vision deficiency and in grey.
-# The web page draws the estimated arm in the colour of AFTER.
+# Readers can distinguish these colours with a colour-vision deficiency and in grey. The web page
+# draws the estimated arm in the colour of AFTER.
 BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
 #: colours of results before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
@@ -37,7 +37,7 @@ STYLES: dict[str, dict[str, Any]] = {
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> Any:
-    """Return a figure of a size [inch], and its axes row by row."""
+    """Return a figure of `width` × `height` [inch], and an array of its axes, row by row."""
     figure = Figure(figsize=(width, height), layout='constrained')
     return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
@@ -56,7 +56,7 @@ def tidy(axes: Any, xlabel: str = '', ylabel: str = '', title: str = '', legend:
 def line(axes: Any, x: Any, y: Any, window: int = 1, **style: Any) -> None:
     """Draw the centred mean of y over `window` samples as a line of at most `POINTS` points."""
     step, kernel = max(1, len(x) // POINTS), np.ones(max(1, min(window, len(y))))
-    # The window is shorter at the ends.
+    # At the ends of the line, the window has fewer samples than in the middle.
     count = np.convolve(np.ones(len(y)), kernel, mode='same')
     axes.plot(x[::step], (np.convolve(y, kernel, mode='same') / count)[::step], **style)
 

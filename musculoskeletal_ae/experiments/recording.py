@@ -23,13 +23,14 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import PAPER_PRESET
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions
 
-PAID_OUT = 0.1  # a muscle this much longer than its command is slack in any posture [m]
+#: length that makes a switched-off muscle slack in any posture when added to its command [m]
+PAID_OUT = 0.1
 SAMPLE_TIME = 0.01  # time between two messages [s]; the modules report at 100 Hz
-#: random seeds of the exploration (plus the individual's seed) and of the held-out motion
+#: random seeds of the exploration, to which the individual's seed is added, and of held-out motion
 EXPLORATION_STREAM, HELD_OUT_STREAM = 100, 9000
 
-#: called with the arm and the time [s] before every step; may attach a payload or rupture muscles,
-#: and returns which muscles (M,) are switched off, or None
+#: function that is called with the arm and the time [s] before every step. It may attach a payload
+#: or rupture muscles. It returns a mask (M,) of the muscles that are switched off, or None.
 Script = Callable[[Arm, float], Bools | None]
 
 
@@ -99,7 +100,7 @@ class ClosedLoop:
         """Handle the command at `now` [s]; subclasses override this."""
 
     def explore(self) -> tuple[Array, ...]:
-        """Make a step of exploration; first reset a stop whose cause has cleared."""
+        """Reset a stop whose cause has cleared, then explore for one message; see `step`."""
         core = self.core
         supervisor = core.supervisor
         if not supervisor.is_running and core.reset(self._now) is None:
@@ -143,10 +144,11 @@ def record(
 ) -> Recording:
     """Drive an arm through the three steps of exploration with a fixed list of commands.
 
-    Every command is that of `first`. `second` needs the current tension, which a fixed list cannot
-    contain; the least tension that holds the posture on the geometric model replaces it. While a
-    muscle is switched off, all modules follow tensions: 0 N for this muscle, and the tensions of
-    MSC for the others. A position-controlled module is paid out instead.
+    Every command is computed by method `first`. Method `second` would need the current tension,
+    which a fixed list cannot contain. Its step therefore uses `first` with the least tension that
+    holds the posture on the geometric model. While a muscle is switched off, all modules follow
+    tensions: 0 N for this muscle, and the tensions of MSC for all other muscles. A
+    position-controlled module is paid out instead.
 
     Args:
         arm: The arm.
@@ -200,19 +202,19 @@ def mean_error(estimate: Array, truth: Array) -> float:
 
 
 def end_tensions(mae: Mae, recording: Recording) -> Array:
-    """Return T_end [N] (N, M) of a recording by a network's friction, as the nodes compute it."""
+    """Return T_end [N] (N, M) of a recording, computed as in the nodes by a network's friction."""
     return mae.transmission.end(recording.tension, directions(recording.length))
 
 
 def motor_tensions(mae: Mae, recording: Recording) -> Array:
-    """Return T [N] (N, M) of a recording, as the nodes compute it."""
+    """Return the motor-side T [N] (N, M) of a recording, computed as in the nodes."""
     return mae.transmission.motor(recording.tension, directions(recording.length))
 
 
 def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
-    """Return a function that computes a network's mean error on every `stride`-th message [rad].
+    """Return a function that computes a network's mean error [rad] on every `stride`-th message.
 
-    The function reuses the friction directions for all networks.
+    The friction directions are computed once, because they are the same for all networks.
     """
     direction = directions(recording.length)[::stride]
     part = recording.part(np.s_[::stride])
@@ -225,5 +227,5 @@ def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae]
 
 
 def estimation_error(mae: Mae, recording: Recording, stride: int = 1) -> float:
-    """Return the mean error of a network's estimate on every `stride`-th message [rad]."""
+    """Return the mean error [rad] of a network's estimate on every `stride`-th message."""
     return make_error_function(recording, stride)(mae)

@@ -46,7 +46,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # every tenth message of the held-out motion is evaluated
-TARGETS = 2
+TARGETS = 2  # number of targets that the arm approaches without each muscle
 MOVING = 12.0  # duration of healthy motion before a fault [s]
 LATEST_VERDICT = 10  # longest time from a fault to its isolation [s]
 AFTERWARDS = 6.0  # duration of the motion after an isolation [s]
@@ -111,17 +111,18 @@ class IsolatingLoop(ClosedLoop):
 def run_with_fault(
     arm: Arm, mae: Mae, seed: int, muscle: int, sensor: str
 ) -> tuple[IsolatingLoop, Array]:
-    """Explore until a muscle or one of its sensors fails, and continue.
+    """Let an arm explore, make a muscle or one of its sensors fail, and continue.
 
     Args:
         arm: The arm.
         mae: The network.
         seed: Random seed of the exploration.
-        muscle: The muscle.
+        muscle: Index of the muscle.
         sensor: 'length' or 'tension' for a sensor that fails; '' for a rupture.
 
     Returns:
-        The loop, and the errors [rad] from the isolation on, or from the fault without one.
+        The loop, and the errors [rad] from the isolation on; from the fault on if no muscle is
+        isolated.
     """
     loop = IsolatingLoop(arm, mae, seed)
     loop.run(1.0)
@@ -149,8 +150,8 @@ class Reach(NamedTuple):
         share: Share of the holdable postures of the true body that remain holdable.
         distances: Final distance of `proposed` from each target [rad], or None if it refused the
             target.
-        trapped: Those distances of an arm that fell to a posture on a stop where the remaining
-            muscles can neither hold nor lift it.
+        trapped: The entries of `distances` for motions that ended at a joint stop, in a posture
+            that the remaining muscles can neither hold nor leave.
     """
 
     share: float
@@ -202,7 +203,7 @@ def measure_reach(loop: IsolatingLoop, muscle: int, rng: np.random.Generator) ->
 def isolations_of_healthy_arm(
     arm: Arm, mae: Mae, seed: int, duration: float
 ) -> list[tuple[int, ...]]:
-    """Return the muscles that each verification isolated on a healthy arm, or () without any."""
+    """Return the muscles that each verification isolated on a healthy arm; () stands for none."""
     loop, rng = IsolatingLoop(arm, mae, seed), np.random.default_rng([seed, 0x4EA])
     loop.run(1.0)
     every, wrench = round(PUSH_EVERY / SAMPLE_TIME), np.zeros(6)
@@ -215,7 +216,7 @@ def isolations_of_healthy_arm(
             arm.set_wrench(wrench)
         loop.explore()
         if loop.core.watchdog.has_anomaly and not loop.isolated:
-            loop.estimator.reset()  # as a user would: after two false alarms the arm stays stopped
+            loop.estimator.reset()  # the arm stays stopped after two false alarms until a reset
     return [isolated for isolated, _ in loop.verdicts]
 
 

@@ -3,8 +3,8 @@
 
     python -m musculoskeletal_ae.experiments.results doc/results.md
 
-rewrites the table of a page from the result.json files in doc/results. `experiment … --readme
-doc/results.md` first copies its own result.json files there.
+This command rewrites the table of the page from the result.json files in doc/results. `experiment …
+--readme doc/results.md` copies its own result.json files to doc/results first.
 """
 
 import base64
@@ -325,9 +325,9 @@ def failures(results: Results) -> list[str]:
 
 
 def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
-    """Rewrite the table of a page from the results beside it; return the files written.
+    """Rewrite the table of a page from the folder of results beside it; return the written files.
 
-    The result.json files of the folder `measured` are first copied there.
+    If `measured` is a folder, its result.json files are copied to the folder of results first.
 
     Raises:
         OSError: If the page cannot be read or written.
@@ -396,7 +396,7 @@ def _page(folder: Path, results: Results) -> str:
 
 
 def flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
-    """Return nested numbers by their path."""
+    """Return the numbers of nested mappings in one mapping, by dotted path."""
     rows: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):

@@ -56,11 +56,11 @@ ABLATED = {
     'joint sensors': ('joint_zero', 'joint_bend', 'backlash'),
     'delays': ('delay', 'jitter', 'dropouts'),
 }
-QUICK = ('friction',)
-ABLATION_INDIVIDUALS = 2
-#: nothing is removed: another exploration shows the difference between runs
+QUICK = ('friction',)  # groups of effects of which a shortened run removes one at a time
+ABLATION_INDIVIDUALS = 2  # number of individuals whose effects are removed
+#: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
-OTHER_RUN = 1000  # added to the seed of exploration and training for the other run
+OTHER_RUN = 1000  # number that is added to the seed of exploration and training of this run
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -82,14 +82,14 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _study_of_model(study: Study, seed: int, reality: str) -> Study:
-    """Return the study of an emulator model; first run online learning there if necessary."""
+    """Return the study of an emulator model, after online learning on this model if necessary."""
     if reality == study.reality:
         return study
     part = replace(study, reality=reality, folder=study.folder / reality)
     part.folder.mkdir(exist_ok=True)
     for preset in PRESETS:
-        # Processes of other individuals write and read this file at the same time, so that it has
-        # to be replaced atomically.
+        # Processes of other individuals write and read this file at the same time, so it has to be
+        # replaced atomically.
         temporary = part.folder / f'{preset}_initial_of_{seed}'
         copyfile(study.network_file(preset, None), temporary)
         temporary.replace(part.network_file(preset, None))
@@ -115,7 +115,7 @@ def _numbers(study: Study, seed: int) -> dict[str, Any]:
 
 
 def _informed_oracle_error(arm: Any, recording: Recording) -> float:
-    """Return the error [rad] of least squares with the arm's true sensor errors and friction."""
+    """Return the error [rad] of the oracle that also knows the true sensor errors and friction."""
     body, part = arm.individual, recording.part(EVERY)
     if (tendons := getattr(arm, 'tendons', None)) is None:
         tension = np.maximum(part.tension - body.tension_bias, 0.0) / body.tension_gain
@@ -138,9 +138,10 @@ def _informed_oracle_error(arm: Any, recording: Recording) -> float:
 def _error_with_effects(
     study: Study, seed: int, effects: Mapping[str, float], run: int | None = None
 ) -> float:
-    """Return the error after learning on an individual with some effects changed [rad].
+    """Return the error after learning [rad] on an individual with other sizes of some effects.
 
-    `run` is the seed of exploration and training, by default the seed of the individual.
+    `effects` has the new sizes by name. `run` is the seed of exploration and training, by default
+    the seed of the individual.
     """
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm

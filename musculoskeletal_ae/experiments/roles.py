@@ -19,7 +19,8 @@ def elbow(robot: Robot) -> int:
 def elbows(robot: Robot) -> Bools:
     """Return a mask of the elbow joints, (D,).
 
-    These are all joints with "elbow" in their names. Without any, it is the joint of `elbow`.
+    These are all joints with "elbow" in their names; if there are none, the joint that `elbow`
+    returns.
     """
     named = np.array([ELBOW[-1] in name for name in robot.joints])
     named[elbow(robot)] |= not named.any()
@@ -51,6 +52,6 @@ def within(robot: Robot, joint: int, degrees: float) -> float:
 
 
 def flexed(robot: Robot) -> float:
-    """Return the elbow angle within its limits that is nearest to ±90° [rad]."""
+    """Return the angle [rad] within the limits of the elbow that is nearest to 90° or −90°."""
     joint = elbow(robot)
     return max((within(robot, joint, -90.0), within(robot, joint, 90.0)), key=abs)

@@ -170,7 +170,8 @@ class _Workers:
     def ended(self) -> list[tuple[Part, Future[Any]]]:
         """Wait for a moment; return the parts that have ended.
 
-        Parts that ran for the first time when a process was killed are not among them.
+        They do not include parts that were running for the first time when a process was killed,
+        because these parts run again.
         """
         ended = list[tuple[Part, Future[Any]]]()
         for future in wait(self._running, POLL, FIRST_COMPLETED).done:

@@ -42,7 +42,7 @@ SIGHTED = 10  # the camera detects the marker in one of this many samples
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Train learners with fewer and fewer sensors on the messages of an individual."""
+    """Return the errors of learners with different sensors on the messages of an individual."""
     robot, held_out = study.robot, study.stream(seed, 'held_out')
     rng = np.random.default_rng([seed, 0x5E])
     elbow, hand = elbows(robot), robot.description.end_effector
@@ -66,7 +66,7 @@ def measure(study: Study, seed: int) -> Measured:
     }
     stream = study.stream(seed, 'exploring')
     length, tension = stream.length, stream.tension
-    # The network that explored learned from all joint sensors.
+    # The network that controlled the exploration learned from all joint sensors.
     networks = {'before': study.network(None, 'default'), 'all': study.network(seed, 'default')}
     for name, (source, view) in sources.items():
         learner = new_learner(study, seed, 'default', source)
@@ -105,7 +105,7 @@ BARS = {
 
 
 def sensors(_: Study | None, rows: Rows) -> Plot:
-    """Draw the error with fewer and fewer joint sensors."""
+    """Draw the error for each set of sensors."""
     figure, (panel,) = plots.new_figure(8.0, 3.2)
     means = {key: np.mean([row.numbers[key] for row in rows.values()]) for key in BARS}
     ranked = sorted(BARS, key=means.__getitem__, reverse=True)

@@ -29,9 +29,9 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
+PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}  # the paper's errors before and after
 CYCLE = 10.0  # duration of the exploration's three steps [s]
-MOMENTS = 5
+MOMENTS = 5  # number of moments that the pictures show
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -55,7 +55,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motion:
-    """Let a network's simulator follow the commands of a recording, from its first posture."""
+    """Let a network's simulator follow the commands of a recording, from the first posture on."""
     simulated, rows = Simulation(robot, mae, preset), []
     simulated.start_from(recording.theta[:1])
     for command in recording.command:
@@ -66,7 +66,7 @@ def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motio
 
 
 def _distances(motion: Motion, arm: Motion) -> dict[str, Array]:
-    """Return the distance of a motion from the arm's in θ [rad] and T [N] for each message."""
+    """Return the distances of a motion from that of the arm, in θ [rad] and in T [N], (N,) each."""
     return {
         'rad': np.linalg.norm(motion.theta - arm.theta, axis=1),
         'n': np.linalg.norm(motion.tension - arm.tension, axis=1),

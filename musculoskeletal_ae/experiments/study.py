@@ -54,7 +54,7 @@ class Study:
     reality: str = 'kin'  # emulator model of the individuals, see `make_arm`
 
     def remember(self, part: str, measure: Callable[[], Any]) -> Any:
-        """Return the kept result of a part of the run, or measure and keep it.
+        """Return the saved result of a part of the run, or measure and save the result.
 
         Results are pickled, so a folder from an untrusted source must not be reused.
         """
@@ -76,11 +76,11 @@ class Study:
         return 10.0 if self.quick else 300.0
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
-        """Return an individual at rest; with friction False, the same body without friction."""
+        """Return the individual of a seed at rest, with or without friction."""
         return make_arm(self.robot, seed, self.reality, friction)
 
     def network_file(self, preset: str, seed: int | None) -> Path:
-        """Return the file of a network: initial (seed None), or after learning on an individual."""
+        """Return the file of the initial network (seed None) or of an individual's network."""
         return self.folder / f'{preset}_{"initial" if seed is None else seed}.safetensors'
 
     def numbers_file(self, seed: int) -> Path:
@@ -88,11 +88,11 @@ class Study:
         return self.folder / f'online_learning_{seed}.json'
 
     def network(self, seed: int | None, preset: str = '') -> Mae:
-        """Load a network: initial (seed None), or after learning on an individual."""
+        """Load the initial network (seed None), or the network that learned from an individual."""
         return checkpoint.load(self.network_file(preset or self.preset, seed), self.robot)
 
     def networks(self, seed: int, preset: str = '') -> dict[str, Mae]:
-        """Load the networks `before` and `after` learning on an individual."""
+        """Load the networks 'before' and 'after' learning from an individual."""
         return {'before': self.network(None, preset), 'after': self.network(seed, preset)}
 
     def save(self, seed: int, **arrays: Recording | RestSamples) -> None:
@@ -129,9 +129,8 @@ class Study:
 class Measured(NamedTuple):
     """The results of an experiment for one individual."""
 
-    numbers: dict[
-        str, Any
-    ]  # contents of result.json: nested dictionaries of finite numbers, text or lists
+    #: contents of result.json: nested dictionaries of finite numbers, text or lists
+    numbers: dict[str, Any]
     traces: dict[str, Any]  # data of the plots
 
 
@@ -163,7 +162,7 @@ Plot = tuple[Figure, str]  # a figure and its caption
 
 
 def first_individual(rows: Rows) -> tuple[int, Measured]:
-    """Return the seed and results of the individual that single-individual plots show."""
+    """Return seed and results of the first individual, for plots that show only one individual."""
     return next(iter(rows.items()))
 
 
@@ -174,6 +173,7 @@ class Experiment(NamedTuple):
     #: terms (lines that start with "- "), with an empty line between them
     text: str | None
     measure: Callable[[Study, int], Measured]  # measures the individual of a seed
-    #: each draws the plot with its name, or returns None if a kept part has no data for it
+    #: functions that draw one plot each, whose file has the name of the function; they return None
+    #: if the results of an interrupted run have no data for the plot
     plots: tuple[Callable[[Study, Rows], Plot | None], ...]
     weight: float  # relative duration, for scheduling and the progress bar
