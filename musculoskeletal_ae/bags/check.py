@@ -22,7 +22,7 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 # differ from their model and neighbouring muscles are similar.
 _BETTER_FIT = 2.5
 _LEAST_MOTION = 0.005  # a column whose length varies less is not checked [m]
-_MOST_SAMPLES = 2000
+_MOST_SAMPLES = 2000  # largest number of samples that are compared with the model
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
@@ -31,7 +31,7 @@ class BagCheck:
     """The report on a recording."""
 
     lines: list[str] = field(default_factory=list)  # the contents
-    faults: list[str] = field(default_factory=list)  # why it is incomplete or does not fit
+    faults: list[str] = field(default_factory=list)  # why the recording is incomplete or unfit
 
     def __str__(self) -> str:
         lines = [*self.lines, *(f'fault: {fault}' for fault in self.faults)]
@@ -44,7 +44,7 @@ def check_bag(
     namespace: str | None = None,
     motors: MotorSettings = NO_MOTORS,
 ) -> BagCheck:
-    """Read every message of a recording and report on it.
+    """Read every message of a recording, and return a report on the recording.
 
     Args:
         path: The bag.
@@ -78,8 +78,8 @@ def check_bag(
 def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     """Return (muscle of the column, muscle that it behaves like) for each misplaced column.
 
-    Arrays carry no names. However, the body resembles its geometric model. Hence the length in
-    column i must follow
+    Arrays carry no names, but the body resembles its geometric model. The length in column i must
+    therefore follow
 
         l̂_j = f_geo(θ) − L_e(f_geo,abs(θ), T)
 
@@ -94,7 +94,7 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     moved = length.std(axis=0) > _LEAST_MOTION
     moved &= ~(pairs.isolated == 1).any(axis=0)  # isolated muscles may have any readings
     columns = range(robot.muscle_count)
-    # Whichever muscle a column belongs to, the tension in the same column stretches it.
+    # The tension in column i stretches the muscle of this column, whichever muscle that is.
     tensions = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]
     modelled = [robot.muscle_lengths(theta, stretching) for stretching in tensions]
     errors = np.array([(length[:, [i]] - modelled[i]).std(axis=0) for i in columns])

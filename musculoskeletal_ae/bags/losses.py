@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Counts the messages that a recorder has missed, by the sequence numbers of their publishers."""
+"""Count the messages that a recorder has missed, by the sequence numbers of their publishers."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -18,7 +18,7 @@ class Losses:
     def __init__(self) -> None:
         self.lost: Counter[str] = Counter()  # messages by topic, without topics that lost none
         self._last: dict[str, int] = {}  # newest sequence number by topic
-        self._gaps: Counter[str] = Counter()  # missing numbers since the last `settle`
+        self._gaps: Counter[str] = Counter()  # missing numbers by topic since the last `settle`
 
     def note(self, topic: str, number: int) -> None:
         """Record the sequence number of a received message."""
@@ -31,7 +31,7 @@ class Losses:
         self._last[topic] = number
 
     def settle(self, publishers: Callable[[str], int]) -> None:
-        """Count the gaps since the last call; `publishers` returns a topic's current number."""
+        """Count gaps since the last call; `publishers` returns how many publishers a topic has."""
         for topic, gap in self._gaps.items():
             if publishers(topic) <= 1:
                 self.lost[topic] += gap

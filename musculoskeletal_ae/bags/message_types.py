@@ -12,13 +12,14 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
-# This is far above the size of any message here; the length of the payload is a further limit.
+# No sequence in the messages of this package is nearly as long. The size of a message is a further
+# limit.
 TYPESTORE.max_sequence_length = 1 << 26
 
 CDR = 'cdr'  # the message encoding of ROS 2
 MSG = 'ros2msg'  # the encoding of definitions in .msg format
 _LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}  # by the first two bytes of a CDR message
-#: largest size of a definition [bytes]; those of the types here are several times shorter
+#: largest size of a definition [bytes]; the types of this package have several times shorter ones
 _LONGEST_DEFINITION = 1 << 16
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write metadata.yaml of a rosbag2 directory in version 9, and read the names of its files.
 
-The recorder writes it when recording starts and replaces it when recording ends. Reading a bag does
-not rely on its times and counts, because the storage files contain them as well.
+The recorder writes metadata.yaml when recording starts and replaces it when recording ends. Readers
+of a bag take times and counts from the storage files instead.
 """
 
 import os
@@ -136,7 +136,7 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
 
 
 def read_metadata(directory: Path) -> Contents:
-    """Return the storage files that metadata.yaml names, or all of them if it cannot be used."""
+    """Return the storage files that metadata.yaml names, or all files if it cannot be used."""
     try:
         metadata = convert(read_yaml(directory / FILE, _unusable), _Document)
     except ValueError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Play a recording: its messages, the time line, and demonstrated motions as trajectories.
+"""Playback of a recording: messages to publish, the time line, and demonstrated motions.
 
 While playback is not paused, recorded time advances with the steady clock t:
 
@@ -56,7 +56,7 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
     """Yield the messages to publish from start to stop [ns, recorded].
 
-    The first are the last latched messages before the start, which a late joiner would receive.
+    The last latched messages before `start` come first, because a late joiner would receive them.
 
     Raises:
         BagError: If a message cannot be decoded; replay must not publish it.
@@ -84,9 +84,10 @@ class Timeline:
         return self._recorded + int(passed * self._rate * 1e9)
 
     def wait(self, recorded: int, now: float) -> float:
-        """Return the seconds until a recorded time [ns] is due, infinite if paused before it.
+        """Return the time until a recorded time [ns] is due [s].
 
-        The result is negative if the time has passed.
+        The result is negative if the recorded time has passed, and infinite while playback is
+        paused before the recorded time.
         """
         if self.paused:
             return math.inf if recorded > self._recorded else 0.0

@@ -38,7 +38,7 @@ class Bag:
     path: Path
     files: list[StorageFile]
     topics: dict[str, BagTopic] = field(default_factory=dict)  # by recorded name
-    unfinished: list[str] = field(default_factory=list)  # why it may be incomplete; usually empty
+    unfinished: list[str] = field(default_factory=list)  # why the recording may be incomplete
 
     @classmethod
     def open(cls, path: str | Path) -> Bag:
@@ -48,7 +48,7 @@ class Bag:
         then has the reason.
 
         Raises:
-            BagError: If it is damaged or not a recording.
+            BagError: If the recording is damaged, or the path is not that of a recording.
         """
         path = Path(path)
         contents = read_metadata(path) if path.is_dir() else Contents([path], None, '')
@@ -83,7 +83,7 @@ class Bag:
     ) -> Iterator[BagMessage]:
         """Yield messages of topics, by default all, from start to stop [ns, log time], inclusive.
 
-        They are sorted by log time; messages of equal time keep the order of the file.
+        The messages are sorted by log time. Messages of equal time keep the order of the file.
         """
         wanted = frozenset(self.topics if topics is None else topics)
         ordered = (_in_order(file.messages(wanted, start, stop)) for file in self.files)
@@ -93,7 +93,7 @@ class Bag:
         """Deserialize a message.
 
         Raises:
-            BagError: If it does not fit the type of its topic.
+            BagError: If the message does not fit the type of its topic.
         """
         topic = self.topics[message.topic]
         with reading(message.file):
@@ -122,7 +122,7 @@ def _open_file(path: Path) -> StorageFile:
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Sort messages, at most LONGEST_PAUSE out of order, by log time."""
+    """Yield messages sorted by log time; they may be out of order by at most LONGEST_PAUSE."""
     waiting: list[tuple[int, int, BagMessage]] = []
     newest = held = 0
     for number, message in enumerate(messages):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common parts of the storage formats: topics, messages and errors.
 
-Opening a file reads it completely once, which yields its topics, its times and the end of its
-complete part. `messages` then reads it again.
+Opening a file reads the whole file once, to find its topics, its times and the end of its complete
+part. `messages` then reads the file again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from musculoskeletal_ae.files import open_regular
 
 # The log times of a topic may go back by this much; more is a jump of the recorder's clock.
 LONGEST_DISORDER = 1_000_000_000  # [ns]
-# A recorder that was paused for this long writes one topic after the other.
+# Messages of different topics may be out of order by this much, because a recorder that was paused
+# for this long then writes one topic after the other.
 LONGEST_PAUSE = 10_000_000_000  # [ns]
 LATEST = (1 << 63) - 1  # [ns]; the largest ROS time
 
@@ -59,7 +60,7 @@ class BagTopic:
     type: str
     qos: list[Qos] = field(default_factory=list)  # offered profiles
     encoding: str = CDR  # encoding of its messages
-    schema: Schema | None = None  # the recorded definition, which is only copied
+    schema: Schema | None = None  # the recorded definition of the type
     problem: str = ''  # why its messages cannot be used; '' if they can
     message_count: int = 0
 
@@ -86,7 +87,7 @@ class StorageFile(Protocol):
     topics: dict[str, BagTopic]  # by recorded name
     start: int  # earliest log time [ns]; LATEST without messages
     end: int  # latest log time [ns]; 0 without messages
-    unfinished: str  # why its end is missing; '' if the file is complete
+    unfinished: str  # why the end of the file is missing; '' if the file is complete
     has_checksums: bool  # whether checksums protect all messages
 
     def messages(
@@ -103,7 +104,7 @@ def open_file(path: Path) -> BinaryIO:
     """Open a regular file for reading.
 
     Raises:
-        BagError: If it cannot be opened.
+        BagError: If the file cannot be opened, or if it is not a regular file.
     """
 
     def refuse(file: Path, problem: str) -> BagError:

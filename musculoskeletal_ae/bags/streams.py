@@ -34,7 +34,7 @@ from musculoskeletal_ae.validity import (
 # Conditions for a topic whose log times are bunched.
 FEW = 20  # topics with fewer messages are not checked
 BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
-MANY = 0.3  # at least this fraction of its messages was written together with the one before
+MANY = 0.3  # at least this fraction of its messages was written together with the message before
 
 
 class Series(NamedTuple):
@@ -76,7 +76,7 @@ class Streams(NamedTuple):
         time = self.muscles.time
         pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
-        # A muscle message at time ∞ makes `Pairing` return the last one.
+        # A muscle message at time ∞ makes `Pairing` return the last pair.
         muscles = ((came, 1, row) for row, came in enumerate([*time, math.inf]))
         theta, muscle = [], []  # θ, and the row of the muscle message
         for came, kind, row in heapq.merge(joints, muscles):
@@ -99,7 +99,7 @@ class Streams(NamedTuple):
 class _Stream:
     """Values of a topic while it is being read."""
 
-    shape: tuple[int, ...]  # of the values of a message
+    shape: tuple[int, ...]  # shape of the values of one message
     read: Callable[[Any, float], Array]  # converts a message and its time [s] to values
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
@@ -124,7 +124,7 @@ class _ArmStreams:
     """
 
     def __init__(self, robot: Robot, motors: MotorSettings, ignore: Callable[[str], None]) -> None:
-        """Start empty; `ignore` receives the unused parts of messages of joint_states."""
+        """Start empty; `ignore` is called with each unused part of a message of joint_states."""
         self._robot, self._ignore = robot, ignore
         self._interface = MotorInterface(motors, robot.muscles)
         self._muscle_stream = MuscleStream(robot)
@@ -163,8 +163,8 @@ class _ArmStreams:
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
 
-#: topics of the body state; they are read first, because the recorder may have received them after
-#: the readings
+#: topics of the body state; they are read first, because the recorder may have received their
+#: messages after the readings to which these apply
 BODY_TOPICS = 'isolated_muscles', 'muscle_length_zeros'
 
 
@@ -201,7 +201,7 @@ def read_streams(
     clock_offsets = _bunched(bag, list(takers))
     early = [recorded[name] for name in BODY_TOPICS if name in recorded]
     _deliver(bag, takers, early, clock_offsets, reception)
-    # Messages of motors carry no angles of joints if these have no sensors.
+    # The topic of the motors may serve as joint_states, but joints without sensors are not in it.
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
     notes = [
@@ -223,7 +223,8 @@ def read_streams(
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
     """Return the names under which messages are counted, by topic of the interface.
 
-    A recorded topic may carry the angles of joints and of motors. Its messages are counted twice.
+    A recorded topic may carry the angles of joints as well as those of motors. Each of its messages
+    is then counted under both names.
     """
     count = Counter(recorded.values())
     return {
@@ -269,7 +270,7 @@ def _deliver(
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:
     """Raise a BagError if messages of a topic were rejected and none was used.
 
-    `used` are the streams by their labels, `warnings` the first rejection for each reason.
+    `used` are the streams by label. `warnings` are the texts on the first rejection for each reason.
     """
     for label, stream in used.items():
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]
@@ -282,8 +283,8 @@ def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
     """Return the topics with bunched log times, and the offsets of their publishers' clocks [ns].
 
     A recorder that was blocked for a moment writes many messages with the same log time. Publish
-    times are then better, but the publisher's clock may differ. Its offset is the shortest delay
-    between publication and writing.
+    times are then better, but the clock of the publisher may differ from that of the recorder. The
+    offset is the shortest delay between publication and writing.
     """
     times = {topic: (array('q'), array('q')) for topic in topics}
     for message in bag.messages(topics):
@@ -302,9 +303,10 @@ def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:
-    """Return the index of the last message at each time; before the first, that of the first.
+    """Return the index of the newest message of a latched topic at each time of `when`.
 
-    The first message of a latched topic was published before it was recorded.
+    Before the first message, the index is 0, because that message was published before it was
+    recorded.
     """
     return np.maximum(np.searchsorted(times, when, side='right') - 1, 0)
 
@@ -315,8 +317,8 @@ def _body_at(time: float, before: BodyState, isolated: _Stream, offsets: _Stream
     if isolated.values:
         body = body.with_isolated(np.flatnonzero(isolated.values[_latched(isolated.times, time)]))
     if offsets.values:
-        # Number of offsets published so far. Known first offsets were published before the bag
-        # began; the recorder received the latched message a little late.
+        # Number of messages with offsets so far. If the first one has known offsets, it was
+        # published before the bag began, but the recorder received it a little late.
         number = int(np.searchsorted(offsets.times, time, side='right'))
         if number == 0 and LengthOffsets(*offsets.values[0]).known:
             number = 1

@@ -131,7 +131,7 @@ def namespaces(names: Iterable[str]) -> list[str]:
     """Return the namespaces, '' or such as '/left_arm', of the interface's topics in a recording.
 
     A name can be ambiguous: `/sim/joint_states` may be `joint_states` in the namespace `/sim`. If
-    one namespace explains all topics, only the shortest such namespace is returned.
+    some namespaces explain all topics, only the shortest of them is returned.
     """
     readings = [
         {name[: -len(topic) - 1] for topic in TOPICS if name.endswith(f'/{topic}')}
@@ -143,15 +143,16 @@ def namespaces(names: Iterable[str]) -> list[str]:
 
 
 def interface_name(name: str) -> str:
-    """Return the longest name of the interface with which a recorded name ends, or the name."""
+    """Return the longest name of the interface with which `name` ends, or `name` if none does."""
     endings = [topic for topic in TOPICS if name.endswith(f'/{topic.lstrip("/")}')]
     return max(endings, key=len, default=name)
 
 
 def _motor_topics(bag: Bag, motors: MotorSettings) -> dict[str, str]:
-    """Return the topics of motors in a bag: the parameter's value by recorded name.
+    """Return the topics of motors in a bag: by recorded name, the name in the motor settings.
 
-    Topics that have a name of the interface are left out, unless the parameter has the full name.
+    Topics that have a name of the interface are left out, unless the motor settings have the full
+    name.
     """
     stated = [motors.motor_state_topic, motors.motor_command_topic]
     return {
@@ -171,7 +172,7 @@ def _relative_names(
 ) -> dict[str, str]:
     """Return the relative name of each recorded name; names outside the namespace stay absolute.
 
-    A motor topic that the parameter states with its full name stays absolute as well.
+    A motor topic that the motor settings state with its full name stays absolute as well.
     """
     motor_topics = _motor_topics(bag, motors)
     placed = [name for name in bag.topics if name not in motor_topics]
@@ -207,7 +208,10 @@ def _around(namespace: str) -> list[str]:
 
 
 def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
-    """Return the namespace that all others enclose, unless a topic is in two of them."""
+    """Return the namespace that lies within all others.
+
+    The result is None if there is none, or if a topic is in two of the namespaces.
+    """
     innermost = max(nested, key=len)
     if not set(nested) <= {innermost, *_around(innermost)}:
         return None

@@ -30,8 +30,8 @@ class BagWriter:
         """Create the directory.
 
         Raises:
-            BagError: If it exists and is not empty, cannot be written, or has a name that is not
-                UTF-8, which metadata.yaml could not contain.
+            BagError: If the directory exists and is not empty, cannot be written, or has a name
+                that is not UTF-8, which metadata.yaml could not contain.
         """
         self.directory = Path(directory)
         self.topics: dict[str, BagTopic] = {}
@@ -43,9 +43,9 @@ class BagWriter:
             raise BagError(self.directory, problem, 'choose another name') from error
         #: further entries of metadata.yaml, which are written when the bag is completed
         self.custom: dict[str, str] = {}
-        self._hashes: dict[str, str] = {}  # of types, by topic
-        self._channels: dict[str, int] = {}  # by topic
-        self._schemas: dict[str, int] = {}  # by type
+        self._hashes: dict[str, str] = {}  # hashes of the types, by topic
+        self._channels: dict[str, int] = {}  # numbers of the channels, by topic
+        self._schemas: dict[str, int] = {}  # numbers of the schemas, by type
         self._pending: list[tuple[int, str, int, bytes]] = []
         self._pending_size = 0
         self._times: tuple[int, int] | None = None  # earliest and latest log time [ns]
@@ -107,7 +107,7 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Close the chunk and pass it to the operating system."""
+        """Write all messages so far to the file, and pass them to the operating system."""
         # Callbacks of several topics run slightly out of order, but readers expect ordered files.
         pending = sorted(self._pending, key=lambda entry: entry[0])
         self._pending, self._pending_size = [], 0
