@@ -30,36 +30,36 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-MOST_REPEATED = 0.2  # share of messages that may equal the one before to the last digit
-QUIET = 3  # so few different values, but more than one, indicate a sensor without noise
+MOST_REPEATED = 0.2  # share of messages that may equal the message before to the last digit
+QUIET = 3  # largest number of different values that indicates a sensor without noise
 TEMPERATURES = -20.0, 130.0  # range of possible temperatures [°C]
 #: distance by which l may exceed its range, with and without length calibration [m]
 BEYOND = 0.1, 1.0
 BEYOND_JOINT = 0.3  # distance by which θ may exceed the joint limits [rad]
-# Tolerance of T − T_bias while nothing is commanded, for errors of the sensor and its zero.
-#: tolerance of T at rest [N], and relative to T_bias; the smaller one applies
+#: tolerance of |T − T_bias| while nothing is commanded, [N] and relative to T_bias, for errors of
+#: the sensor and of its zero; the smaller tolerance applies
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
 PULLS = 0.3, 3.0  # usual range of T / T_bias at rest
 USUAL = 10.0, 60.0  # usual temperatures of modules at rest [°C]
-UNIT_TOLERANCE = 0.3  # relative deviation from T_bias of a T in another unit
+UNIT_TOLERANCE = 0.3  # relative deviation from T_bias up to which T is in a unit of TENSION_UNITS
 TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
 HOTTEST_AT_REST = 55.0  # highest temperature of modules without commands [°C]; it is 131 °F
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of both shipped
 # arms (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by 0.31 to 1.55
 # times the model's changes. Where another muscle fits 2.5 times better, the misfit is below 8.5 mm.
 ZERO_TOLERANCE = 0.045  # largest length offset of a healthy arm [m]
-SLOPES = 0.2, 2.2  # legal range of the change of l, divided by that of the model
-MISPLACED = 0.012  # misfit to its own muscle from which a column can be misplaced [m]
+SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
+MISPLACED = 0.012  # misfit of a column to its own muscle above which it can be misplaced [m]
 BETTER = 2.5  # a column is misplaced only if another muscle fits it better by this factor
-MOVED = 0.04  # range of l from which its sign and slope can be checked [m]
-#: fraction of the misfit that may remain if angles instead of lengths are wrong
+MOVED = 0.04  # smallest range of l that allows a check of its sign and slope [m]
+#: fraction of the misfit that a correction of angles may leave; with more, the lengths are blamed
 JOINTS_BETTER = 0.8
-MOVED_JOINT = 0.2  # range of θ from which its sign can be checked [rad]
-MOST_SAMPLES = 400
+MOVED_JOINT = 0.2  # smallest range of θ that allows a check of its sign [rad]
+MOST_SAMPLES = 400  # largest number of messages that are compared with the model
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},
-    'tension': {'mN': 1e-3, 'cN': 1e-2},  # mA of motor currents
+    'tension': {'mN': 1e-3, 'cN': 1e-2},  # mN also stands for mA of motor currents
     'temperature': {'m°C': 1e-3, 'c°C': 1e-2, 'tenths of °C': 0.1},
 }
 
@@ -101,7 +101,7 @@ class Listening:
         (low, high), most = length_range(robot), robot.tension.max
         ones, beyond, (coldest, hottest) = np.ones_like(most), BEYOND[not zeroed], TEMPERATURES
         least, most = -0.02 * most, 1.1 * most
-        if robot.tension_source.is_current:  # includes drive friction, and its scale is not learned
+        if robot.tension_source.is_current:  # wider, for drive friction and an unknown scale
             least, most = reading_range(robot)
         #: range of possible values, (3, M)
         self._low = np.stack([low - beyond, least, coldest * ones])
@@ -155,7 +155,7 @@ class Listening:
             self._rejected.setdefault((topic, error.reason), []).append(error)
 
     def verdict(self, now: float) -> Verdict:
-        """Check the messages received until now [s]."""
+        """Check the messages received until `now` [s]; return the results."""
         verdict = Verdict(self._robot)
         has_angles = not self._stated and not np.isnan(self._theta).all()
         for (topic, reason), errors in self._rejected.items():
@@ -241,7 +241,7 @@ class Listening:
         return False
 
     def _of_source(self, fault: str) -> str:
-        """Return the fault of motor currents that corresponds to one of tensions."""
+        """Return `fault`, or the fault of motor currents for it if the driver reports currents."""
         if not self._robot.tension_source.is_current:
             return fault
         return fault.replace('tension', 'current')
@@ -249,7 +249,7 @@ class Listening:
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
         """Check T and temperature in `states` (3, M) of modules without commands."""
         bias = self._robot.tension.bias
-        # Of position-controlled modules, T is what the posture gives.
+        # With position-controlled modules, T depends on the posture and is not compared with T_bias.
         bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
         for unit, newtons in TENSION_UNITS.items():
             if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():
@@ -268,7 +268,11 @@ class Listening:
     def _judge_lengths_and_joints(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Compare l with the model at θ (N, D), or blame θ if that explains faults of several l."""
+        """Compare l with the model at θ (N, D).
+
+        If several lengths have faults, and one fault of θ explains all of them, that fault is
+        reported instead.
+        """
         lengths_verdict = Verdict(self._robot)
         misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
         if sum(len(fault.muscles) for fault in lengths_verdict.faults) > 1:
@@ -289,7 +293,10 @@ class Listening:
         verdict.add(lengths_verdict)
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return a note on joints that did not move, if another sign of θ (N, D) explains all l."""
+        """Return a note that names the joints whose angle with the other sign explains all l.
+
+        The list is empty if there are no such joints. `theta` is θ [rad], (N, D).
+        """
         names = []
         for j, name in enumerate(self._robot.joints):
             turned, other = theta.copy(), Verdict(self._robot)
@@ -352,7 +359,8 @@ class Listening:
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)
-        # A hand moves the joints, but position-controlled modules hold their lengths.
+        # Position-controlled modules hold their lengths even if a hand moves the joints, so l never
+        # counts as moved.
         least = robot.actuation.choose(MOVED, math.inf)
         moved: Bools = np.ptp(model, axis=0) > least
 
@@ -408,7 +416,8 @@ class Listening:
 def _readings(states: Array) -> Iterator[tuple[str, dict[str, str], Array]]:
     """Yield interpretations of l, T, temperature (3, M), from the literal one to the least likely.
 
-    Each comes with its fault, '' for none, and the values that the texts of the fault name.
+    Each comes with its fault ('' for none) and the values for the texts of the fault. The literal
+    interpretation comes again at the end, so that impossible values are reported as published.
     """
     yield '', {}, states
     yield 'kelvin', {}, states - np.array([[0.0], [0.0], [273.15]])

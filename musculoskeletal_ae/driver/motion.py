@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common parts of the motion tests of both kinds of muscle modules.
 
-A muscle that does not do what it was commanded to do is released at once, and the test ends. Each
-kind of test decides what that means (`MotionTest._run_away`).
+A muscle that runs away, that is, does not follow its commands, is released at once, and the test
+ends. Each kind of test defines when a muscle runs away (`MotionTest._run_away`).
 
-The test also moves the joints. Afterwards, the joint sensors are compared with the lengths.
+Since the test also moves the joints, their sensors are compared with the lengths afterwards.
 """
 
 from abc import ABC, abstractmethod
@@ -37,7 +37,7 @@ class RunAwayError(Exception):
     """A muscle runs away and must be released."""
 
     def __init__(self, muscle: int, fault: str, **values: object) -> None:
-        """Describe it for `Verdict.failed`."""
+        """Take the arguments of `Verdict.failed` that describe the fault."""
         super().__init__(fault)
         self.muscle, self.fault, self.values = muscle, fault, values
 
@@ -82,7 +82,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _hold(self) -> Wait:
-        """Check that the arm is held where it is."""
+        """Check that the modules hold the arm where it is."""
 
     @abstractmethod
     def _try(self, m: int) -> Wait:
@@ -90,11 +90,11 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
-        """Return the error of a muscle that runs away.
+        """Return the error of a muscle that runs away, or None.
 
         Args:
             states: l [m], T [N] and temperature [°C] of the newest message, (3, M).
-            start: The same when the present wait began.
+            start: The newest message when the present wait began, (3, M).
         """
 
     @abstractmethod
@@ -115,13 +115,13 @@ class MotionTest(ABC):
         except RunAwayError as error:
             self.verdict.failed(error.fault, error.muscle, **error.values)
             self._pay_out(error.muscle)
-            # Then commands end, after which modules go to their safe state.
+            # After this wait, no more commands follow, so that the modules go to their safe state.
             end = self._now + RELEASE
             while self._now < end:
                 yield
 
     def _judge_joints(self) -> None:
-        """Compare the joint sensors with the lengths, unless these are wrong."""
+        """Compare the joint sensors with the lengths, unless the lengths are wrong."""
         verdict, robot = self.verdict, self._robot
         if not self._history or {'order', 'unit', 'sign'} & verdict.wrong:
             return
@@ -133,7 +133,7 @@ class MotionTest(ABC):
         for fault in judgement.faults:
             verdict.failed(fault.kind, names=', '.join(robot.joints[j] for j in fault.joints))
         if judgement.faults:
-            verdict.withdraw('zero')  # it was compared with the model at wrong angles
+            verdict.withdraw('zero')  # lengths were compared with the model at wrong angles
             return
         unknown = [name for j, name in enumerate(robot.joints) if j not in judgement.right]
         if judgement.right:
@@ -147,7 +147,7 @@ class MotionTest(ABC):
             )
 
     def _wait(self, duration: float) -> Wait:
-        """Wait [s].
+        """Wait for `duration` [s].
 
         Raises:
             RunAwayError: If a muscle runs away meanwhile.
@@ -176,7 +176,7 @@ class MotionTest(ABC):
         return np.std(self._readings()[:, 1], axis=0)
 
     def _go(self, m: int, goal: float) -> Wait:
-        """Move a target to `goal` [m] at RELEASE_SPEED, and wait."""
+        """Move the target of muscle m to `goal` [m] at RELEASE_SPEED, and wait for RELEASE."""
         last = self._now
         while self._target[m] != goal:
             yield from self._wait(1e-9)

@@ -21,12 +21,12 @@ LONGEST_GAP = 0.2  # longest gap between two messages [s]; the controller's `max
 #: time between two ticks above which this process was blocked [s]; check_driver ticks every 0.02 s
 LONGEST_TICK = 0.07
 OVERLOAD = 1.5  # load average per core above which this computer may slow the driver down
-LEAST_LOST = 0.05  # a larger fraction of lost messages is reported
+LEAST_LOST = 0.05  # fraction of lost messages above which the loss is reported
 
 
 class _Message(NamedTuple):
     came: float  # time of reception [s]
-    came_awake: float  # the same without pauses of this process [s]
+    came_awake: float  # time of reception by a clock that stops while this process is blocked [s]
     sent: float  # source time by the driver's clock [s]; NaN if unknown
     number: int  # sequence number; 0 if unknown
 
@@ -54,7 +54,7 @@ class Pace:
         self._awake.tick(now)
 
     def judge(self, verdict: Verdict, now: float) -> None:
-        """Check the rate and the gaps until now [s]."""
+        """Check the rate and the gaps until `now` [s], and add the results to `verdict`."""
         came, came_awake, sent, number = map(np.array, zip(*self._messages))
         is_dated = bool(np.isfinite(sent).all() and (np.diff(sent) >= 0.0).all())
         is_numbered = is_dated and bool((number > 0).all() and (np.diff(number) > 0).all())
@@ -93,7 +93,10 @@ class Pace:
 
 
 def _explained(came: Array, came_awake: Array) -> bool:
-    """Return whether pauses of this process make up most of the longest gap between times."""
+    """Return whether this process was blocked for most of the longest gap between messages.
+
+    The arguments are times of reception by the steady clock and by the `AwakeClock` [s].
+    """
     gaps = np.diff(came)
     longest = int(gaps.argmax())
     return bool(np.diff(came_awake)[longest] < 0.5 * gaps[longest])

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the response of a driver whose modules follow positions, one muscle at a time.
 
-At first every l_target is the current l, where every l must stay. Then, for each muscle, the target
-moves inwards slowly, until the tension has risen or the target has moved by FURTHEST. l must follow
+At first, every l_target is the current l, and every l must stay there. Then, for each muscle, the
+target moves inwards slowly until the tension has risen or the target has moved by FURTHEST. l must
+follow
 
     l → l_target
 
-and T must not fall meanwhile. The target then returns and moves outwards, where l must follow, too.
+and T must not fall meanwhile. The target then returns and moves outwards, and l must follow again.
 """
 
 from collections.abc import Sequence
@@ -157,5 +158,5 @@ class Positioning(MotionTest):
         verdict.passed('latency', m)
 
     def _may_go_on(self, m: int) -> bool:
-        """Return whether muscle m may be wound in further; an unknown tension does not end it."""
+        """Return whether muscle m may be wound in further; if T is unknown, it may."""
         return not float(self._readings()[:, 1, m].mean()) > self._highest[m]
