@@ -270,7 +270,7 @@ def _deliver(
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:
     """Raise a BagError if messages of a topic were rejected and none was used.
 
-    `used` are the streams by label. `warnings` are the texts on the first rejection for each reason.
+    `used` are the streams by label; `warnings` are the texts on the first rejection of each kind.
     """
     for label, stream in used.items():
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]

@@ -249,7 +249,7 @@ class Listening:
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
         """Check T and temperature in `states` (3, M) of modules without commands."""
         bias = self._robot.tension.bias
-        # With position-controlled modules, T depends on the posture and is not compared with T_bias.
+        # With position-controlled modules, T depends on the posture, so it is not compared.
         bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
         for unit, newtons in TENSION_UNITS.items():
             if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():

@@ -9,8 +9,8 @@ steps inwards until the MSC law
 demands a low tension at the measured l. The target then returns, and moves beyond l, where T must
 stay at T_bias.
 
-The law amplifies an error of l by K. From 50 kN/m on, the resulting error of T exceeds
-TENSION_TOLERANCE. It then replaces the tolerance, and all demanded tensions and detection
+The law amplifies an error of l by K. If K exceeds 50 kN/m, the resulting error of T exceeds
+TENSION_TOLERANCE. This error then replaces the tolerance, and all demanded tensions and detection
 thresholds grow by the same factor.
 """
 
@@ -38,10 +38,10 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-#: responses to lower demands above T_bias cannot be distinguished from noise [N]
+#: smallest demand above T_bias whose response can be distinguished from noise [N]
 LEAST_ABOVE_BIAS = 20.0
 FURTHEST = 0.025  # largest distance by which a muscle is wound in [m]
-SLACK = 0.01  # distance by which l_target is then set beyond l [m]
+SLACK = 0.01  # distance by which l_target is set beyond l after winding in [m]
 RUN_AWAY = 0.05  # shortening at which a muscle is released [m]
 #: tolerance of T [N], and relative to the demand; the larger one applies
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
@@ -58,7 +58,7 @@ class _Reading(NamedTuple):
 
     length: Array
     tension: Array
-    third: Array  # row 3
+    third: Array  # third row of the message, the temperatures
     demand: Array
 
 
@@ -145,9 +145,9 @@ class Winding(MotionTest):
         self._target += 2.0 * RUN_AWAY
 
     def _demanded(self, length: Array) -> Array:
-        """Return the tensions that the commands demand at l [m] (..., M), [N] (..., M)."""
+        """Return the tensions [N] (..., M) that the present commands demand at l [m] (..., M)."""
         demand = self._robot.actuation.demanded(length, self._target)
-        assert demand is not None  # None: modules that follow positions; `Positioning` tests them
+        assert demand is not None  # None only for modules that follow positions (`Positioning`)
         return demand
 
     def _mean(self) -> _Reading:
@@ -159,7 +159,7 @@ class Winding(MotionTest):
         return _Reading(length, tension, third, clipped)
 
     def _off(self, reading: _Reading) -> Bools:
-        """Return which muscles have another tension than the law demands, (M,)."""
+        """Return a mask (M,) of the muscles whose tension is not the one that the law demands."""
         tolerated = np.maximum(self._resting, TENSION_SHARE * reading.demand)
         wrong: Bools = np.abs(reading.tension - reading.demand) > tolerated
         return wrong
@@ -256,7 +256,7 @@ class Winding(MotionTest):
             self.verdict.passed('law', m)
 
     def _whose_tension(self, m: int, home: _Reading, last: _Reading) -> int:
-        """Return the muscle whose T shows the response to winding in m."""
+        """Return the muscle whose T responds when muscle m is wound in; m if no other one does."""
         asked, got = last.demand - home.demand, last.tension - home.tension
         if asked[m] < 0.25 * (self._highest - self._bias)[m] or abs(got[m]) > 0.3 * asked[m]:
             return m
@@ -267,7 +267,8 @@ class Winding(MotionTest):
         """Search for the l_target [m] at which muscle m gets tight; return None without a response.
 
         The target moves slowly inwards and outwards, past −l, where the muscle would get tight if a
-        sign were wrong. The search ends at the first response, or if l or T is not being read.
+        sign were wrong. The search ends at the first response, or when l or T stops changing, that
+        is, when its sensor is not read any more.
         """
         home_length, far = (
             home.length[m],
@@ -310,7 +311,7 @@ class Winding(MotionTest):
             self.verdict.failed('outwards', m)
             return
         onset = yield from self._find_onset(m, home)
-        self._target[m] = home.length[m]  # return without RELEASE_SPEED
+        self._target[m] = home.length[m]  # at once, not at RELEASE_SPEED
         yield from self._wait(RELEASE)
         if onset is None:
             self.verdict.failed('no answer', m)
