@@ -6,7 +6,7 @@ from pathlib import Path
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
 from musculoskeletal_ae.stop_signals import import_heavy
 
-REACH = 0.02  # [m]
+REACH = 0.02  # default of --reach [m]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -19,10 +19,10 @@ from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 COLUMNS = ['tension', 'absolute_length', 'elongation']
 EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]
 EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # [m]
-EXAMPLE_NOISE = 1e-4  # [m], the resolution of a caliper
+EXAMPLE_NOISE = 1e-4  # standard deviation of the noise [m]: the resolution of a caliper
 LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # range of `force`, relative to the highest tension
-SLIGHTLY = 1e-3  # distance of the starting point from the bounds
-LEAST_ELONGATION = -0.002  # [m]; noise can make an elongation negative
+SLIGHTLY = 1e-3  # smallest distance of the starting point from the bounds, in logarithms
+LEAST_ELONGATION = -0.002  # smallest legal elongation [m]; noise can make it negative
 #: largest length of a muscle on a testbed [m]; larger numbers are probably in another unit
 LONGEST = 10.0
 
@@ -63,7 +63,7 @@ def fit(args: Namespace) -> None:
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
-    """Fit the constants, each of shape (1,), to T [N], l_abs [m] and L_e [m], (N,) each.
+    """Return the constants, each of shape (1,), that fit T [N], l_abs [m] and L_e [m], (N,) each.
 
     Raises:
         ValueError: If there are fewer than four rows, or they do not describe a spring.
@@ -84,7 +84,8 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     def residual(log_constants: Array) -> Array:
         return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
 
-    # A linear spring would have F ≫ T, and a tendon alone an infinite rate; both are bounded here.
+    # A linear spring would need an infinite `force`, and a tendon without an element an infinite
+    # `rate`. Both are bounded here.
     most = tension.max()
     low, high = np.log([[LEAST_FORCE * most, 1e-3, 1e-12], [MOST_FORCE * most, 1e6, 1.0]])
     start = np.clip(np.log(list(DEFAULT.values())), low + SLIGHTLY, high - SLIGHTLY)

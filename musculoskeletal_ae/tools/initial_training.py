@@ -44,7 +44,7 @@ from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
-HELD_OUT_STATES = 5000
+HELD_OUT_STATES = 5000  # number of states of the geometric model over which errors are averaged
 #: time between two lines of progress without a terminal [s]
 REPORT_INTERVAL = 5.0
 ENTERED = {
@@ -129,7 +129,7 @@ def _learn_recordings(robot: Robot, args: Namespace, steps: int) -> None:
         for path, pairs in recordings.items()
         for text in wrong_joint_sensors(robot, pairs)
     ]
-    _warn(warnings)  # before the training as well, because the user may want to end it
+    _warn(warnings)  # also before the training, because the user may want to stop here
     if args.checkpoint:
         mae = checkpoint.load(args.checkpoint, robot)
     else:
@@ -167,7 +167,7 @@ def _warn(warnings: list[str]) -> None:
 
 
 def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
-    """Return a warning about an anomaly in a recording and its error until then, or ''.
+    """Return a warning about the first anomaly in a recording and the error before it, or ''.
 
     The health monitor detects the anomaly with the learned network, as on a running arm.
     """
@@ -188,7 +188,7 @@ def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
         if finding is None:
             continue
         muscle = robot.muscles[finding.muscle]
-        text = f'an anomaly ({muscle}: {finding.kind.value}) begins {at:.1f} s into it'
+        text = f'an anomaly ({muscle}: {finding.kind.value}) begins {at:.1f} s after the start'
         if row:
             before = error(mae, recording.first(row))
             text += f'; until then the error is {before:.4f} {robot.kinematics.distance_unit}'
@@ -208,7 +208,7 @@ def read(
         motors: How the motors of a ros2_control robot are connected.
 
     Raises:
-        BagError: If the bag is unusable or has no pair.
+        BagError: If the bag is unusable or has no pair of simultaneous messages.
     """
     bag = Bag.open(path)
     for reason in bag.unfinished:
@@ -262,7 +262,7 @@ def learn(
         if finding is not None:
             learner.anomaly(True)
             stop = stop or (
-                f'learning stopped {at:.1f} s into it: an anomaly begins there '
+                f'learning stopped {at:.1f} s after the start: an anomaly begins there '
                 f'({learner.robot.muscles[finding.muscle]}: {finding.kind.value})'
             )
         learner.muscles(states, at)
@@ -316,7 +316,7 @@ def table(errors: list[PairError], title: str) -> str:
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:
-    """Return a table of the mean absolute error of each joint angle, by estimates from (T, l)."""
+    """Return a table of the mean absolute error of each joint angle when ② estimates θ."""
     estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
     rows = zip(robot.joints, estimates['theta'], robot.units)

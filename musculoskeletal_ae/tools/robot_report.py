@@ -45,7 +45,7 @@ def check(args: Namespace) -> int:
     print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
     if not (count and args.suggest):
         return 1 if count else 0
-    args.out.mkdir(parents=True)  # fails before the search, which takes minutes
+    args.out.mkdir(parents=True)  # if this fails, it fails before a search of minutes
     try:
         return _suggested(robot, args)
     finally:
@@ -54,7 +54,7 @@ def check(args: Namespace) -> int:
 
 
 def _suggested(robot: Robot, args: Namespace) -> int:
-    """Search for a sound arm and write it; return the exit status of its check."""
+    """Search for a sound arm and write it; return the exit status of the check of that arm."""
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
     far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
     if not before:

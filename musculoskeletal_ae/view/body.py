@@ -23,10 +23,10 @@ from musculoskeletal_ae.robot import drawing
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.routes import ARC
 
-LARGEST_MESH = 50_000_000  # [bytes]
+LARGEST_MESH = 50_000_000  # largest size of a mesh file [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-POSTURES = 50  # random postures of either kind that have to fit into the picture
-DASHES = 5  # tubes per straight segment of a muscle; healthy muscles show no gaps
+POSTURES = 50  # number of random postures of each kind in `space`
+DASHES = 5  # number of tubes per straight piece of a muscle; only dashed muscles have gaps
 #: red, green, blue at T_bias and at T_limit
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 
@@ -40,7 +40,7 @@ class Kind(IntEnum):
     RUPTURED = 3
 
 
-MARKS = ('', '? ', '⊘ ', '✂ ')  # by kind
+MARKS = ('', '? ', '⊘ ', '✂ ')  # text before the name of a muscle, by kind
 #: red, green, blue of muscles that are not coloured by tension
 COLOURS = {Kind.SUSPECT: (200, 0, 130), Kind.ISOLATED: (140, 140, 140), Kind.RUPTURED: (0, 0, 0)}
 
@@ -83,7 +83,7 @@ def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
 
 
 def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
-    """Read the file of a <mesh>: package://, file:// or relative to the robot's directory.
+    """Return the mesh of a <mesh>: package://, file:// or relative to the robot's directory.
 
     Raises:
         RobotDescriptionError: If the file cannot be drawn.
@@ -128,7 +128,7 @@ def space(robot: Robot, solids: list[Solid]) -> Array:
     """Return points [m], (N, 3), between which the arm moves.
 
     They are corners of the drawn solids and points of the muscles, in random postures within the
-    joint limits, of which half have every joint at a limit.
+    joint limits. In half of the postures, every joint is at a limit.
     """
     rng = np.random.default_rng(0)
     shares = rng.uniform(0.0, 1.0, (2 * POSTURES, robot.joint_count))
@@ -173,24 +173,25 @@ def viewpoint(points: Array, direction: Array, half: tuple[float, float]) -> tup
 
 
 def grid_cell(reach: float) -> float:
-    """Return a round size [m] of the floor's cells for an arm of radius `reach` [m]."""
+    """Return a power of ten as the size of the floor's cells [m], for a `reach` of the arm [m]."""
     return float(10.0 ** np.round(np.log10(0.15 * reach)))
 
 
 def pieces(robot: Robot) -> Ints:
-    """Return the muscle of each straight piece that is drawn, of segments and of arcs."""
+    """Return the index of the muscle of each drawn straight piece, including pieces of arcs."""
     routes = robot.routes
     return np.sort(np.append(routes.muscle, np.repeat(routes.muscle[routes.wrapping], ARC)))
 
 
 def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dict[str, Array]:
-    """Return the tubes of muscles at θ [rad] (D,) and T [N] (M,), DASHES tubes per piece.
+    """Return the tubes of all muscles at θ [rad] (D,) and T [N] (M,): DASHES tubes per piece.
 
     Positions [m], quaternions wxyz and scales place a tube of radius 1 that reaches from −½ to ½
     along z.
     """
     owner = pieces(robot)
-    # The number of pieces is constant: pieces of a tendon that does not wrap have no length.
+    # The number of pieces is constant. While a tendon does not touch its object, the pieces of the
+    # arc have no length.
     drawn = zip(robot.routes.drawn(theta), robot.routes.pieces_drawn.tolist(), strict=True)
     lines = [
         line[np.linspace(0.0, len(line) - 1.0, n + 1).round().astype(int)] for line, n in drawn

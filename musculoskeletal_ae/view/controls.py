@@ -57,7 +57,7 @@ class Controls:
         self._gui, self._robot, self._scene, self._act = server.gui, robot, scene, act
         self._is_targeted = False  # whether the sliders show a visitor's target
         self._is_pushing = False
-        #: controls of each node; shown while it runs
+        #: controls of each node, which are shown while the node runs
         self._of_node: dict[str, Any] = {
             'controller': self._build_arm(),
             'hardware_emulator': self._build_faults(),
@@ -69,7 +69,7 @@ class Controls:
 
     def _connect(self, register: Any, what: str, value: Any = None) -> None:
         def on_event(event: Any) -> None:
-            if event.client is not None:  # None: `follow` has set the control
+            if event.client is not None:  # without a client, `follow` has set the control
                 if what in ('targets', 'hand'):
                     self._is_targeted = True
                 self._act(what, *[value(event)] if value else [])
@@ -101,7 +101,7 @@ class Controls:
                 'drag the hand', False, hint='shows arrows at the hand that you can drag'
             )
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', _chosen(event)))
-            # Steps of at most a hundredth of the range keep the ends near the limits.
+            # A slider ends at multiples of its step, so a step is at most a hundredth of the range.
             spans = np.minimum(robot.upper - robot.lower, 100.0)
             places = np.ceil(2.0 - np.log10(spans)).astype(int).tolist()
             steps = np.array([float(f'1e-{n}') for n in places])
@@ -181,7 +181,7 @@ class Controls:
             self._timeline.value = round(min(played), 1)
 
     def end_push(self) -> None:
-        """End a push, because its visitor may have left; a drag that continues pushes again."""
+        """End a push, whose visitor may have left; if a visitor still drags, it begins again."""
         if self._is_pushing:
             self._is_pushing = self._force.visible = False
             self._act('push', np.zeros(3))
@@ -191,7 +191,7 @@ class Controls:
         self._scene.pick(muscle)
 
     def push(self, event: Any) -> Array:
-        """Draw and return the force of a drag [N] (3,)."""
+        """Draw the force of a drag, and return the force [N], (3,)."""
         ends = np.array([event.start_position, event.end_position])
         force = PUSH_STIFFNESS * (ends[1] - ends[0])
         self._is_pushing = self._force.visible = event.phase != 'end'

@@ -55,7 +55,7 @@ class Page:
         self.looked_at = threading.Event()
         # Browsers open connections that they never use; do not log a traceback for each.
         logging.getLogger('websockets.server').setLevel(logging.CRITICAL)
-        try:  # viser would wait for ever, or use another port
+        try:  # if the port is in use, viser would wait for ever or use another port
             family = socket.getaddrinfo(host, port)[0][0]
             socket.create_server((host, port), family=family).close()
         except (OSError, UnicodeError) as error:
@@ -69,7 +69,7 @@ class Page:
             checked_visits(host, f'{robot.description.directory.name} – musculoskeletal_ae'),
         ):
             server = self._server = viser.ViserServer(host, port, verbose=False)
-        if server.get_port() != port:  # another process took it first
+        if server.get_port() != port:  # another process took the port first
             server.stop()
             raise MusculoskeletalError(f'port {port} of {host} is in use; choose another --port')
         # Visitors must not open a tunnel to the internet.
@@ -88,7 +88,7 @@ class Page:
         is_narrow = camera.image_width < NARROW
         window = camera.image_width, camera.image_height
         look_at, position = self.scene.viewpoint(*window, is_narrow)
-        # In this order, because the position moves the target along.
+        # Set the position first, because the target of the camera moves with it.
         camera.position, camera.look_at = position, look_at
         self._readings[client.client_id] = Readings(client.gui, self._robot, is_narrow)
         self.looked_at.set()
@@ -113,7 +113,7 @@ class Page:
         gui.main_panel.set_width(RIGHT_PANEL)
 
     def draw(self, posture: dict[str, Array], tension: Array | None, kinds: Ints) -> None:
-        """Draw the arms at their θ [rad] (D,) if known, and muscles at T [N] (M,)."""
+        """Draw the arms in `posture` at θ [rad] (D,), and the muscles at T [N] (M,)."""
         theta = self.scene.draw(posture, tension, kinds)
         if self.controls is not None and theta is not None:
             self.controls.draw(theta)

@@ -24,8 +24,8 @@ GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
 HEIGHT = 84  # height of a plot [pixels]
 TIME_AXIS = {'incrs': [0.25 * DURATION], 'space': 30, 'size': 26}
-#: uPlot takes the smallest distance of ticks of at least `space` pixels: half of any `scale_top`.
-#: The axes never change, because viser's charts lose the time axis when they do.
+#: Of these distances between ticks, uPlot takes the smallest one of at least `space` pixels: half of
+#: any `scale_top`. The axes never change, because viser's charts would then lose the time axis.
 VALUE_AXIS = {
     'incrs': [step * 10.0**power for power in range(-6, 7) for step in (0.5, 1.0, 2.5)],
     'space': 18,
@@ -43,7 +43,7 @@ class Curve(NamedTuple):
 
 
 def curves(unit: str) -> tuple[Curve, ...]:
-    """Return the plots; `unit` is that of the estimation error."""
+    """Return the plots; `unit` is the unit of the estimation error."""
     return (
         Curve(f'error of the estimate [{unit}]', (GREEN,), (0,)),
         Curve('A: mismatch between T and l', (BLUE,), (1,)),
@@ -67,8 +67,8 @@ class History:
     def curve(self, values: Sequence[int]) -> tuple[Array, ...]:
         """Return time relative to now [s], and the values since the last gap.
 
-        Rows in which the first value is unknown are left out. Where another value is unknown, it is
-        replaced by the first one, whose line hides it.
+        Rows in which the first value is unknown are left out. Other values that are unknown are
+        replaced by the first value of their row, so that the first line hides them.
         """
         table = np.array(self._rows)
         if not len(table):

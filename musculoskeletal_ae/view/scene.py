@@ -17,6 +17,7 @@ from musculoskeletal_ae.view.readings import ARMS, LEFT_PANEL
 
 CAMERA_FOV = 0.8  # vertical field of view [rad]
 FILLED = 0.95  # share of the visible width and height that the arm may fill
+#: unit vector from the arm to the initial camera
 VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
 RIGHT_PANEL = 330  # width of the right panel [pixels]
 #: width and height for which the initial camera is placed [pixels]
@@ -53,7 +54,7 @@ class Scene:
 
     def _build_arms(self, solids: Any) -> None:
         scene, kin = self._server.scene, self._robot.kinematics
-        self._arms: dict[str, list[Any]] = {}  # root frame, then joint frames
+        self._arms: dict[str, list[Any]] = {}  # by arm: its root frame, then its joint frames
         for arm, colour in ARMS.items():
             frames = self._arms[arm] = [scene.add_frame(f'/{arm}', show_axes=False, visible=False)]
             for i, parent in enumerate(kin.tree.parent[1:], 1):
@@ -69,7 +70,7 @@ class Scene:
     def _build_muscles(self) -> None:
         robot, scene = self._robot, self._server.scene
         tube = trimesh.creation.cylinder(1.0, 1.0, sections=12)
-        # Without end caps there are no seams.
+        # Remove the end caps, which would show as seams between tubes.
         tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)
         middle = 0.5 * (robot.lower + robot.upper)
         tubes: Any = body.muscle_tubes(robot, middle, np.zeros(robot.muscle_count), self.kinds)
@@ -91,7 +92,7 @@ class Scene:
         look_at, position = self.viewpoint(*WINDOW, False)
         floor, width = (*look_at[:2], self._space[:, 2].min() - 0.1 * self.size), 8.0 * self.size
         scene.add_grid('/floor', width, width, position=floor, cell_size=body.grid_cell(self.size))
-        # Lights that do not tint colours.
+        # Replace the default lights, which tint colours.
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_ambient('/light', intensity=1.5)
@@ -105,7 +106,7 @@ class Scene:
 
         Args:
             width: Width of the visitor's window [pixels].
-            height: Its height [pixels].
+            height: Height of the visitor's window [pixels].
             is_narrow: Whether there is no panel on the left.
         """
         free = width - RIGHT_PANEL - (0 if is_narrow else LEFT_PANEL)
@@ -114,10 +115,10 @@ class Scene:
         return body.viewpoint(self._space, VIEW_DIRECTION, (FILLED * side, FILLED * up))
 
     def draw(self, posture: dict[str, Array], tension: Array | None, kinds: Ints) -> Array | None:
-        """Draw the arms at their θ [rad] (D,) if known, and muscles at T [N] (M,).
+        """Draw the arms in `posture` at θ [rad] (D,), and the muscles at T [N] (M,).
 
         Returns:
-            θ at which the muscles are drawn; None if they are not.
+            θ at which the muscles are drawn; None if they are not drawn.
         """
         kin, self.posture = self._robot.kinematics, posture
         with self._server.atomic():
@@ -151,7 +152,7 @@ class Scene:
         return self._robot.muscles[self._owner[tube]]
 
     def pick(self, muscle: str) -> None:
-        """Label a muscle that a visitor has picked, by name."""
+        """Label the muscle of this name, which a visitor has picked."""
         self._picked = muscle
         self._mark()
 

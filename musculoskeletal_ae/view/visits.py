@@ -3,9 +3,9 @@
 
 Browsers let every web site open a WebSocket to localhost. Without a check, any site that is open in
 a browser could move the arm. Moreover, viser sets any attribute of a control that a browser names.
-It offers no hook for either check. It serves its page by the public function
-`websockets.asyncio.server.serve` and the public class `ServerConnection`, however, and
-`checked_visits` extends these while viser starts.
+viser offers no hook for either check. However, it serves its page by the public function
+`websockets.asyncio.server.serve` and the public class `ServerConnection`, and `checked_visits`
+extends these while viser starts.
 """
 
 import gzip
@@ -89,7 +89,7 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
         title: Title of the page.
 
     Raises:
-        MusculoskeletalError: If websockets has served nothing, because nothing is checked then.
+        MusculoskeletalError: If websockets has served nothing, because visits would be unchecked.
     """
     serve, served = server.serve, False
 

@@ -164,7 +164,7 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     assert anomaly_in(arm26, recording, initial, 'default') == ''
     monkeypatch.setattr(initial_training, 'HealthMonitor', Monitor)
     learner = Learner(arm26, initial)
-    assert 'learning stopped 3.0 s into it: an anomaly' in learn(learner, recording)
+    assert 'learning stopped 3.0 s after the start: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')
-    assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s into it' in text
+    assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s after the start' in text
     assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text
