@@ -219,7 +219,7 @@ class CommandLimiter:
         The result is not lowered below T_bias, so that uncertainty alone makes no tendon slack.
         """
         bias = self._robot.description.tension.bias
-        spread = np.nan_to_num(sample.tension_spread)
+        spread = np.fmax(sample.tension_spread, 0.0)  # NaN: tension unknown
         return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:

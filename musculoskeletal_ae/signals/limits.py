@@ -118,15 +118,16 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
     Raises:
         MessageError: If a joint does; the text names the joint, its angle and its limits.
     """
-    beyond = share_outside(robot, theta)
-    j = int(np.nanargmax(np.append(beyond, -np.inf)))
-    if j < len(theta) and beyond[j] > outside:
-        low, high, unit = robot.lower[j], robot.upper[j], robot.units[j].theta
-        value, least, most = distinct(theta[j], low, high)
-        raise MessageError(
-            'θ far outside the joint limits',
-            f'{robot.joints[j]} {value} {unit}, limits {least} to {most}',
-        )
+    share = share_outside(robot, theta)
+    if not (share > outside).any():
+        return
+    j = int(np.nanargmax(share))
+    low, high, unit = robot.lower[j], robot.upper[j], robot.units[j].theta
+    value, least, most = distinct(theta[j], low, high)
+    raise MessageError(
+        'θ far outside the joint limits',
+        f'{robot.joints[j]} {value} {unit}, limits {least} to {most}',
+    )
 
 
 class Persistence:
