@@ -219,10 +219,10 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
         problem: The problem to fit.
         start: The first point.
         rounds: Largest number of steps.
-        enough: The fit ends when a step lowers the cost by less than this.
+        enough: The fit ends when a step lowers the cost by less than this value.
 
     Returns:
-        The last point. The weights of the problem are then those of this point.
+        The state after the last round. The weights of the problem are those of its point.
     """
     fit = Result(start)
     for _ in range(rounds):
@@ -241,7 +241,7 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
 
 
 def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Result[Point]:
-    """Take the least damped step that lowers the cost, or none."""
+    """Take the least damped step that lowers the cost, if any, and return the new state."""
     before = problem.cost(fit.point)
     equations = problem.equations(fit.point)
     right = problem.right_sides(fit.point)

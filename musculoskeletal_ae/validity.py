@@ -42,7 +42,7 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
     values = _values(message, rows, columns)
     finite = np.isfinite(values)
     if not finite.all():
-        raise MessageError('not finite', f'value {np.flatnonzero(~finite)[0]}')
+        raise MessageError('not finite', f'element {np.flatnonzero(~finite)[0]} of the data')
     return values[0] if rows == 1 else values
 
 
@@ -128,7 +128,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
 
 
 def joints_not_finite(message: Any, joints: Sequence[str]) -> list[str]:
-    """Return the names in `joints` that have a position in a JointState that is not finite."""
+    """Return which of the `joints` have a position of NaN or infinity in a JointState."""
     return [
         name
         for name, position in zip(message.name, message.position)
@@ -179,9 +179,9 @@ def joint_names(message: Any) -> list[str]:
     if not names:
         raise MessageError('empty', 'no joints')
     if counts[1] != counts[0] or not set(counts[2:]) <= {0, counts[0]}:
-        raise MessageError(
-            'wrong length', '{} names, {} positions, {} efforts, {} velocities'.format(*counts)
-        )
+        stated = '{} names, {} positions, {} efforts, {} velocities'.format(*counts)
+        legal = 'a position for each name, and as many efforts and velocities, or none'
+        raise MessageError('wrong length', f'{stated}; expected {legal}')
     return names
 
 
@@ -248,7 +248,9 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
     )
     assert position is not None
     if effort is not None:
-        raise MessageError('effort', 'a trajectory has positions, velocities, accelerations only')
+        raise MessageError(
+            'effort', 'the points have efforts; legal: positions, velocities, accelerations'
+        )
     if velocity is None and acceleration is not None:
         raise MessageError('wrong length', 'accelerations without velocities')
     spans = [point.time_from_start for point in points]
@@ -261,7 +263,9 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
             point, joint = np.argwhere(~np.isfinite(column))[0]
             raise MessageError('not finite', f'{what} of {names[joint]} at point {point + 1}')
     if velocity is not None and np.abs(velocity[-1]).max() > LAST_VELOCITY:
-        raise MessageError('moves at its end', f'last velocities {velocity[-1].tolist()}')
+        raise MessageError(
+            'moves at its end', f'last velocities {velocity[-1].tolist()}; expected 0'
+        )
     places = np.array([list(joints).index(name) for name in names])
     return Points(places, time, position, velocity, acceleration)
 
@@ -282,7 +286,8 @@ def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:
     lengths = {len(row) for row in rows}
     legal = {joint_count} if what == 'positions' else {0, joint_count}
     if len(lengths) > 1 or not lengths <= legal:
-        problem = f'{what} of {sorted(lengths)} values at the points, for {joint_count} joints'
+        found, expected = (' or '.join(map(str, sorted(sizes))) for sizes in (lengths, legal))
+        problem = f'the points have {found} {what}; expected {expected} at every point'
         raise MessageError('wrong length', problem)
     return None if 0 in lengths else np.array([list(row) for row in rows], dtype=float)
 

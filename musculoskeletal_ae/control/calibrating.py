@@ -74,8 +74,8 @@ class Calibrating(ActivityControl):
     def _goal(self, inputs: Inputs) -> Array:
         """Return the length command [m], (M,), at the end of a step towards a random goal.
 
-        Of GOALS random goals, the first one is used whose step ends in a holdable posture. If there
-        is none, the goal with the least missing torque is used.
+        The step leads towards the first of GOALS random goals for which it ends in a holdable
+        posture. If there is no such goal, it leads towards the goal with the least missing torque.
         """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
         tension = inputs.sample.model_tension * inputs.sample.usable

@@ -96,10 +96,11 @@ def holdable_postures(
         postures: Random postures.
         count: Number of postures to return.
         others: Further functions that return G (N, M, D) for postures (N, D). A posture has to be
-            holdable with the nominal G and with each of these; T is computed with the last one.
+            holdable with the nominal G and with the G of each of these functions. T is computed
+            with the G of the last function.
 
     Raises:
-        RobotDescriptionError: If there are fewer holdable postures.
+        RobotDescriptionError: If fewer than `count` of the postures are holdable.
     """
     held: list[tuple[Array, Array]] = []
     for theta in postures:
@@ -155,7 +156,7 @@ class Exploring(ActivityControl):
 
     @property
     def theta(self) -> Array | None:
-        """The posture to which the arm moves [rad], (D,); None before the first one.
+        """The posture to which the arm moves [rad], (D,); None before the first step.
 
         This is not a target of the user, and does not replace `Controller.target_state`.
         """

@@ -17,8 +17,8 @@ SUCCESSFUL, INVALID, BEYOND_PATH, BEYOND_GOAL = 0, -1, -4, -5
 def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
     """Return the position tolerance of each joint [rad] (D,) from control_msgs/JointTolerance.
 
-    A position of 0, the default, and a negative one mean no tolerance. Tolerances on velocities and
-    accelerations are ignored, because these are not estimated.
+    A position of 0 (the default) or a negative position means that the joint has no tolerance.
+    Tolerances of velocity and acceleration are ignored, because neither is estimated.
 
     Raises:
         MessageError: If a joint is unknown or a tolerance is not finite.
@@ -47,9 +47,9 @@ class FollowedGoal:
             core: The controller.
             joints: Names of the joints.
             path: Tolerances along the trajectory [rad], (D,).
-            goal: Tolerances at its end [rad], (D,).
-            patience: Longest time after the end until the goal tolerances are met [s]; 0 for no
-                limit.
+            goal: Tolerances at the end of the trajectory [rad], (D,).
+            patience: Longest time after the end of the trajectory until the tolerances `goal` are
+                met [s]; 0 for no limit.
         """
         self._core, self._trajectory = core, core.activities.follower.latest
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience

@@ -50,7 +50,7 @@ class Hand:
     def posture(
         self, mae: Mae, pose: pin.SE3, whole: bool, start: Array, nearest: bool
     ) -> tuple[Array, str]:
-        """Return the posture θ [rad] (D,) for a pose, and why it does not reach the pose, or ''.
+        """Return the posture for a pose, and the reason why the hand does not reach the pose.
 
         Args:
             mae: The network in use.
@@ -59,6 +59,9 @@ class Hand:
             start: Posture from which the search starts [rad], (D,).
             nearest: Whether to return the nearest holdable posture if the hand cannot reach the
                 pose.
+
+        Returns:
+            The posture θ [rad], (D,), and the reason, which is '' if the hand reaches the pose.
 
         Raises:
             MessageError: If the hand cannot reach or hold the pose and `nearest` is false.
@@ -82,11 +85,11 @@ class Hand:
         return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
-        """Return the trajectory to the posture of a pose.
+        """Return the trajectory to the posture in which the hand has a pose.
 
         Args:
             start: Setpoint from which the trajectory starts.
-            theta: Posture of the pose θ [rad], (D,).
+            theta: The posture θ [rad], (D,).
             speed: Largest speed of the hand to a single pose [m/s].
             now: Time at which the pose was received [s].
         """

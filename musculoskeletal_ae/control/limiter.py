@@ -75,7 +75,7 @@ RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modul
 
 
 class CommandLimiter:
-    """Limits commands relative to the last published one.
+    """Limits commands relative to the last published command.
 
     Attributes:
         command: The last published command, or None.
@@ -111,7 +111,7 @@ class CommandLimiter:
         return self.slack_length if self.offsets_known else np.full_like(self.slack_length, np.inf)
 
     def shift(self, offset: Array) -> None:
-        """Convert the last commands after the length offsets grew by `offset` [m], (M,)."""
+        """Convert the last commands to length offsets that have grown by `offset` [m], (M,)."""
         self._exceeded = self._exceeded - offset
         if self._last_length is not None:
             self._last_length = self._last_length[0] - offset, self._last_length[1]
@@ -137,7 +137,10 @@ class CommandLimiter:
         return Command(LENGTH, self._length_demanding(self.command.value, sample))
 
     def _length_demanding(self, tension: Array, sample: MuscleSample) -> Array:
-        """Return lengths [m] (M,) that demand tensions [N] (M,), near the last published ones."""
+        """Return lengths [m], (M,), that demand given tensions [N], (M,).
+
+        Of all lengths that do, these are as near to the last published lengths as possible.
+        """
         robot = self._robot
         demand = np.maximum(tension, robot.tension.bias)
         length = np.minimum(sample.length, self.longest) + msc_compensation(robot, demand)

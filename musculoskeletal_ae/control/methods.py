@@ -162,7 +162,7 @@ class StiffnessModel(NamedTuple):
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Compute the model from the network at θ (D,) and T (M,)."""
+        """Compute the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
 
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
@@ -189,7 +189,7 @@ class StiffnessModel(NamedTuple):
         )
 
     def muscle_stiffness(self, tension: Array) -> tuple[Array, Array]:
-        """Return k [N/m] and dk/dT [1/m] of every muscle, each of shape (M,)."""
+        """Return k [N/m] and dk/dT [1/m] of every muscle at T [N], (M,) each."""
         square, linear, constant = self.compliance
         compliance = (square * tension + linear) * tension + constant
         # Treat a tendon as rigid if the network wrongly predicts that it shortens under tension.
@@ -198,13 +198,13 @@ class StiffnessModel(NamedTuple):
         return k, -k * k * slope
 
     def joint_stiffness(self, tension: Array) -> Array:
-        """Return K_θ [N·m/rad] at T (M,), shape (D, D)."""
+        """Return K_θ [N·m/rad], (D, D), at the tensions T [N], (M,)."""
         k, _ = self.muscle_stiffness(tension)
         muscular = robot_stiffness.joint_stiffness(self.jacobian, self.hessian, k, tension)
         return self.springs + muscular
 
     def slope(self, tension: Array) -> Array:
-        """Return ∂K_jj/∂T_i [N·m/rad/N] at T (M,), shape (D, M)."""
+        """Return ∂K_jj/∂T_i [N·m/rad/N], (D, M), at the tensions T [N], (M,)."""
         _, bend = self.muscle_stiffness(tension)
         return (self.jacobian**2 * bend[:, None]).T + np.einsum('mjj->jm', self.hessian)
 

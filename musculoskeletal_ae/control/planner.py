@@ -120,11 +120,11 @@ class Planner:
         self._hand.again(now)
 
     def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
-        """Plan to move the end effector by a twist [m/s], [rad/s] (6,) for a short time."""
+        """Plan to move the end effector by a twist, (6,) in m/s and rad/s, for a short time."""
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return θ, or a posture that is holdable without the isolated muscles, and the reason.
+        """Return θ if it is holdable without the isolated muscles, else the nearest such posture.
 
         Args:
             mae: The network in use.
@@ -151,7 +151,7 @@ class Planner:
         )
         if not nearest:
             raise MessageError('not holdable', problem)
-        return held, f'{problem}; going there'
+        return held, f'{problem}; the arm moves there'
 
     def _clipped(self, points: Points) -> Points:
         """Return the points clipped to the joint limits.

@@ -80,7 +80,7 @@ class Goal(NamedTuple):
 
 
 class LengthRamps:
-    """Ramps to one goal after the other, and holds the last one.
+    """Moves the arm by ramps to one goal after the other, and holds the last goal.
 
     Attributes:
         solution: Solution of the present goal, or None.

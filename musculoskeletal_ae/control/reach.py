@@ -151,7 +151,7 @@ class Limits:
     def of(
         self, jacobian: Array, direction: Array, resistance: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Return the lowest and highest tensions [N], (M,) each.
+        """Return the lowest and the highest tension [N] that may be used, (M,) each.
 
         Args:
             jacobian: G [m/rad], (M, D).
@@ -188,9 +188,11 @@ class PathCost:
         self._limits = Limits(robot, mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
-        """Return m of postures [rad] (N, D): the largest missing torque [N·m], (N,).
+        """Return m, the largest missing torque [N·m] of each posture, (N,).
 
-        The joints move slowly in a `direction` (D,); without one, they rest.
+        Args:
+            postures: Postures θ [rad], (N, D).
+            direction: Direction in which the joints move slowly, (D,); None if they rest.
         """
         robot, bias = self._robot, self._robot.tension.bias
         moved = np.zeros(robot.joint_count) if direction is None else direction

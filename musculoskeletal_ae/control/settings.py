@@ -15,7 +15,7 @@ MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/r
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of control; `Controller.configure` applies changed ones."""
+    """Settings of control; `Controller.configure` applies changed settings."""
 
     method: str = settable(
         'proposed', 'control method, which computes commands from targets', legal=METHODS

@@ -107,7 +107,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
 
 
 def _learned(core: Controller) -> str:
-    """Return the learned friction of the drives, or that it has not been learned."""
+    """Return a text on what was learned about the motor currents: scale and friction."""
     drive = None if core.mae is None else core.mae.transmission.drive
     if drive is None:
         return 'the friction of the drives has not been learned; tensions are inaccurate'
@@ -152,7 +152,7 @@ def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
 
 
 def slowed(follower: Follower) -> str:
-    """Return a text on how much the last trajectory was slowed; '' if it was not."""
+    """Return a text on how much the last trajectory was slowed; '' if it was not slowed."""
     last = follower.latest
     if last is None or last.slowed == 1.0:
         return ''
@@ -167,7 +167,7 @@ def slowed(follower: Follower) -> str:
 
 
 def _fallen(core: Controller) -> str:
-    """Return how far from its target a fallen arm rests, and the torque that its muscles lack."""
+    """Return a text on a fallen arm: its distance from the target, and the missing torque."""
     mae, estimate, robot = core.mae, core.estimate, core.robot
     error = core.activities.follower.error
     assert mae is not None and estimate is not None  # the arm has moved

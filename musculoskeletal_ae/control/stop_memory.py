@@ -5,10 +5,10 @@
     controller.lock    locked by the controller that uses the directory
 
 While a controller commands the arm, the file names the stop cause `restarted`. A latched stop
-replaces it by its own cause. A controller that ends properly while nothing stops it deletes the
-file. The file therefore remains after a stop, and after a controller that was killed or has
-crashed. A controller that finds the file when it starts is stopped from the beginning, and moves
-only after `controller/reset`.
+replaces this cause by its own. A controller that ends properly while nothing stops it deletes the
+file. The file therefore remains if the controller was stopped, was killed or has crashed. A
+controller that finds the file when it starts is stopped from the beginning, and moves the arm only
+after `controller/reset`.
 """
 
 import fcntl
@@ -28,7 +28,7 @@ BEFORE = 'before this controller was started'
 
 
 class StopMemory:
-    """The file that outlives a controller.
+    """Reads and writes the file that keeps a stop.
 
     Attributes:
         found: The stop that the previous controller has left behind, or None.
@@ -36,10 +36,11 @@ class StopMemory:
     """
 
     def __init__(self, directory: Path | None) -> None:
-        """Read what the previous controller has left behind.
+        """Read the stop that the previous controller has left behind, and lock the directory.
 
         Args:
-            directory: Where the file is; created if it does not exist. None: nothing is kept.
+            directory: Directory of the file, which is created if it does not exist. With None, no
+                stop is read or kept.
 
         Raises:
             MusculoskeletalError: If the directory cannot be used, or another controller uses it.
@@ -76,7 +77,7 @@ class StopMemory:
     def note(self, stop: Condition | None) -> None:
         """Keep the present latched stop; None while the arm may move.
 
-        A write that fails is reported in `problem`, and repeated.
+        If writing fails, `problem` says so, and a later call tries again.
         """
         self._is_latched = stop is not None
         cause = StopCause.RESTARTED if stop is None else stop.cause
@@ -84,8 +85,9 @@ class StopMemory:
             return
         new = self._file.with_name(f'.{FILE}')
         try:
-            # Without fsync, which could delay a command by 0.1 s. A kill loses nothing that was
-            # written. A power failure may leave an empty file, which counts as `restarted`.
+            # Write without fsync, which could delay a command by 0.1 s. If the process is killed,
+            # nothing that was written is lost. A power failure may leave an empty file, which
+            # counts as `restarted`.
             new.write_text(f'{cause.identifier}\n{stop or cause.text}\n', encoding='utf-8')
             new.replace(self._file)
         except OSError as error:

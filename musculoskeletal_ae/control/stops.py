@@ -52,7 +52,7 @@ LAST = Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY
 
 
 class StopCause(Enum):
-    """All stop causes in order of severity; the value contains the stable identifier."""
+    """All stop causes, the most severe first; the value contains the stable identifier."""
 
     def __init__(self, identifier: str, declaration: Declaration) -> None:
         self.identifier = identifier
@@ -233,10 +233,10 @@ class Condition(NamedTuple):
 def remedy_of(
     causes: Iterable[StopCause], explored: bool, of_finding: Iterable[Step] = REPAIR
 ) -> list[Step]:
-    """Return the remedies of all causes in their order; each step once, and the reset last.
+    """Return the steps of the remedies of all causes, each step once, and the reset last.
 
     Args:
-        causes: The causes.
+        causes: The causes, in whose order the steps are returned.
         explored: Whether the arm explored when it stopped, so that it may explore again.
         of_finding: Remedy of the estimator's finding, which is part of the remedy of an anomaly.
     """
@@ -247,7 +247,7 @@ def remedy_of(
 
 
 def parse(value: str) -> list[StopCause]:
-    """Return the causes in a value `stop causes`; unknown ones are left out."""
+    """Return the causes in a value `stop causes`; unknown identifiers are left out."""
     causes = {cause.identifier: cause for cause in StopCause}
     return [causes[name] for name in value.split(', ') if name in causes]
 

@@ -102,7 +102,7 @@ class Supervisor:
 
     @property
     def mode(self) -> str:
-        """The mode: the identifier of the activity while running, otherwise of the stop state."""
+        """The identifier of the activity while the arm is running, otherwise of the stop state."""
         return (self.activity if self.state is StopState.RUNNING else self.state).value
 
     @property

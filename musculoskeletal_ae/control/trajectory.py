@@ -94,10 +94,12 @@ class Trajectory:
     def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
         """Return the trajectory from `start` through the points that are still ahead.
 
-        `passed` is the time [s] since the times of the points began to count. Earlier points are
-        dropped.
-
         A single point at time 0 is reached as fast as possible.
+
+        Args:
+            start: Setpoint at which the trajectory begins.
+            points: The points; those that are no longer ahead are dropped.
+            passed: How long ago the time of the points was 0 [s].
 
         Raises:
             MessageError: If no point remains, or two points are too close in time.
@@ -201,7 +203,10 @@ class Trajectory:
         return float(self.time[-1])
 
     def sample(self, time: Array | float) -> Setpoint:
-        """Return the setpoint at one time or at times (N,) [s]; outside the duration it rests."""
+        """Return the setpoint at one time or at times (N,) [s].
+
+        Before the start and after the end of the trajectory, the setpoint is at rest.
+        """
         inner = np.clip(np.asarray(time), 0.0, self.time[-1])
         piece = np.clip(np.searchsorted(self.time, inner, side='right') - 1, 0, len(self.time) - 2)
         span = np.diff(self.time)[piece]

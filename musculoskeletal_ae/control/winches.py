@@ -42,16 +42,20 @@ class Winches:
 
     @property
     def lead(self) -> Array:
-        """Lag of the modules behind their commands while they wind in [m], (M,)."""
+        """Length by which modules that wind in lag behind their commands [m], (M,)."""
         return self.lag * np.maximum(-self._speed, 0.0)
 
     def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
-        """Update the fit from l [m], T [N] and the length command of the same time [m], (M,) each.
+        """Update the fit.
 
-        `dt` [s] is the time since the previous call.
+        Args:
+            length: l [m], (M,).
+            tension: T [N], (M,).
+            command: Length command at the time of l and T [m], (M,).
+            dt: Time since the previous call [s].
         """
-        # `length` is a median of three messages and therefore one message old. Hence the time since
-        # the last length that was used ends at the previous call, not at this one.
+        # `length` is a median of three messages, so it belongs to the time of the previous call.
+        # The time between two lengths therefore counts each `dt` one call later.
         self._since, self._last = self._since + self._last, dt
         if self._length is not None and self._since < SPAN:
             return

@@ -146,7 +146,7 @@ class Arm(Shell):
 
         Args:
             prefix: Prefix of the topic names, such as `sim/`. Motors of a ros2_control robot are
-                published instead of `muscle_states` only if it is empty.
+                published instead of `muscle_states` only if the prefix is empty.
             joint_sensors: Whether to publish `joint_states`.
             description: Whether to publish `robot_description`.
         """

@@ -177,9 +177,9 @@ def _motors(robot: Robot, options: Namespace) -> MotorInterface:
 
 
 def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
-    """Return the motion test of the muscles that the options name, or of all.
+    """Return the motion test of the muscles that the options name, or of all muscles.
 
-    It is a `Winding`, or a `Positioning` for modules that follow positions.
+    The test is a `Winding`, or a `Positioning` for modules that follow positions.
 
     Raises:
         MusculoskeletalError: If the options name an unknown muscle, or a tension that is too low.
@@ -253,8 +253,8 @@ def _parse(arguments: list[str]) -> Namespace:
     )
     add('--muscles', type=names, metavar='NAME,…', help='with --move: wind only these muscles in')
     text = (
-        'with --move: highest commanded tension [N] (default: T_bias + 40 N; for K above '
-        '50 kN/m: T_bias + 0.8 mm times K; at most tension.max)'
+        'with --move: highest commanded tension [N] (default: T_bias + 40 N, or T_bias + 0.8 mm '
+        'times K for modules with a stiffness K above 50 kN/m; at most tension.max)'
     )
     add('--tension', type=positive, metavar='N', help=text)
     add('--wait', action='store_true', help='wait for a driver, and listen until it has no faults')

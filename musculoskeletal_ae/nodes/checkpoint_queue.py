@@ -19,7 +19,7 @@ LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical one has ha
 
 
 class CheckpointQueue:
-    """Handles one checkpoint at a time; of those that arrive meanwhile, only the newest is kept."""
+    """Handles one checkpoint at a time, then the newest of those that have arrived meanwhile."""
 
     def __init__(
         self,

@@ -135,8 +135,8 @@ class Estimator(Shell):
         self.core.calibrate_lengths(self.posture)
         self._publish_offsets()
         self._reset(request)
-        how = 'while the arm stands in zero_posture' if self.posture else 'while it moves gently'
-        return f'calibrating length offsets {how}; /diagnostics shows the progress'
+        doing = 'stands in zero_posture' if self.posture else 'moves gently'
+        return f'calibrating length offsets while the arm {doing}; /diagnostics shows the progress'
 
     def _isolate(self, muscles: set[int]) -> str:
         self.core.isolate(muscles)

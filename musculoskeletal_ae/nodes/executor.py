@@ -77,7 +77,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait until a callback is ready, then run all ready callbacks.
 
-        The wait ends after `timeout_sec` [s] and after FULL_ROUND_PERIOD, whichever is shorter.
+        The wait lasts at most `timeout_sec` [s], and at most FULL_ROUND_PERIOD.
         """
         if self._wait_set is None:
             self._build_wait_set()

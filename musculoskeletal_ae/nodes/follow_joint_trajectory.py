@@ -18,7 +18,7 @@ class LateServer(ActionServer):
     """An action server that runs no task while a goal is active.
 
     rclpy's server runs `execute_callback` from the start of a goal to its end. This server starts a
-    goal without a callback; a later call of `notify_execute` with one ends the goal.
+    goal without a callback; a later call of `notify_execute` with a callback ends the goal.
     """
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:

@@ -209,8 +209,8 @@ def check_names(names: Iterable[str], node: str = '') -> None:
         node: Node or executable to which the parameters are passed; '' for all nodes, as in a file.
 
     Raises:
-        MusculoskeletalError: If no node has a parameter of this name, or if a single node has one
-            and `node` is another.
+        MusculoskeletalError: If no node has a parameter of this name, or if only one node has, and
+            that is not `node`.
     """
     own = COMBINED.get(node, (node,) if node else ())
     every = [*OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]

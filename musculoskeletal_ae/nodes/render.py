@@ -41,7 +41,7 @@ def _render(options: Namespace, arguments: list[str]) -> int:
         spinner.spin_until(lambda: topics[0] in drawn, options.timeout)
     if not drawn:
         problem = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
-        remedy = 'check that the node runs, and state its namespace (--ros-args -r __ns:=/NAME)'
+        remedy = 'check that the arm runs, and state its namespace (--ros-args -r __ns:=/NAME)'
         raise MusculoskeletalError(f'{problem}; {remedy}')
     topic = topics[0] if topics[0] in drawn else topics[-1]
     save_picture(drawn[topic], options.out)
@@ -60,7 +60,7 @@ def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
     add = parser.add_argument
-    topic_help = f'MarkerArray to draw (default: {BODY}, or {ESTIMATE} if it has no publisher)'
+    topic_help = f'MarkerArray to draw (default: {BODY} if it is published, else {ESTIMATE})'
     add('--topic', help=topic_help)
     add(
         '--timeout',

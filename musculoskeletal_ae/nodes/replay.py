@@ -57,7 +57,7 @@ class Replay(Node):
     """Publishes recorded messages, as serialized bytes, at their recorded times."""
 
     def __init__(self, bag: Bag, names: dict[str, str], options: Namespace) -> None:
-        """Advertise the topics; `names` maps each recorded topic to the one to publish."""
+        """Advertise the topics; `names` maps a recorded topic to the topic that is published."""
         super().__init__('replay')
         self._bag, self._names = bag, names
         self._start, self._stop = window(bag, options.start, options.duration)
@@ -75,7 +75,7 @@ class Replay(Node):
         # Times of the next /clock message, service round and report on the steady clock [s].
         self._next_tick = self._next_service = self._next_report = 0.0
         self._sought: int | None = None  # recorded time to seek to [ns]
-        description = 'position in the bag; set it to seek [s]'
+        description = 'position in the bag [s]; set this parameter to seek'
         descriptor = ParameterDescriptor(description=description)
         end = self._before + self.length
         legal = FloatingPointRange(from_value=self._before, to_value=end)
@@ -212,7 +212,8 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     names = select(bag, options.topics, options.from_namespace, options.keep_names, motors)
     if options.loop and not options.clock:
         problem = (
-            'nodes do not notice that time jumps back; add --clock, and set use_sim_time in them'
+            'nodes do not notice that time jumps back; add --clock, and set use_sim_time in '
+            'the nodes'
         )
         print(f'warning: --loop: {problem}', file=sys.stderr)
     with STOP.reacting(Reaction.REMEMBER):
@@ -241,14 +242,15 @@ def parse(arguments: list[str]) -> Namespace:
     add('--check', action='store_true', help=check)
     add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
     topics = (
-        f'{DEFAULT}: topics of hardware, vision, user and controller; {ALL}: also those that '
+        f'{DEFAULT}: topics of hardware, vision, user and controller; {ALL}: also the topics that '
         'nodes compute; or names of topics, separated by commas'
     )
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
     parser.add_motors()
     add('--keep-names', action='store_true', help='keep the recorded namespace')
-    add('--from-namespace', metavar='NS', help='arm to play, if the bag has several arms')
-    rate = 'multiple of the recorded speed; needs --clock'
+    arm = 'namespace of the arm to play, if the bag has several arms'
+    add('--from-namespace', metavar='NS', help=arm)
+    rate = 'playback speed as a multiple of the recorded speed; needs --clock'
     add('--rate', type=number(1e-3, 1e3), default=1.0, help=rate)
     add('--clock', action='store_true', help='publish the recorded time on /clock')
     add('--loop', action='store_true', help='start again at the end')

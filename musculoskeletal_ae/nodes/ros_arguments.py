@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS arguments on the command line: the parameters that they set, and the errors of rclpy."""
+"""ROS arguments on the command line: the names of parameters in them, and rclpy's errors."""
 
 import os
 from itertools import pairwise

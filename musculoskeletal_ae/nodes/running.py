@@ -106,8 +106,8 @@ def _run(kinds: list[Any]) -> None:
 def spin(executor: Executor, node: Any) -> None:
     """Spin until the context is shut down, or a callback raises ExternalShutdownException.
 
-    Each node counts the exceptions of its own callbacks. `node` counts those that rclpy raises
-    outside callbacks, for example for a message that cannot be deserialized.
+    Each node counts the exceptions of its own callbacks. `node` also counts the exceptions that
+    rclpy raises outside callbacks, for example for a message that cannot be deserialized.
     """
     while rclpy.ok():
         try:

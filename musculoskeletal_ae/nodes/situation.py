@@ -112,7 +112,10 @@ class Situation:
         self._other_networks: dict[str, tuple[str, int]] = {}
 
     def tick(self) -> None:
-        """Forget nodes that have ended; call this about once a second, to recognize pauses."""
+        """Forget nodes that have ended.
+
+        Call this about once a second, because longer intervals count as pauses of this process.
+        """
         self._awake.tick(self._clock())
         for name, node in list(self._nodes.items()):
             if not _is_needed(name) and self._now - node.heard_at > FORGET_TIME:
@@ -258,7 +261,7 @@ class Situation:
         ]
 
     def silent_nodes(self) -> dict[str, float]:
-        """Return the time since the last report of each needed node that has become silent [s]."""
+        """Return the time [s] since the last report of each needed node that is silent, by name."""
         now = self._now
         return {
             name: now - node.heard_at

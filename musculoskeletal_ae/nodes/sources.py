@@ -74,8 +74,8 @@ class Authorship:
 
     Attributes:
         intruders: The publishing nodes if there are several, as `/a and /b`; else ''.
-        is_certain: Whether the graph knows the nodes of all publishers. Until then, latched
-            messages are rejected and requested again later.
+        is_certain: Whether the graph knows the nodes of all publishers. If it does not, latched
+            messages are rejected, and requested again later.
     """
 
     def __init__(self) -> None:

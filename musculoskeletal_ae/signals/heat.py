@@ -50,7 +50,16 @@ CHANGED = 1.5  # factor by which a known constant must change to be reported
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:
-    """Return the state (6, ...) after dt [s] at a squared tension [N²] (...)."""
+    """Return the state of the filter after a time in which the tension is constant.
+
+    Args:
+        state: c₁ − c₂ [K], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C] at the beginning, (6, ...).
+        square: T² [N²], (...).
+        dt: The time [s].
+
+    Returns:
+        The same six quantities at the end, (6, ...).
+    """
     inner, outer, *logs, air = state
     kappa, winding, housing = np.exp(logs)
     share = winding / (housing * RATIO)  # C₁/C₂
@@ -105,7 +114,8 @@ class Heat:
             highest: The temperature limit of the windings [°C].
 
         Returns:
-            The tensions [N] that can be held for HELD, and those for MOMENT, (M,) each.
+            The tensions [N] that can be held for HELD, and the tensions [N] that can be held for
+            MOMENT, (M,) each.
         """
         if highest in self._limits:
             return self._limits[highest]

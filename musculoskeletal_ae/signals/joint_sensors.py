@@ -35,9 +35,10 @@ BETTER = 0.8
 MOST_SAMPLES = 600  # largest number of messages that are used, evenly distributed
 LEAST_SAMPLES = 20  # smallest number of messages by which sensors are judged
 STUCK_TIME = 5.0  # shortest time for which a stuck sensor repeats its reading [s]
-#: A repeated reading is stuck if the lengths show that the joint moves by more than this [rad],
+#: motion of a joint, according to the lengths, above which a repeated reading is stuck [rad]
 STUCK_MOTION = 0.2
-#: or that the joint is further from the reading than this [rad].
+#: distance of a joint from its reading, according to the lengths, above which a repeated reading is
+#: stuck [rad]
 STUCK_OFFSET = 0.5
 STUCK_EXPLAINED = 0.5  # fraction of the misfit of l that the motion or distance must explain
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
@@ -175,7 +176,7 @@ class _Lengths:
         self._segments = [np.flatnonzero(segments == each) for each in np.unique(segments)]
 
     def _model(self, theta: Array) -> Array:
-        """Return the lengths of the used muscles at θ (N, D) by the model [m]."""
+        """Return the lengths [m] that the model gives for the used muscles at θ (N, D)."""
         return self.robot.muscle_lengths(theta, self._tension)[:, self._used]
 
     def _centred(self, lengths: Array) -> Array:

@@ -70,7 +70,7 @@ LENGTH_JUMPED = 'length jumped'
 
 
 def reading_range(robot: Robot) -> tuple[Array, Array]:
-    """Return the lowest and the highest plausible reading T_read of every muscle [N], (M,) each."""
+    """Return the lowest and the highest plausible T_read [N] of every muscle, (M,) each."""
     most, low, high = robot.description.tension.max, LIMITS.lowest_tension, LIMITS.highest_tension
     if robot.tension_source.is_current:
         low, high = LIMITS.lowest_current, LIMITS.highest_current
@@ -116,7 +116,8 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
     Joints with NaN are ignored.
 
     Raises:
-        MessageError: If a joint does; the text names the joint, its angle and its limits.
+        MessageError: If a joint exceeds its range by more; the text names the joint, its angle and
+            its limits.
     """
     share = share_outside(robot, theta)
     if not (share > outside).any():

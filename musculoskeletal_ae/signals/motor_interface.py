@@ -117,8 +117,8 @@ class MotorInterface:
         Messages of muscle_states are returned unchanged.
 
         Raises:
-            MessageError: If a JointState has no stamp or the stamp of an earlier one, if its arrays
-                have different lengths, or if a motor is missing or named twice.
+            MessageError: If a JointState has no stamp or the stamp of an earlier message, if its
+                arrays have different lengths, or if a motor is missing or named twice.
         """
         if not self.is_ros2_control:
             return message
@@ -183,7 +183,7 @@ def _refused(name: str, problem: str) -> MusculoskeletalError:
 
 
 def _each(name: str, values: Sequence[float], count: int) -> Array:
-    """Return one value for each muscle, (M,)."""
+    """Return `values` as one value for each muscle, (M,)."""
     if len(values) not in (1, count):
         raise _refused(name, f'got {len(values)} values; expected 1, or {count} for all muscles')
     each: Array = np.full(count, values[0]) if len(values) == 1 else np.array(values)
