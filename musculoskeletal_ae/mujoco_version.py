@@ -7,7 +7,7 @@ import mujoco
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-#: First supported version, and first unsupported one after it; setup.cfg has the same range.
+#: First supported version, and the first later version that is not; setup.cfg has the same range.
 #: MuJoCo 3.9 lacks functions that the emulator uses. MuJoCo 4.0 routes a tendon differently if its
 #: side site lies on the axis of a cylinder.
 RANGE = (3, 10), (4,)

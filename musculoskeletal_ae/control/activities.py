@@ -19,8 +19,8 @@ class Inputs(NamedTuple):
     sample: MuscleSample  # the newest muscle states
     pull: Pull
     theta: Array  # the estimated posture [rad], (D,)
-    length: Array  # last length command, or one that keeps the present tensions [m], (M,)
-    tension: Array  # last tension command, or one that keeps the present tensions [N], (M,)
+    length: Array  # last length command, or a command that keeps the present tensions [m], (M,)
+    tension: Array  # last tension command, or a command that keeps the present tensions [N], (M,)
     limit: Array  # highest tension that may be planned [N], (M,)
     dt: float  # time since the last command [s]
 

@@ -19,7 +19,7 @@ DURATION = 1.5  # duration of a step [s]
 REST = 0.25  # duration of the rest after a step [s]
 REACH = 0.7  # largest change of each joint in a step [rad]; for prismatic joints times RACK [m]
 INSIDE = 0.1  # smallest distance of goals from the joint limits, as a fraction of the joint range
-GOALS = 20  # number of random goals, of which the first holdable one is used
+GOALS = 20  # number of random goals among which a holdable goal is sought
 SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limit
 
 

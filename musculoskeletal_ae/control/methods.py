@@ -35,9 +35,10 @@ from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_t
 # programme would change the tension by well under a newton.
 SOLVES = 2
 
-# Constants of `stiffness`
-# Candidates for the margin of T_low above T_bias [N]; the largest feasible one is used. An external
-# force can reduce a muscle's tension by this margin before the muscle becomes slack.
+# The following constants are those of the method `stiffness`.
+
+# Candidates for the margin of T_low above T_bias [N]; the largest feasible margin is used. An
+# external force can reduce a muscle's tension by this margin before the muscle becomes slack.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6  # largest number of iterations of Gauss–Newton and of Frank–Wolfe
 # Weight of the least tension relative to the stiffness. A reachable stiffness is missed by about

@@ -24,7 +24,7 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times RACK [m].
-#: The estimate of an arm that is held against a joint stop exceeds the limit by less.
+#: The estimate of an arm that is held against a joint stop exceeds the limit by less than this.
 TOLERANCE = 0.01
 SAME = 1e-6  # relative difference below which two poses count as equal
 

@@ -9,7 +9,7 @@ from musculoskeletal_ae.parameters import PRESET, settable
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
-BY_TENSION = ('tension', 'float')  # methods that command tensions; the others command lengths
+BY_TENSION = ('tension', 'float')  # methods that command tensions; all others command lengths
 MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/rad]
 
 

@@ -28,8 +28,8 @@ OWN_PAUSE = 0.3  # longest time between two steps that counts as age [s]
 SLOWEST = 0.05  # smallest pace of the messages' clock that is compensated
 PACE_SPAN = 1.0  # time constant of the average pace of the messages' clock [s]
 OVERHEATED = 20.0  # excess over temperature_limit at which the arm stops [°C]
-#: ratio of a tension to tension.limit above which the arm stops after OVERLOAD_TIME; until then,
-#: the limiter pays out only that muscle
+#: ratio of a tension to tension.limit above which the arm stops after OVERLOAD_TIME; during this
+#: time, the limiter pays out the muscle
 OVERLOAD = 1.1
 OVERLOAD_TIME = 0.2  # time after which an overload stops the arm [s]
 
@@ -159,8 +159,8 @@ class HeatLimit:
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
         """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
-        # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, which its
-        # module is commanded.
+        # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because the
+        # module is commanded to exert T_bias.
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest[1], bias)
         tension = np.where(np.isnan(tension), sample.model_tension, tension)

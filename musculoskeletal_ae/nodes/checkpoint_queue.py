@@ -15,7 +15,7 @@ CANDIDATES = 'mae_checkpoint'  # topic of the networks that the learner proposes
 ACCEPTED = 'accepted_checkpoint'  # topic of the networks that the estimator has accepted
 #: Time between steps [s]. A step takes a few milliseconds, at most a quarter of this time.
 STEP_PERIOD = 0.02
-LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical one has half a MB
+LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical checkpoint has half a MB
 
 
 class CheckpointQueue:

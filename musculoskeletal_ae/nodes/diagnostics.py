@@ -30,7 +30,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._ignored_before = Counter[str]()
         self.status_name = f'{node.get_fully_qualified_name()}: state'
-        #: distinguishes this node from another one of the same name
+        #: random text that distinguishes this node from another node of the same name
         self.identity = secrets.token_hex(8)
 
     def tell(self, report: Report, rates: Mapping[str, float]) -> None:

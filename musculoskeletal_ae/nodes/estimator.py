@@ -54,8 +54,8 @@ class Estimator(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
         self.core = Core(self.robot, self.parameter('preset'))
-        # After a restart of this node, the learner's first network tells which muscles are
-        # isolated. Later networks must not change that, hence `keep_isolated`.
+        # After a restart of this node, the learner's first network determines which muscles are
+        # isolated. `keep_isolated` ensures that later networks do not change that.
         self.candidates = Candidates(self, self._use, self.core.keep_isolated)
         self._advertise()
         self.sources.watch(*OWN_TOPICS)

@@ -14,7 +14,7 @@ from musculoskeletal_ae.report import Report
 if TYPE_CHECKING:
     from musculoskeletal_ae.nodes.shell import Shell
 
-#: needed topics that are published continually, so that silence is an error; with its remedy
+#: topics that are published continually, so that silence is an error, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 SILENT_TOPIC = 'silent topic'  # key of a value in reports
 SILENCE = 1.0  # time without a usable message after which a stream is silent [s]

@@ -194,7 +194,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
     },
 }
 
-#: executables that run several nodes in one process, with these nodes
+#: executables that run several nodes in one process, and the names of these nodes
 COMBINED = {'combined': ('estimator', 'controller')}
 
 #: parameters that rclpy declares for every node

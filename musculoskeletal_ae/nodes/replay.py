@@ -85,7 +85,7 @@ class Replay(Node):
         self._position_publisher = self.create_publisher(
             Float64MultiArray, 'replay/position', RELIABLE
         )
-        reception = Reception(self.get_logger().warning)  # stays empty: this node only publishes
+        reception = Reception(self.get_logger().warning)  # stays empty: no topic is subscribed to
         self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())

@@ -108,7 +108,8 @@ class Situation:
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
-        #: version of a node's other network and the number of reports that name it, by node
+        #: version of the network that a node uses instead of the accepted network, and the number
+        #: of reports that name this version, by node
         self._other_networks: dict[str, tuple[str, int]] = {}
 
     def tick(self) -> None:

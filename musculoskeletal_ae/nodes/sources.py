@@ -50,7 +50,7 @@ SEVERAL = 'several publishers'  # rejection reason
 
 LOOK_PERIOD = 0.1  # time between checks of the graph [s]
 LOOKS = 20  # number of recent checks over which decreases of the sequence number are counted
-TURNS = 3  # number of these decreases that proves two publishers of one name
+TURNS = 3  # number of decreases within LOOKS checks that proves two publishers of one name
 LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
 NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
 TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]

@@ -321,7 +321,8 @@ class View(Node):
 
         def answered(answer: Any) -> None:
             if not quiet:
-                # SetParameters responds with a list of one result, other services with the result.
+                # The response of SetParameters has a list with one result; the response of every
+                # other service is itself the result.
                 result = [*getattr(answer, 'results', ()), answer][0]
                 good = getattr(result, 'success', getattr(result, 'successful', False))
                 why = getattr(result, 'message', getattr(result, 'reason', '')) or 'done'

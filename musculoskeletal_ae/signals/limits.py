@@ -36,8 +36,8 @@ class Limits(NamedTuple):
     lowest_temperature: float = -40.0  # lowest temperature of a muscle module [°C]
     highest_temperature: float = 200.0  # highest temperature of a muscle module [°C]
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
-    # time dt since the last accepted one. The first temperature is accepted once further readings
-    # have agreed with it to within `temperature_step` for `glitch`.
+    # time dt since the last accepted temperature. The first temperature is accepted after later
+    # readings have differed from it by at most `temperature_step` for the time `glitch`.
     temperature_step: float = 5.0  # constant part of the largest change of a temperature [°C]
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
     #: largest excess of a length over its range within the joint limits [m]; lengths exceed this

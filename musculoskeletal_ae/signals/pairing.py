@@ -49,7 +49,8 @@ class Pairing(Generic[Message]):
         # the pending muscle message, the first θ after it, and the latest θ of all.
         self._last = self._next = self._latest = np.full((2, 1), np.nan)
         self._came = -math.inf  # time of the latest message with θ [s]
-        self._pending: tuple[float, Message] | None = None  # its time [s], and the message
+        #: time [s] and content of the pending muscle message
+        self._pending: tuple[float, Message] | None = None
         self._before: float | None = None  # time of the muscle message before the pending one [s]
 
     def joints(self, time: float, theta: Array) -> None:
