@@ -52,7 +52,7 @@ class _Document(Struct):
 
 
 def offered_qos(latched: bool, reliable: bool = True) -> Qos:
-    """Return the QoS profile that a publisher offers."""
+    """Return the QoS profile of a publisher whose topic is latched or not, and reliable or not."""
     return Qos(
         history=QosHistory.KEEP_LAST,
         depth=1 if latched else 10,

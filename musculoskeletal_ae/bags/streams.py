@@ -111,7 +111,7 @@ class _Stream:
         self.times.append(came)
 
     def series(self) -> Series:
-        """Return all values."""
+        """Return the times and values of all messages."""
         return Series(np.array(self.times), np.array(self.values).reshape(-1, *self.shape))
 
 
@@ -175,8 +175,8 @@ def read_streams(
 
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
     implausible messages. Lengths are corrected by the length offsets that `muscle_length_zeros` had
-    published at that time. Its first offsets, if known, also correct the earlier lengths. Messages
-    received while offsets were unknown are rejected. For isolated muscles, values that are not
+    published at that time. The first offsets on this topic, if known, also correct earlier lengths.
+    Messages received while offsets were unknown are rejected. For isolated muscles, values that are not
     finite become 0, and temperatures NaN.
 
     Args:

@@ -241,7 +241,7 @@ class Listening:
         return False
 
     def _of_source(self, fault: str) -> str:
-        """Return `fault`, or the fault of motor currents for it if the driver reports currents."""
+        """Return the name of a fault; if the driver reports currents, replace 'tension' in it."""
         if not self._robot.tension_source.is_current:
             return fault
         return fault.replace('tension', 'current')
@@ -349,7 +349,8 @@ class Listening:
             tension: T [N], (N, M).
 
         Returns:
-            The sum over muscles of the misfit [m] that remains after the verdict's explanations.
+            The sum over muscles of the misfit [m] that remains if columns are exchanged or signs of
+            l are reversed.
         """
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)

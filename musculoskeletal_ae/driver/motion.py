@@ -62,7 +62,7 @@ class MotionTest(ABC):
         self._run = self._sequence()
 
     def step(self, states: Array, now: float, theta: Array | None = None) -> Array | None:
-        """Take the newest readings; return l_target [m] (M,), or None.
+        """Take the newest readings; return l_target [m] (M,), or None for no command.
 
         Args:
             states: l [m], T [N] and temperature [°C], (3, M).

@@ -178,7 +178,8 @@ class Winding(MotionTest):
         before = self._mean()
         noise = max(self._swing[m], self._noise()[m])
         answer = self._response[m] + 2.0 * noise
-        # A stiff arm responds before the next message, so a single reading must show the response.
+        # On a stiff arm, the tension rises before the next message and does not rise further. The
+        # latency is therefore only measured if this single rise is clear of the noise.
         hidden = answer + 3.0 * noise > level - before.demand[m]
         further = (level - self._bias[m]) / self._robot.stiffness[m]
         self._target[m] = before.length[m] - further
@@ -290,7 +291,7 @@ class Winding(MotionTest):
         return None
 
     def _ask_outwards(self, m: int, home: _Reading, pulled: Array, wound: Array) -> Wait:
-        """Find out why a muscle did not respond.
+        """Find out why a muscle did not respond, and record the fault.
 
         Args:
             m: The muscle.

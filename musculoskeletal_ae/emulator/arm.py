@@ -87,8 +87,8 @@ def make_handle(parts: Parts) -> Handle:
 def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
     """Advance joints and motors of `Parts` by one STEP; write generalised torques to joint.torque.
 
-    `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION. `acceleration` is q̈ of the rigid-body
-    dynamics, (J−1,).
+    `arm` is a handle to the `Parts`, and `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
+    `acceleration` is q̈ of the rigid-body dynamics, (J−1,).
     """
     routes, placed, body, constants, muscle, joint, command, wrench = arm.held
     for i in range(joint.q.shape[0]):
@@ -153,7 +153,7 @@ class EmulatedArm(modules.Arm):
     def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
         """Build an individual of a robot, at rest with its modules in the safe state.
 
-        `seed` selects the individual and seeds its sensor noise.
+        `seed` selects the individual, unless `individual` is given, and seeds the sensor noise.
         """
         self.individual = individual or Individual(robot, seed)
         super().__init__(robot, seed, self.individual.length_bias)
@@ -184,7 +184,7 @@ class EmulatedArm(modules.Arm):
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
-        """Exclude the handle, so that a copy makes one to its own arrays."""
+        """Return the state without the handle, because a copy needs a handle to its own arrays."""
         return {**self.__dict__, '_handle': None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -234,8 +234,9 @@ class EmulatedArm(modules.Arm):
 
             q̈ = A θ̈ + Ȧ θ̇,   θ̈ = (Aᵀ M A)⁻¹ Aᵀ (τ − h − M Ȧ θ̇)
 
-        M includes the armature. If a coupling is nonlinear, q̈ is corrected so that all couplings
-        hold exactly at the end of the step.
+        A = ∂q/∂θ, M is the inertia with the armature, and h the torque of weight and velocity. If a
+        coupling is nonlinear, q̈ is corrected so that all couplings hold exactly at the end of the
+        step.
         """
         model, data, joint, kin = self._model, self._data, self._joint, self.robot.kinematics
         theta, gear = self.theta, kin.tree.transmission(self.theta)

@@ -91,7 +91,10 @@ class ForeignBody:
         )
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
-        """Return l [m] without friction, hysteresis, give or sensor errors, θ (N, D), T (N, M)."""
+        """Return l [m] (N, M) for θ (N, D) and T (N, M).
+
+        Friction, hysteresis, give and sensor errors are not included.
+        """
         relative = self.absolute_lengths(theta) - self.length_at_zero
         return relative - self.elastic.elongation(tension)
 
@@ -231,7 +234,7 @@ class ForeignArm(Arm):
         file: Path | None = None,
         deviates: bool = False,
     ) -> None:
-        """Build an individual at rest, with its modules in the safe state and calibrated effects.
+        """Build an individual at rest, with its modules in the safe state.
 
         Args:
             robot: The robot to emulate.

@@ -64,7 +64,7 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
 
 
 def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
-    """Return the links and joints of a robot with deviations, and the body of each joint."""
+    """Return an MjSpec of a robot's links and joints with deviations, and each joint's body."""
     kin, spec = robot.kinematics, mujoco.MjSpec()
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
@@ -148,7 +148,10 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
 
 
 def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
-    """Add the tendons: route points with deviations, described wrap objects, and bones' heads."""
+    """Add the tendons: route points with deviations, described wrap objects, and heads of bones.
+
+    `again` holds how often the deviations of each muscle's route points are redrawn, (M,).
+    """
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.tree.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
     bellies = _bellies(robot)
@@ -196,7 +199,7 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
 
 
 def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
-    """Return the muscle, centre and direction of every section of a route, joints at mid-range."""
+    """Return (muscle, obstacle) for every section of every route, with joints at mid-range."""
     kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
     poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
@@ -221,7 +224,10 @@ def _obstacle(
     kink: float,
     cylinder: bool,
 ) -> tuple[int, Array, Array, float]:
-    """Return the object that bends a tendon between two ends, with its radius [m]; 0 if none.
+    """Return joint, centre, axis and radius [m] of the object that bends a tendon between two ends.
+
+    The radius is 0 if there is no such object.
+
 
     Candidates are the heads of bones at joints between the ends, and the bellies of other muscles.
     The object lengthens the tendon by `kink` [m] in at least one posture, or by as much as
@@ -361,7 +367,7 @@ def from_file(robot: Robot, file: Path) -> Any:
 
 
 def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
-    """Return the pose of the end effector in the frame of each link that does not move against it.
+    """Return the end effector's pose in the frame of each link that is rigidly connected to it.
 
     The first link is the end effector itself; the links that carry it come next.
     """

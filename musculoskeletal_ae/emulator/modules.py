@@ -339,7 +339,7 @@ class Arm(ABC):
         self._wrench[:] = wrench
 
     def set_length_offset(self, offset: Array | Sequence[float]) -> None:
-        """Set the length sensors' offsets [m], as after re-wiring: one for all or one for each.
+        """Set the offsets of the length sensors [m]: one for all muscles, or one for each.
 
         Raises:
             MusculoskeletalError: If the number of offsets is neither 1 nor M; nothing changes then.

@@ -84,7 +84,7 @@ class Springs:
         return self._read(self.table, tension)
 
     def compliance(self, _absolute: Array, tension: Array) -> Array:
-        """Return ∂x/∂T [m/N], (..., M)."""
+        """Return the derivative of `elongation` at T [N] (..., M), [m/N] (..., M)."""
         slopes = [np.gradient(x, t) for x, t in zip(self.table.T, self.tension.T)]
         return self._read(np.transpose(slopes), tension)
 
@@ -101,7 +101,7 @@ class Springs:
 #:     full_scale      of the load cell [N], (M,)
 #:     layer_start     l at which the second layer on the spool begins [m], (M,)
 #:     phase           of the spool's eccentricity [rad], (M,)
-#:     ridge, side     l_abs at the ridge [m], and the side (±1) on which the tendon is caught, (M,)
+#:     ridge, side     l_abs at the ridge [m], and the side of it (±1) on which slip_over acts, (M,)
 Tendons = namedtuple(
     'Tendons',
     'length_at_zero table spacing late friction full_scale layer_start phase ridge side '
@@ -139,7 +139,7 @@ def make_tendons(
 
     Args:
         robot: The robot.
-        springs: The laws of its series elastic elements.
+        springs: The laws of the series elastic elements.
         at_zero: Lengths of the routes at θ = 0 [m], (M,).
         span: Lengths of the routes in N postures, relative to those at θ = 0 [m], (N, M).
         bend: Bends of the tendons at mid-range [rad], (M,).
@@ -180,7 +180,7 @@ def spooled(tendons: Tendons, m: int, length: float) -> float:
 
 @njit(cache=True)
 def load_cell(tendons: Tendons, m: int, tension: float, temperature: float) -> float:
-    """Return the tension sensor's reading of T [N]."""
+    """Return the tension sensor's reading [N] of T [N] at a temperature [°C]."""
     full = tendons.full_scale[m]
     share = min(1.0, tension / full)
     off = tendons.tension_zero[m] + tendons.tension_drift[m] * (temperature - AMBIENT)

@@ -101,7 +101,7 @@ def fill(row: Array, values: Vector | Array) -> None:
 
 @njit(cache=True)
 def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
-    """Compute all poses for q (J−1,)."""
+    """Compute all entries of `placed` at joint positions q (J−1,)."""
     tree, fixed = routes.tree, np.zeros((3, 3))
     for i in range(1, tree.parent.shape[0]):
         up = tree.parent[i]
@@ -137,7 +137,10 @@ def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
 
 @njit(cache=True)
 def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Array, Array]:
-    """Return absolute lengths [m] (N, M) and their Jacobian [m/rad] (N, M, J−1) for q (N, J−1)."""
+    """Return absolute lengths [m] (N, M) and their Jacobian [m/rad] (N, M, J−1) at q (N, J−1).
+
+    `placed` is a buffer for intermediate results.
+    """
     lengths = np.zeros((q.shape[0], placed.absolute.shape[0]))
     jacobian = np.zeros((*lengths.shape, q.shape[1]))
     for n in range(q.shape[0]):

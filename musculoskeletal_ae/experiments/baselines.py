@@ -25,7 +25,7 @@ STREAM_STRIDE = 10
 def baseline_errors(
     robot: Robot, rests: RestSamples, stream: Recording, held_out: Recording
 ) -> dict[str, dict[str, float]]:
-    """Return each estimator's error on the held-out motion before and after learning [rad].
+    """Return each estimator's error [rad] on the held-out motion, before and after learning.
 
     All start from the geometric model. The unweighted least squares estimate does not learn, so its
     two errors are equal.
@@ -95,14 +95,14 @@ class PolynomialFilter:
         self._coefficients = np.vstack([fit, np.zeros(robot.muscle_count)])
 
     def _monomials(self, theta: Array) -> Array:
-        """Return the monomials of θ (N, D), shape (N, K)."""
+        """Return the monomials (N, K) of θ (N, D)."""
         low, high = self._robot.lower, self._robot.upper
         x = (2.0 * theta - low - high) / (high - low)
         table = x[:, :, None] ** np.arange(self.DEGREE + 1)  # (N, D, DEGREE+1)
         return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Fit the mapping to samples θ (N, D), T (N, M), l (N, M); the prior is the present one."""
+        """Fit the mapping to samples θ (N, D), T (N, M) and l (N, M); see the class."""
         design = self._monomials(theta)
         target = without_elongation(self._robot, tension, length)
         for m in range(self._robot.muscle_count):
@@ -122,7 +122,7 @@ class PolynomialFilter:
         return predicted, coefficients.T @ (self._slopes @ monomials).T * scale
 
     def estimate(self, tension: Array, length: Array) -> Array:
-        """Return θ [rad] (N, D) for successive messages T [N] (N, M), l [m] (N, M)."""
+        """Return θ [rad] (N, D) for N successive messages with T [N] and l [m], (N, M) each."""
         robot = self._robot
         measured = without_elongation(robot, tension, length)
         noise = np.diag(np.maximum(self._noise, self.LEAST_NOISE) ** 2)
@@ -168,6 +168,6 @@ class TableSearch:
         self._lengths = cKDTree(without_elongation(self._robot, tension, length))
 
     def estimate(self, tension: Array, length: Array) -> Array:
-        """Return θ [rad] (N, D) for T [N] (N, M), l [m] (N, M)."""
+        """Return θ [rad] (N, D) for N messages with T [N] and l [m], (N, M) each."""
         row = self._lengths.query(without_elongation(self._robot, tension, length))[1]
         return self._theta[row]

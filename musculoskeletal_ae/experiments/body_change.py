@@ -110,11 +110,13 @@ def measure(study: Study, seed: int) -> Measured:
 def _changes(
     robot: Robot, name: str, origin: int, trained: Bools, curves: Mapping[str, Array]
 ) -> dict[str, Any]:
-    """Return the numbers of the curves (points, M) of one sweep [m], named `angle` or `tension`.
+    """Return the numbers of one sweep, whose name is 'angle' or 'tension'.
 
-    The change of a curve is its largest difference. "Relative" is the change of l − l(origin),
-    because the curves in the paper pass the origin. "All" refers to the range of the paper's
-    figure, the other numbers to the range of the training.
+    `curves` are the lengths 'before' and 'after' learning and those of the 'true' body [m],
+    (points, M) each. The change of a muscle is the largest difference between the curves before and
+    after learning. "Relative" is the change of l − l(origin), because the curves in the paper pass
+    the origin. "All" refers to the range of the paper's figure, the other numbers to the range of
+    the training.
     """
     change = curves['after'] - curves['before']
     relative = change - change[origin]
@@ -138,7 +140,7 @@ def _changes(
 
 
 def _by_muscle(robot: Robot, change: Array) -> dict[str, float]:
-    """Return the largest absolute change (points, M) [m] of each muscle [mm], by its name."""
+    """Return the largest absolute value [mm] of `change` [m] (points, M), by name of the muscle."""
     largest = 1e3 * np.abs(change).max(axis=0)
     return dict(zip(robot.muscles, largest.tolist(), strict=True))
 
@@ -232,7 +234,7 @@ def _panels(study: Study, rows: Rows, name: str, xlabel: str, title: str) -> Any
 
 
 def _line_style(study: Study, preset: str, when: str) -> dict[str, Any]:
-    """Return the style of a curve: colour by time, dashes by preset."""
+    """Return the style of a curve: its colour depends on `when`, its dashes on the preset."""
     if when == 'true':
         return {'color': plots.TRUE, 'lw': 1.0, 'ls': '-'}
     dashes = '-' if preset == study.preset else '--'

@@ -111,7 +111,10 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _errors(true: Array, estimated: Array) -> tuple[Array, Array]:
-    """Return the relative errors of the magnitudes and the errors of direction [deg], (N,)."""
+    """Return the relative errors of the sizes of N forces, and of their directions [deg], (N,).
+
+    `true` and `estimated` are the forces [N], (N, 3).
+    """
     sizes, estimated_sizes = np.linalg.norm(true, axis=1), np.linalg.norm(estimated, axis=1)
     cosine = (true * estimated).sum(axis=1) / np.maximum(sizes * estimated_sizes, 1e-9)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

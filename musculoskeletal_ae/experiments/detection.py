@@ -120,7 +120,10 @@ class DetectorOutput(NamedTuple):
 
 
 def run_detector(robot: Robot, mae: Mae, recording: Recording) -> DetectorOutput:
-    """Run estimator and detector over a recording as the node does, but without latching."""
+    """Return what estimator and detector report for each message of a recording.
+
+    They run as in the node, but continue after an anomaly.
+    """
     health, rows = HealthMonitor(robot, mae.preset), []
     health.use(mae)
     bone_tensions = end_tensions(mae, recording)

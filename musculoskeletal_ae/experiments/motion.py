@@ -147,7 +147,7 @@ def follow(
 
 
 def settling(loop: ClosedLoop, goal: Array) -> float:
-    """Return the time [s] from the target `goal` [rad] (D,) until the arm stays WITHIN of it."""
+    """Return the time [s] until the arm stays within a distance WITHIN of `goal` [rad] (D,)."""
     last = 0
     loop.target(goal)
     for n in range(round(SETTLING_TIME / SAMPLE_TIME)):

@@ -110,7 +110,7 @@ class ClosedLoop:
         return self.step()
 
     def go(self, theta: Array, duration: float) -> None:
-        """Move to θ [rad] (D,) within a time [s].
+        """Move to θ [rad] (D,) within `duration` [s].
 
         Raises:
             MusculoskeletalError: If the controller stopped on the way.
@@ -119,7 +119,7 @@ class ClosedLoop:
         self.check()
 
     def approach(self, theta: Array, duration: float) -> None:
-        """Move towards θ [rad] (D,) for a time [s]; a stop of the controller is not reported."""
+        """Move towards θ [rad] (D,) for `duration` [s]; do not report a stop of the controller."""
         self.target(theta)
         self.wait(duration)
 

@@ -67,7 +67,7 @@ def run(
 
 
 class _Schedule:
-    """The parts that may begin, and the results of those that have ended.
+    """The parts that may begin, and the results of the parts that have ended.
 
     Attributes:
         waiting: Parts that may begin, in this order.

@@ -115,8 +115,8 @@ class Study:
     def with_prefix(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return a preset's numbers under their keys in result.json.
 
-        Numbers of preset `paper` have its name as a prefix. If it is the preset of the run, they
-        are also returned without the prefix.
+        The keys of preset `paper` begin with its name. If `paper` is the preset of the run, its
+        numbers are also returned under keys without this prefix.
         """
         prefixed = dict[str, Any]()
         if preset == self.preset:

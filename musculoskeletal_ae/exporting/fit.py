@@ -91,7 +91,7 @@ class _Muscle:
         return SeriesElastic(*(value * f for value, f in zip(nominal, factors, strict=True)))
 
     def fitted(self, states: _States) -> tuple[Array, Array]:
-        """Return the parameters, and the errors that remain [m], (N,)."""
+        """Fit the parameters to states; return them, and the remaining errors of l [m], (N,)."""
 
         def residuals(parameters: Array) -> Array:
             length, _ = self._linearised(parameters, states)

@@ -60,7 +60,7 @@ class Report(NamedTuple):
     mjx: str  # text that says whether MJX can load the model
 
     def text(self, robot: Robot, offsets: Array) -> str:
-        """Return the report as a text."""
+        """Return the report as a text; `offsets` are the offsets of the controls [m], (M,)."""
         counts = f'{robot.joint_count} joints, {robot.muscle_count} muscles, {POSTURES} postures'
         units = f'{"":<28}{"[mm]":>10}{"[mm]":>12}{"[mm]":>8}{"[mm]":>9}{"[m]":>11}'
         head = f'{"muscle":<28}{"length":>10}{"moment arm":>12}{"of":>8}{"spring":>9}{"offset":>11}'

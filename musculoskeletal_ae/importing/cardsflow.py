@@ -109,7 +109,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
 
 
 def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
-    """Return the joint limits of a joint_limits.yaml; empty if there is no such file."""
+    """Return the limits of joints in a joint_limits.yaml, or {} if there is no such file."""
     if not os.path.lexists(file):
         return {}
     document, limits = read_yaml(file, refuse), dict[str, tuple[float, float]]()
@@ -130,7 +130,7 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
 def _measure(source: Source) -> None:
     """Set `source.lengths` to a function that computes the lengths of all straight routes.
 
-    CARDSflow also connects the points of such a route by straight lines.
+    CARDSflow, too, connects the points of a straight route by straight lines.
     """
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
@@ -172,7 +172,10 @@ def _endless(*ends: str | None) -> bool:
 def _read_urdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the links and joints of a URDF, read by pinocchio, and each link's centre of mass."""
+    """Return the links and joints of a URDF, read by pinocchio, and each link's centre of mass.
+
+    `limits_and_file` are limits that replace those of the URDF, and the name of their file.
+    """
     for joint in root.findall('joint'):
         limits, kind = joint.findall('limit'), joint.get('type')
         ends = [limit.get(end) for limit in limits for end in ('lower', 'upper')]
@@ -212,7 +215,10 @@ def _read_urdf(
 def _read_sdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the links and joints of an SDF with one model, and each link's centre of mass."""
+    """Return the links and joints of an SDF with one model, and each link's centre of mass.
+
+    `limits_and_file` are limits that replace those of the SDF, and the name of their file.
+    """
     model = root.find('.//model')
     if root.tag != 'sdf' or model is None:
         raise refuse(file, 'expected an <sdf> element with a <model>')

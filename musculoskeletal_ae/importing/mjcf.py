@@ -82,7 +82,7 @@ def open_mjcf(file: Path) -> Any:
 
 
 def resting_joints(model: Any) -> list[float]:
-    """Return the position of each joint of a model at which `import_robot` would hold the joint."""
+    """Return the position [rad] or [m] at which `import_robot` would hold each joint of a model."""
     reader = _Reader(model, '')
     source = reader.source
     source.couplings = resolved(source.couplings)
@@ -91,12 +91,12 @@ def resting_joints(model: Any) -> list[float]:
 
 
 def tie_rims(model: Any) -> list[tuple[int, int]]:
-    """Reduce the radius of each geom that has a site of a tendon that wraps around it on its rim.
+    """Reduce the radius of each geom on whose rim a site of a wrapping tendon lies.
 
-    The radius is reduced by a share 2·RIM.
+    The tendon of the site must wrap around the geom. The radius is reduced by a share 2·RIM.
 
     Returns:
-        Indices (tendon, geom) for each of these sites.
+        Indices (tendon, geom) for each site on a rim.
     """
     data, types, tied = mujoco.MjData(model), mujoco.mjtWrap, []
     mujoco.mj_kinematics(model, data)

@@ -251,7 +251,7 @@ def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
 def unique(
     kind: str, items: Iterable[tuple[str, Any]], legal: str = 'unique names: rename one'
 ) -> dict[str, Any]:
-    """Return elements by name.
+    """Return the elements in `items`, pairs (name, element), as a dictionary by name.
 
     Raises:
         ValueError: If a name occurs twice.
@@ -353,7 +353,7 @@ def cut(
 
 
 def _choose_end(source: Source) -> None:
-    """Choose the far end of the link `tip` as the end effector, and note the alternatives."""
+    """Choose the far end of the last link (`tip`) as the end effector; note the alternatives."""
     link = tip(source)
     leaves = [name for name in source.links if name not in source.above.values()]
     others = [name for each in leaves for name in (tip_name(each), each)]

@@ -165,7 +165,10 @@ class Actuation(ABC):
         """
 
     def fastest(self, rate_limit: float) -> Array:
-        """Return the lower of `rate_limit` [m/s] and the speed of each module [m/s], (M,)."""
+        """Return the rate limit of each length command [m/s], (M,).
+
+        This is `rate_limit` [m/s], or the speed of the module if it is lower.
+        """
         return np.minimum(rate_limit, self.speed)
 
     # -- limits ----------------------------------------------------------------------------------
@@ -173,7 +176,7 @@ class Actuation(ABC):
     @property
     @abstractmethod
     def largest_relief(self) -> float:
-        """Largest length by which rest feedback relieves a muscle [m]."""
+        """Largest length by which rest feedback pays out a muscle that is too tense [m]."""
 
     @abstractmethod
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
@@ -280,7 +283,7 @@ class StiffnessControl(Actuation):
         return length - (wanted - self._bias) / self._stiffness
 
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:  # noqa: ARG002
-        """Return the tensions themselves."""
+        """Return TENSION and `wanted`, because these modules follow tension commands."""
         return TENSION, wanted
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:
@@ -292,7 +295,7 @@ class StiffnessControl(Actuation):
         return self.demanded(length, command)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return where l is larger than l_target, (M,)."""
+        """Return a mask (M,) of the muscles whose l is larger than l_target."""
         pulling: Bools = length > command
         return pulling
 
@@ -358,7 +361,7 @@ class PositionControl(Actuation):
         return
 
     def tension_per_length(self, tension: Array) -> Array:
-        """Return the stiffness of the series elastic elements at T [N/m], (M,)."""
+        """Return the stiffness [N/m] (M,) of series elastic elements and tendons at T [N]."""
         at_zero = self._robot.routes.length_at_zero
         stiffness: Array = 1.0 / self._robot.series_elastic.compliance(at_zero, tension)
         return stiffness
@@ -369,7 +372,7 @@ class PositionControl(Actuation):
         return length + elongation(tension) - elongation(wanted)
 
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
-        """Return lengths that correct the fraction ADMITTANCE of T_wanted − T (admittance)."""
+        """Return LENGTH and the lengths that correct the fraction ADMITTANCE of T_wanted − T."""
         measured = np.maximum(tension, 0.0)
         goal = measured + ADMITTANCE * (wanted - measured)
         return LENGTH, self.length_for(length, measured, goal)

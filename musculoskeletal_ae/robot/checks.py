@@ -235,7 +235,7 @@ def arm_terms(robot: Robot, joint: int) -> ArmTerms:
 
 
 def required_stiffness(robot: Robot, required: float) -> str:
-    """Return the required eigenvalue [N·m/rad], and its equivalent for prismatic joints."""
+    """Return a text with the required eigenvalue [N·m/rad], and [N/m] for prismatic joints."""
     text = f'{required:.2g} N·m/rad'
     if robot.kinematics.slides.any():
         text += f' ({required / RACK**2:.0f} N/m for prismatic joints)'
@@ -259,7 +259,7 @@ def rounded_text(value: float, least: int = 1, largest: float | None = None) -> 
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
-    """Return the signs that `moment_arms.csv` declares, as (muscle, joint) → ±1.
+    """Return the signs (±1) that `moment_arms.csv` declares, by (muscle, joint).
 
     The result is empty if there is no such file.
 

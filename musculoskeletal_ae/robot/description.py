@@ -117,7 +117,7 @@ class TensionRange:
 
 
 def shown(values: Array) -> str:
-    """Return the common value of all muscles, or the range of their values."""
+    """Return a text with the common value of all muscles, or with the range of their values."""
     low, high = np.min(values), np.max(values)
     return f'{low:g}' if low == high else f'{low:g}–{high:g}'
 
@@ -249,7 +249,7 @@ def load_description(robot: str | Path) -> RobotDescription:
 
 
 def _with_muscle_name(problem: str, document: Any) -> str:
-    """Return a problem with the name of its muscle added, if it concerns a muscle with a name."""
+    """Return a problem, preceded by the name of the muscle if the problem concerns a muscle."""
     match = re.match(r'\$\.muscles\[(\d+)\]', problem)
     muscle = document['muscles'][int(match[1])] if match else None
     name = muscle.get('name') if isinstance(muscle, dict) else None

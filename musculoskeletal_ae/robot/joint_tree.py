@@ -76,7 +76,7 @@ def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
     """Return chained couplings as direct ones, whose masters are not coupled themselves.
 
     Raises:
-        ValueError: If a joint follows itself, or by a polynomial with too many terms.
+        ValueError: If a joint follows itself, or if a polynomial has too many terms.
     """
     result = {}
     for slave, coupling in couplings.items():
@@ -224,7 +224,7 @@ class JointTree:
         return polyval(theta[..., self.theta_index[1:]], terms)
 
     def transmission(self, theta: Array) -> Array:
-        """Return A = ∂q/∂θ (J−1, D), rows in the order of the tree, at θ (D,)."""
+        """Return A = ∂q/∂θ at θ (D,), with one row for each joint of the tree, (J−1, D)."""
         return self.ratios(theta)[:, None] * self.moved_by
 
     def of_theta(self, values: Array, theta: Array) -> Array:

@@ -64,7 +64,7 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
 
 
 def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
-    """Return the joint-space inertia M of all joints of the tree [kg·m² or kg], (J−1, J−1)."""
+    """Return the joint-space inertia [kg·m² or kg] (J−1, J−1) of the tree's joints at q."""
     # Add the lower triangle, which pinocchio does not fill.
     upper = np.triu(pin.crba(model, data, q))
     return upper + np.triu(upper, 1).T
@@ -121,7 +121,7 @@ class Kinematics:
         self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
-        """Return the joint of the tree that carries a link, and a link's point in its frame.
+        """Return the joint of the tree that carries a link, and a point of the link in its frame.
 
         Args:
             link: Name of the link.
@@ -134,7 +134,7 @@ class Kinematics:
         return joint, placement.act(xyz)
 
     def placement(self, link: str) -> tuple[int, pin.SE3]:
-        """Return the joint of the tree that carries a link, and the link's pose in that joint."""
+        """Return the joint of the tree that carries a link, and the link's pose in its frame."""
         return link_placement(self.model, link)
 
     def with_elasticity(self, elasticity: JointElasticity) -> Kinematics:
@@ -144,9 +144,9 @@ class Kinematics:
         return changed
 
     def holding_torque(self, theta: Array) -> Array:
-        """Return the torque that holds the arm against its weight and its springs.
+        """Return the torque that holds the arm at θ (..., D) against its weight and its springs.
 
-        g(θ) + K θ − b    [N·m], shape (..., D)
+        g(θ) + K θ − b    [N·m], (..., D)
         """
         weight = self.weight_torque(theta)
         if not self.elasticity.is_present:
@@ -154,20 +154,20 @@ class Kinematics:
         return weight + self.elasticity.holding_torque(theta)
 
     def weight_torque(self, theta: Array) -> Array:
-        """Return g(θ), the joint torque that holds the arm's own weight [N·m], (..., D)."""
+        """Return g(θ) [N·m] (..., D), the torque that holds the arm's weight at θ (..., D)."""
         if theta.ndim > 1:
             return np.stack([self.weight_torque(row) for row in theta])
         return self.tree.of_theta(self._gravity(theta), theta)
 
     def _gravity(self, theta: Array) -> Array:
-        """Return the torque of the weight on every joint of the tree [N·m], (J−1,), at θ (D,)."""
+        """Return the torque [N·m] (J−1,) of the tree's joints that holds the weight at θ (D,)."""
         q = self.tree.angles(theta)
         return np.array(pin.computeGeneralizedGravity(self.model, self.data, q))
 
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
         """Return the joint torque of a motion, including the torque of springs and dampers.
 
-        M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇    [N·m], shape (D,)
+        M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇    [N·m], (D,)
         """
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
         if tree.is_coupled:
@@ -181,7 +181,7 @@ class Kinematics:
         return result
 
     def holding_gradient(self, theta: Array) -> Array:
-        """Return ∂g/∂θ + K, the gradient of `holding_torque` [N·m/rad], shape (D, D), at θ (D,)."""
+        """Return ∂g/∂θ + K [N·m/rad] (D, D), the gradient of `holding_torque` at θ (D,)."""
         tree, q = self.tree, self.tree.angles(theta)
         gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, q)
         result = tree.of_both(gradient, theta)
@@ -200,7 +200,7 @@ class Kinematics:
         return np.diag(self.tree.of_both(inertia, theta))
 
     def end_effector_jacobian(self, theta: Array) -> Array:
-        """Return J (6, D) at the end effector's origin, in root-link axes.
+        """Return J (6, D) of the end effector's origin at θ (D,), in root-link axes.
 
         The first three rows are linear [m/rad], the others angular [rad/rad]. A wrench F at that
         point produces the joint torque Jᵀ F.
@@ -212,11 +212,11 @@ class Kinematics:
         return jacobian @ tree.transmission(theta) if tree.is_coupled else jacobian[:, tree.order]
 
     def link_pose(self, theta: Array, link: str) -> pin.SE3:
-        """Return the pose of a link in the root link's frame."""
+        """Return the pose of a link in the root link's frame at θ (D,)."""
         frame = self.model.getFrameId(link, pin.FrameType.BODY)
         pin.forwardKinematics(self.model, self.data, self.tree.angles(theta))
         return pin.updateFramePlacement(self.model, self.data, frame).copy()
 
     def end_effector_pose(self, theta: Array) -> pin.SE3:
-        """Return the pose of the end effector in the root link's frame."""
+        """Return the pose of the end effector in the root link's frame at θ (D,)."""
         return self.link_pose(theta, self._end_effector)

@@ -183,7 +183,7 @@ class MuscleFile(Strict, frozen=True):
     ] = ()
 
     def __post_init__(self) -> None:
-        """Check that names are unique."""
+        """Check that names are unique, and that no two keys exclude each other."""
         _check_unique('joints', self.joints)
         _check_unique('muscles', (muscle.name for muscle in self.muscles))
         _check_unique('end_effectors', self.end_effectors or ())

@@ -35,7 +35,7 @@ CHANGES = {
 
 
 def remedies(check: RobotCheck, fault: Finding) -> list[str]:
-    """Return remedies for a 'not_held' or 'not_stiff' fault, as texts with the resulting share."""
+    """Return texts on remedies for a 'not_held' or 'not_stiff' fault, with the resulting share."""
     kind = fault.kind.removeprefix('not_')
 
     @cache

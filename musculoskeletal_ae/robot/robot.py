@@ -96,7 +96,7 @@ class Robot:
         return [self.muscles.index(name) for name in names]
 
     def names(self, muscles: Iterable[int]) -> str:
-        """Return the names of muscles, indices in T and l, as text."""
+        """Return a text with the names of the muscles that have these indices in T and l."""
         return ', '.join(self.muscles[m] for m in muscles)
 
     def without(self, muscles: Iterable[int]) -> Robot:
@@ -127,7 +127,7 @@ class Robot:
         return changed
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
-        """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m], θ (..., D), T (..., M)."""
+        """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m] (..., M) for θ (..., D) and T (..., M)."""
         absolute = self.routes.absolute_lengths(theta)
         relative = absolute - self.routes.length_at_zero
         return relative - self.series_elastic.elongation(absolute, tension)
@@ -146,7 +146,7 @@ class Robot:
         return load
 
     def muscle_stiffness(self, theta: Array, tension: Array) -> Array:
-        """Return k(θ, T) [N/m] of MSC and elastic element in series, θ (..., D), T (..., M)."""
+        """Return the stiffness k(θ, T) [N/m] (..., M) of modules and elastic elements in series."""
         absolute = self.routes.absolute_lengths(theta)
         return muscle_stiffness(self.stiffness, self.series_elastic.compliance(absolute, tension))
 
@@ -156,7 +156,7 @@ class Robot:
         return ', '.join(f'{name} {value:.{digits}f} {unit.theta}' for name, value, unit in each)
 
     def random_postures(self, count: int, rng: np.random.Generator, margin: float = 0.0) -> Array:
-        """Return uniformly random θ [rad], shape (count, D).
+        """Return uniformly distributed random θ [rad], (count, D).
 
         Args:
             count: Number of postures.

@@ -179,7 +179,7 @@ class Routes:
         return np.array([self.muscle[own[0]] for own in self._branches])
 
     def points(self, theta: Array) -> Array:
-        """Return all route points in the root link's frame [m], shape (N, P, 3), θ (N, D)."""
+        """Return all route points in the root link's frame [m] (N, P, 3) at θ (N, D)."""
         return self.placed(self._kinematics.tree.joint_poses(theta))
 
     def placed(self, poses: JointPoses, point: Array | None = None) -> Array:
@@ -194,7 +194,7 @@ class Routes:
         return np.einsum('npij,pj->npi', rotation, point) + translation
 
     def _segments(self, theta: Array) -> tuple[Array, Array]:
-        """Return lengths of the segments and straight distances of their ends [m], both (N, S)."""
+        """Return the lengths of segments and the distances of their end points [m], (N, S) each."""
         poses = self._kinematics.tree.joint_poses(theta)
         points = self.placed(poses)
         straight = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
@@ -206,7 +206,7 @@ class Routes:
 
     @_in_chunks
     def absolute_lengths(self, theta: Array) -> Array:
-        """Return f_geo,abs(θ) [m], shape (..., M), for θ (..., D)."""
+        """Return f_geo,abs(θ) [m] (..., M) for θ (..., D)."""
         return self._segments(theta)[0] @ self._sum.T
 
     def moved(self, poses: JointPoses, point: Array) -> tuple[Array, Array]:
@@ -238,23 +238,23 @@ class Routes:
 
     @_in_chunks
     def detours(self, theta: Array) -> Array:
-        """Return the length that wrapping adds to each muscle [m], shape (..., M), θ (..., D)."""
+        """Return the length that wrapping adds to each muscle [m] (..., M) at θ (..., D)."""
         return self.wound(theta) @ self._sum[:, self.wrapping].T
 
     @_in_chunks
     def wound(self, theta: Array) -> Array:
-        """Return the length that wrapping around each object adds [m], shape (..., W)."""
+        """Return the length that wrapping around each object adds [m] (..., W) at θ (..., D)."""
         if self.objects is None:
             return np.zeros((len(theta), 0))
         return np.subtract(*self._segments(theta))[:, self.wrapping]
 
     def relative_lengths(self, theta: Array) -> Array:
-        """Return f_geo(θ) [m], which is zero at θ = 0, shape (..., M), for θ (..., D)."""
+        """Return f_geo(θ) [m] (..., M) for θ (..., D); it is zero at θ = 0."""
         return self.absolute_lengths(theta) - self.length_at_zero
 
     @_in_chunks
     def muscle_jacobian(self, theta: Array) -> Array:
-        """Return G(θ) [m/rad], shape (..., M, D), for θ (..., D)."""
+        """Return G(θ) [m/rad] (..., M, D) for θ (..., D)."""
         kin = self._kinematics
         poses = kin.tree.joint_poses(theta)
         points = self.placed(poses)

@@ -32,16 +32,16 @@ class SeriesElastic:
         return SeriesElastic(*(values[muscle] for values in vars(self).values()))
 
     def elongation(self, absolute_length: Array, tension: Array | float) -> Array:
-        """Return L_e(l_abs, T) [m]; l_abs [m] and T [N] of shape (..., M)."""
+        """Return L_e [m] (..., M) for l_abs [m] and T [N], (..., M) each."""
         tension = np.maximum(tension, 0.0)
         stretch = self.wire_stretch * absolute_length * tension
         return np.log1p(tension / self.force) / self.rate + stretch
 
     def compliance(self, absolute_length: Array, tension: Array) -> Array:
-        """Return ∂L_e/∂T [m/N], shape (..., M)."""
+        """Return ∂L_e/∂T [m/N] (..., M) for l_abs [m] and T [N], (..., M) each."""
         element = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
         return element + self.wire_stretch * absolute_length
 
     def length_slope(self, tension: Array) -> Array:
-        """Return ∂L_e/∂l_abs [m/m], shape (..., M)."""
+        """Return ∂L_e/∂l_abs [m/m] (..., M) for T [N] (..., M)."""
         return self.wire_stretch * np.maximum(tension, 0.0)

@@ -31,7 +31,7 @@ def muscle_stiffness(module: Array, compliance: Array) -> Array:
 def muscle_hessian(
     muscle_jacobian: Callable[[Array], Array], theta: Array, step: Array | float = 1e-5
 ) -> Array:
-    """Return ∂²l/∂θ² [m/rad²], (..., M, D, D), by central differences of G.
+    """Return ∂²l/∂θ² [m/rad²] (..., M, D, D), computed by central differences of G.
 
     Args:
         muscle_jacobian: Function of θ [rad] (..., D) that returns G [m/rad], (..., M, D).
@@ -45,7 +45,7 @@ def muscle_hessian(
 
 
 def joint_stiffness(jacobian: Array, hessian: Array, stiffness: Array, tension: Array) -> Array:
-    """Return K_θ [N·m/rad], (..., D, D).
+    """Return the joint stiffness K_θ [N·m/rad], (..., D, D).
 
     Args:
         jacobian: G [m/rad], (..., M, D).

@@ -44,8 +44,8 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
         seed: Random seed. The postures differ from the postures of a check with the same seed.
 
     Returns:
-        The change d [m] (P, 3), in the frames of the links, and the measure of `lacking` before
-        and after it.
+        The change d [m] (P, 3), in the frames of the links, and the result of `lacking` before and
+        after the change.
     """
     import cma
 
@@ -92,7 +92,10 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
 
 
 def moved(robot: Robot, change: Array) -> Robot:
-    """Return a robot with its via points moved by `change` [m] (P, 3), in the links' frames."""
+    """Return a copy of a robot in which via points are moved by `change` [m] (P, 3).
+
+    The displacements are in the frames of the links.
+    """
     shifts = iter(change)
     routes = [
         tuple(
@@ -125,7 +128,7 @@ def lacking(check: checks.RobotCheck) -> float:
 
 
 def write(robot: Robot, change: Array, out: Path) -> None:
-    """Write a robot directory with the via points moved, and a picture of both routes.
+    """Write a robot directory with moved via points, and a picture of the old and new routes.
 
     Args:
         robot: The original robot.

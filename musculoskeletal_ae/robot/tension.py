@@ -59,7 +59,7 @@ class TensionProgramme:
         _require_finite(self._constraints, self._bounds)
 
     def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
-        """Return argmin ½ Tᵀ Q T − aᵀ T [N], shape (M,).
+        """Return the T [N] (M,) that minimises ½ Tᵀ Q T − aᵀ T under the constraints.
 
         Args:
             quadratic: Q, (M, M).
@@ -92,7 +92,7 @@ class TensionProgramme:
 def holding_tension(
     robot: Robot, theta: Array, desired: Array | float = 0.0, jacobian: Array | None = None
 ) -> Array:
-    """Return the tension within [T_bias, T_limit] that holds a posture [N], (M,).
+    """Return tensions [N] (M,) within [T_bias, T_limit] that hold a posture.
 
     Args:
         robot: The robot.
@@ -117,9 +117,9 @@ def least_tension(
     high: Array | float,
     desired: Array | float = 0.0,
 ) -> Exertion:
-    """Solve the hard form, or the soft form if the hard one is infeasible.
+    """Return the solution of the hard form, or of the soft form if the hard one is infeasible.
 
-    For the arguments see `TensionProgramme`, and for `desired` its method `nearest`.
+    The arguments are those of `TensionProgramme`; `desired` is T_desired [N], scalar or (M,).
 
     Raises:
         InfeasibleError: If an entry is not finite.
@@ -133,7 +133,7 @@ def least_tension(
 
 @cache
 def _unit(count: int) -> tuple[Array, Array]:
-    """Return the unit matrix and the normals of the limits; callers must not change them."""
+    """Return the unit matrix (M, M) and the normals of the limits (M, 2 M); do not change them."""
     eye = np.eye(count)
     return eye, np.hstack([eye, -eye])
 

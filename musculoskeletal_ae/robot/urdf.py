@@ -49,7 +49,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
 
     Args:
         file: The file, for error messages.
-        text: Its content.
+        text: The content of the file.
 
     Raises:
         RobotDescriptionError: If the URDF is invalid; the message names the file, the link or

@@ -66,7 +66,7 @@ def with_title(response: Response, title: str) -> Response:
 
 
 def is_foreign(host: str, request: Request) -> bool:
-    """Whether a page of another site sent a request to the page served at `host`.
+    """Return whether a page of another site sent a request to the page served at `host`.
 
     Browsers send the site in the header `Origin`. Other clients send none and are not foreign.
     """
