@@ -176,8 +176,8 @@ def read_streams(
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
     implausible messages. Lengths are corrected by the length offsets that `muscle_length_zeros` had
     published at that time. The first offsets on this topic, if known, also correct earlier lengths.
-    Messages received while offsets were unknown are rejected. For isolated muscles, values that are not
-    finite become 0, and temperatures NaN.
+    Messages received while offsets were unknown are rejected. For isolated muscles, lengths and
+    tensions that are not finite become 0, and temperatures that are not finite become NaN.
 
     Args:
         bag: The recording.
