@@ -5,11 +5,13 @@
     F     = argmin Σ_j ((JᵀF − τ_ext)_j / σ_j)² + ‖F‖²/F₀²,   without a moment at the hand
     d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > CONTACT in IN_A_ROW consecutive messages
 
-θ and Gᵀ T_end pass through the same second-order low-pass filter, which also gives θ̇ and θ̈. The
-result is the residual of the momentum observer (De Luca 2005) without numerical differentiation of
-noise. Tendon friction μ has to be known: unknown friction hides a contact force of 10 N. σ is the
-residual torque of the healthy moving arm (`estimation/healthy_torque.py`). F₀ keeps components of
-the force small that produce no joint torque, such as those along a stretched arm.
+M is the inertia matrix, h contains the torques due to velocity and weight, and s is the direction
+in which a tendon slid last (`signals/friction.py`). θ and Gᵀ T_end pass through the same
+second-order low-pass filter, which also gives θ̇ and θ̈. The result is the residual of the momentum
+observer (De Luca 2005) without numerical differentiation of noise. Tendon friction μ has to be
+known: unknown friction hides a contact force of 10 N. σ is the residual torque of the healthy
+moving arm (`estimation/healthy_torque.py`). The term with F₀ keeps those components of F small that
+produce no joint torque, such as the component along a stretched arm.
 
 At a joint limit, the unknown torque of the stop is added to τ_ext. A computed torque that points
 away from the stop may be due to the stop alone and therefore counts as 0. If the computed torque

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitors the health of the body with a list of detectors.
 
-A new detector is one file in `estimation/detectors/` and one entry in the list below. The
-estimator, offline learning (`train --from-bag`) and the experiments use the same list.
+A new detector is one file in `estimation/detectors/` and one entry in the list of `HealthMonitor`.
+The estimator, offline learning (`train --from-bag`) and the experiments use the same list.
 """
 
 from collections.abc import Iterable

@@ -174,8 +174,8 @@ class LengthCalibration:
             name = self._robot.muscles[int(residual.argmax())]
             limit = 1e3 * LARGEST_RESIDUAL
             return (
-                f'the residual of {name} is {1e3 * residual.max():.1f} mm; legal: at most '
-                f'{limit:g} mm'
+                f'the length of {name} differs from the fit by {1e3 * residual.max():.1f} mm; '
+                f'legal: at most {limit:g} mm'
             )
         cost = self._fit.cost_per_residual(fit)
         # At a high cost, the fit may have found wrong postures that are similar to the true ones.

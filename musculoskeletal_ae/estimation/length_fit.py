@@ -4,15 +4,16 @@
     l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
     0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more equations while the arm moves slowly
 
-The network computes l and G through ①. If the joint angles were measured, o is the mean residual of
-the first line. Otherwise o and the postures of all moments are estimated together, by maximum
-likelihood with noise of Student's distribution. Because muscles outnumber joints and G changes with
-the posture, only one o explains all moments of a moving arm. The second line already restricts
-the posture at the first moment, when the lengths alone do not.
+o are the offsets, g is the torque of the weight, and K and b describe the springs of the joints.
+The network computes l and G = ∂l/∂θ through ①. If the joint angles were measured, o is the mean
+residual of the first line. Otherwise o and the postures of all moments are estimated together, by
+maximum likelihood with noise of Student's distribution. Because muscles outnumber joints and G
+changes with the posture, only one o explains all moments of a moving arm. The second line already
+restricts the posture at the first moment, when the lengths alone do not.
 
 The fit is a damped Gauss–Newton method that eliminates the postures. It starts from the best of
-many random first postures. Besides o it estimates the friction μ of every tendon, the offset of
-every tension sensor, and the Coulomb friction torque of every joint.
+many random postures of the first moment. Besides o it estimates the friction μ of every tendon, the
+offset of every tension sensor, and the Coulomb friction torque of every joint.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 
     l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + ψ(θ)ᵀ v
 
+    f, L_e  length of the route through the attachment points, and elongation of the elastic element
     δ       errors of the attachment points p, a few millimetres
     κ       logarithmic errors of the elastic constants c, some per cent
     μ, s    tendon friction, and the direction of the last sliding (+1 wound in, −1 paid out);

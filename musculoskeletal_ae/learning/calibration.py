@@ -7,7 +7,7 @@
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
 because friction gives d heavy tails. This maximum includes messages that were not used to
-compute Σ. Sensor glitches are excluded, which are a few messages far beyond all others.
+compute Σ. Single messages far beyond all others count as sensor glitches and are excluded.
 
 Where joint sensors read all angles, the network also learns from every second message (`update`).
 The other messages, which are not used for training, serve to validate its estimates.

@@ -9,9 +9,9 @@ back until the next length calibration:
     other offsets        the samples are dropped, because it is unknown which of them are wrong
 
 Offsets may also have been wrong from the start, for example after a bad calibration. This is
-certain if a new calibration differs although no length has jumped and no message was missed: the
-muscle modules cannot have lost their position then. Samples taken under the wrong offsets are
-corrected.
+certain if a new calibration gives different offsets although no length has jumped and no message
+was missed: the muscle modules cannot have lost their position then. Samples taken under the wrong
+offsets are corrected.
 """
 
 from __future__ import annotations

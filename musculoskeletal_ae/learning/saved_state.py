@@ -157,7 +157,8 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     """
     if added := [name for name in robot.muscles if name not in state.muscles]:
         raise StateError(
-            f'the saved network lacks {", ".join(added)}; only the saved samples are used'
+            f'the saved network lacks the muscles {", ".join(added)}; only the saved samples are '
+            'used'
         )
     if state.network is None:
         return None

@@ -39,10 +39,10 @@ def synthetic_samples(
 
         target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
 
-    T_r is the tension at the elastic elements. An estimator knows it except for the share u
-    (UNKNOWN_FRICTION) of the friction. The network's input contains this error and the noise ε, and
-    its target does not. ② therefore learns to weight muscles by the accuracy of their lengths, as
-    in weighted least squares.
+    T_r is the tension at the elastic elements. Measured tensions allow an estimator to compute T_r,
+    except for the share u (UNKNOWN_FRICTION) of the friction. The network's input contains this
+    error and the noise ε, and its target does not. ② therefore learns to weight muscles by the
+    accuracy of their lengths, as in weighted least squares.
 
     Args:
         body: The calibrated body.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs updates, either in the calling process or in a separate training process.
 
-Experiments and recordings use the calling process, the node a separate one. The caller submits a
-job and polls for its update. The update itself is in `update`, which imports torch; it is imported
-only in processes that train.
+Experiments and learning from recordings use the calling process, and the node uses a separate one.
+The caller submits a job and polls for its update. The module `update` computes the update. It
+imports torch and is therefore imported only in processes that train.
 """
 
 from __future__ import annotations

@@ -92,7 +92,8 @@ class Metadata(Strict, frozen=True):
                 raise ValueError(f'{key} {word!r}; legal: {", ".join(legal)}')
         for names, places in zip((self.joints, self.muscles), zip(*self.groups), strict=True):
             if sorted(chain(*places)) != [*range(len(names))] or not all(places):
-                raise ValueError(f'groups {self.groups}; legal: each joint and muscle in one group')
+                legal = 'each joint and muscle in exactly one group'
+                raise ValueError(f'groups {self.groups}; legal: {legal}')
         known, muscles = set(self.isolated), range(len(self.muscles))
         if len(known) < len(self.isolated) or not known <= {*muscles}:
             raise ValueError(f'isolated {self.isolated}; legal: different indices of muscles')
@@ -263,7 +264,8 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
         if value.shape != shapes[name]:
             raise CheckpointError(f'tensor {name} has shape {value.shape}; legal: {shapes[name]}')
         if not (np.abs(value) <= LARGEST).all():
-            raise CheckpointError(f'tensor {name} has a value beyond ±{LARGEST:g} or not finite')
+            problem = f'tensor {name} has a value that is not finite or is beyond ±{LARGEST:g}'
+            raise CheckpointError(problem)
     for name in ('std', 'touch.spread'):
         if name in tensors and (least := tensors[name].min()) < SMALLEST_STD:
             value_text, limit = distinct(least, SMALLEST_STD)
@@ -312,9 +314,10 @@ def _check_elasticity(stiffness: Array, damping: Array) -> None:
         raise CheckpointError('tensor elasticity.stiffness is not symmetric')
     least, most = np.linalg.eigvalsh(stiffness)[[0, -1]]
     if least < SMALLEST_SPRING_EIGENVALUE * most or damping.min() < 0.0:
-        problem = f'eigenvalues from {least:g} to {most:g} and dampers from {damping.min():g}'
         raise CheckpointError(
-            f'tensors elasticity have {problem}; legal: 0 or more, as springs only store energy'
+            f'tensor elasticity.stiffness has eigenvalues from {least:g} to {most:g}, and '
+            f'elasticity.damping has values from {damping.min():g}; legal: 0 or more, because '
+            'springs only store energy and dampers only dissipate it'
         )
 
 
@@ -361,8 +364,8 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
         network_names, robot_names = getattr(mae, kind), getattr(robot, kind)
         if network_names != robot_names:
             raise CheckpointError(
-                f'made for {kind} {", ".join(network_names)}; '
-                f'this robot has {", ".join(robot_names)}, in this order'
+                f'made for the {kind} {", ".join(network_names)}; '
+                f'this robot has the {kind} {", ".join(robot_names)}, in this order'
             )
     if mae.transmission.drive is not None and not robot.tension_source.is_current:
         raise CheckpointError(

@@ -94,8 +94,8 @@ class BlockDiagonal:
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
     """Return x @ weight, shape (..., out), for x (..., in).
 
-    The operator @ has 0.4 µs more overhead than the method `dot`, as much as the product of one row
-    with a layer takes. `dot` is therefore used where possible.
+    The method `dot` is used where possible, because the operator @ has 0.4 µs more overhead. This
+    is as long as the product of one row with a layer takes.
     """
     if x.ndim > 2 or isinstance(weight, BlockDiagonal):
         return x @ weight
@@ -374,7 +374,7 @@ class Mae:
         quantities = (theta, tension, length)
         one, two = (q for q, is_used in zip(quantities, mask.value, strict=True) if is_used)
         if one is None or two is None:
-            raise ValueError(f'mask {mask.name} needs both of its two quantities')
+            raise ValueError(f'mask {mask.name}: one of its two quantities is None; pass both')
         return self._enter[mask](np.concatenate((one, two), axis=-1))
 
     def decode(self, z: Array) -> State:

@@ -18,9 +18,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
-# Lowest standard deviation of a residual in scaled units; as 0.02 N or 0.01 mm, it is below any
-# sensor's resolution. It keeps the covariance invertible if a network restores some combination of
-# its inputs perfectly.
+# Lowest standard deviation of a residual in scaled units. It corresponds to 0.02 N or 0.01 mm,
+# which is below any sensor's resolution. It keeps the covariance invertible if a network restores
+# some combination of its inputs perfectly.
 FLOOR = 1e-4
 ANYTHING = 10.0  # standard deviation of a residual that is ignored, in scaled units
 LEAST_MOTION = 60.0  # duration of motion that calibrated touch statistics require [s]
@@ -57,7 +57,7 @@ class AnomalyStatistics:
 
     mean: Array  # mean μ of e, (2M,)
     covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
-    calibrated: bool  # whether measured on the real arm instead of the geometric model
+    calibrated: bool  # whether the residuals are those of the real arm, not the geometric model
     samples: int  # number of samples
     #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)

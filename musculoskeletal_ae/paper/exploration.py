@@ -36,7 +36,7 @@ def three_steps(
     posture: Callable[[Robot, np.random.Generator], Array] = random_posture,
     constant_tension: Callable[[Robot, Array, np.random.Generator], Array] = random_tension,
 ) -> tuple[Step, Step, Step]:
-    """Draw a random holdable posture; return the three steps of exploration there.
+    """Draw a random holdable posture, and return the three steps of exploration at this posture.
 
     Args:
         robot: The body; its isolated muscles carry no tension.

@@ -106,7 +106,7 @@ class Limbs(NamedTuple):
 
 @njit(cache=True)
 def handed(body: Body, tree: Tree, limbs: Limbs) -> Handle:
-    """Return the constants as one handle, the argument `robot` of `advance`."""
+    """Return a handle that holds the constants; it is the argument `robot` of `advance`."""
     return Handle((body, tree, limbs))
 
 
@@ -478,7 +478,9 @@ class Slopes:
         """
         lengths = mae.lengths(self._postures, self._tension)
         if not np.isfinite(lengths).all():
-            raise FloatingPointError('some lengths within the joint limits are not finite')
+            raise FloatingPointError(
+                "some of the network's lengths within the joint limits are not finite"
+            )
         fitted = zip(*(limb.fit(lengths) for limb in self._cubics), strict=True)
         self.limbs = Limbs(*self._places, *map(np.concatenate, fitted))
 

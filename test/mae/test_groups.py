@@ -130,7 +130,7 @@ def test_a_checkpoint_stores_the_groups_and_gives_the_same_answers(mae, state):
 @pytest.mark.parametrize(
     ('change', 'says'),
     [
-        ({'groups': LIMBS[:2]}, 'each joint and muscle in one group'),
+        ({'groups': LIMBS[:2]}, 'each joint and muscle in exactly one group'),
         ({'groups': 3}, 'groups'),
         ({'layer_sizes': [1, 2, 3]}, 'layer_sizes'),
     ],

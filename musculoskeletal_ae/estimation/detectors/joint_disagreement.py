@@ -9,8 +9,8 @@ and changes little with the posture. When the length offset of a module jumps or
 by as much as the offset.
 
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ. Because
-muscles outnumber joints, arbitrary errors of lengths rarely have this form. If a δθ explains most
-of Δ, the joint sensor with the largest δθ is reported; otherwise the lengths are.
+muscles outnumber joints, arbitrary errors of lengths rarely have this form. If some δθ explains
+most of Δ, the joint sensor with the largest δθ is reported; otherwise, the lengths are reported.
 """
 
 from collections import deque
@@ -172,15 +172,15 @@ class JointDisagreement(Detector):
         unexplained = change + jacobian @ shift
         size = float(np.sqrt(np.square(change[self._used]).mean()))
         evidence = (
-            f'its length differs from that at the measured posture by '
+            f'length differs from that at the measured posture by '
             f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * largest.single:.0f} mm), and all '
             f'lengths by {1e3 * size:.0f} mm (limit {1e3 * largest.all:.0f} mm)'
         )
         if np.linalg.norm(unexplained) > UNEXPLAINED * np.linalg.norm(change):
-            return Finding(muscle, Kind.LENGTHS_DISAGREE, evidence)
+            return Finding(muscle, Kind.LENGTHS_DISAGREE, f'its {evidence}')
         j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
         offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
         cause = (
             f'the lengths look as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
         )
-        return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f'{cause}: {evidence}')
+        return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f"{cause}: the muscle's {evidence}")

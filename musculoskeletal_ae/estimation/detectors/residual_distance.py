@@ -51,7 +51,7 @@ class Reading(NamedTuple):
     """Results of one message."""
 
     distance: float  # d, in healthy standard deviations; NaN without statistics
-    suspect: int  # the most suspect muscle
+    suspect: int  # index of the most suspect muscle
 
 
 class ResidualDistance(Detector):

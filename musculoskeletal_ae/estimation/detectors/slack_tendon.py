@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects a muscle without tension although tension is commanded: it ruptured or is slack.
+"""Detects a muscle that has no tension although tension is commanded: it is ruptured or slack.
 
     T < slack_share · T_ref for DEAD_TIME, and not being wound in
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a muscle module whose drag, cooling or tension sensor has changed, by its thermal model.
 
-`heat.py` estimates the constants of the model. Only a module with a hot winding is a finding; a
-cool one is reported in /diagnostics without stopping the arm.
+`heat.py` estimates the constants of the model. A changed module is a finding only if its winding is
+hot. A cool module that has changed is reported in /diagnostics, and the arm is not stopped.
 """
 
 from collections.abc import Iterable

@@ -14,7 +14,7 @@ larger than that of the network in use.
 
 Without joint sensors, the network in use is the reference. The limits of the median differences are
 ANGLE_MOVED and LENGTH_MOVED, and that of the relative difference in shape is SHAPE_MOVED. If there
-are too few messages, the fixed states replace them, with lengths by the network in use.
+are too few messages, the fixed states replace them. The network in use then computes the lengths.
 """
 
 from __future__ import annotations
@@ -172,7 +172,14 @@ class AgreementCheck:
         )
 
     def _length_error(self, mae: Mae, theta: Array, tension: Array, length: Array) -> Array:
-        """Return the median error of l through ① [m], 0 for isolated muscles, (M,)."""
+        """Return the median error [m] (M,) of l through ①, which is 0 for isolated muscles.
+
+        Args:
+            mae: A network.
+            theta: Postures at which the network computes lengths [rad], (N, D).
+            tension: T_end [N], (N, M).
+            length: Lengths with which the network's lengths are compared [m], (N, M).
+        """
         error = _median(mae.lengths(theta, tension) - length)
         error[list(self._isolated)] = 0.0
         return error
