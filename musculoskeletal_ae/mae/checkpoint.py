@@ -92,8 +92,8 @@ class Metadata(Strict, frozen=True):
                 raise ValueError(f'{key} {word!r}; legal: {", ".join(legal)}')
         for names, places in zip((self.joints, self.muscles), zip(*self.groups), strict=True):
             if sorted(chain(*places)) != [*range(len(names))] or not all(places):
-                legal = 'each joint and muscle in exactly one group'
-                raise ValueError(f'groups {self.groups}; legal: {legal}')
+                problem = f'groups {self.groups}; legal: each joint and muscle in exactly one group'
+                raise ValueError(problem)
         known, muscles = set(self.isolated), range(len(self.muscles))
         if len(known) < len(self.isolated) or not known <= {*muscles}:
             raise ValueError(f'isolated {self.isolated}; legal: different indices of muscles')
