@@ -117,8 +117,8 @@ class Parser(argparse.ArgumentParser):
             action='append',
             default=[],
             metavar='FILE',
-            help='parameters of the nodes, which say how the motors of a ros2_control robot are '
-            'connected (doc/howto/ros2_control.md); may be given several times',
+            help='parameter file of the nodes, which states how the motors of a ros2_control robot '
+            'are connected (doc/howto/ros2_control.md); may be given several times',
         )
 
     def add_preset(self, text: str = 'network, learning and solver') -> None:

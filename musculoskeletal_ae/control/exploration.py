@@ -32,10 +32,10 @@ PRESSES = 10  # number of random T_const from which the most strongly pressing o
 class Step(NamedTuple):
     """One step of the exploration."""
 
-    method: str  # 'first' or 'second', of the preset's length methods
+    method: str  # length method of the preset: 'first' or 'second'
     theta: Array  # θ_target [rad], (D,)
-    #: T_const of `first` [N], (M,); for `second`, which uses the present tension, the tension that
-    #: the geometric model expects
+    #: T_const of the method `first` [N], (M,). For the method `second`, which uses the present
+    #: tension instead, this is the tension that the geometric model expects.
     tension: Array
     duration: float  # duration of the step [s]
 
@@ -58,7 +58,7 @@ class Exploration:
 
 
 def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_LIMITS) -> Array:
-    """Return a random θ [rad] (D,); each joint is at a limit with probability `share`."""
+    """Return a random θ [rad], (D,); each joint is at a limit with probability `share`."""
     theta = robot.random_postures(1, rng)[0]
     chosen, upper = rng.uniform(size=(2, robot.joint_count))
     limit = np.where(upper < 0.5, robot.upper, robot.lower)
@@ -89,7 +89,7 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
 def holdable_postures(
     robot: Robot, postures: Iterable[Array], count: int, *others: Callable[[Array], Array]
 ) -> list[tuple[Array, Array]]:
-    """Return the first `count` holdable postures θ (D,), each with its least T [N] (M,).
+    """Return the first `count` holdable postures θ (D,), each with its least T [N], (M,).
 
     Args:
         robot: The robot.

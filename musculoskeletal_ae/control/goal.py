@@ -15,7 +15,7 @@ SUCCESSFUL, INVALID, BEYOND_PATH, BEYOND_GOAL = 0, -1, -4, -5
 
 
 def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
-    """Return the position tolerance of each joint [rad] (D,) from control_msgs/JointTolerance.
+    """Return the position tolerance [rad] of each joint, (D,), from control_msgs/JointTolerance.
 
     A position of 0 (the default) or a negative position means that the joint has no tolerance.
     Tolerances of velocity and acceleration are ignored, because neither is estimated.

@@ -177,7 +177,7 @@ class CommandLimiter:
             tension_limit: Tension limit of each muscle in addition to `tension.limit` [N], (M,).
             dt: Time since the last command [s].
             lead: λ max(0, −dl/dt) of each muscle [m], (M,).
-            rejected: l [m] and T [N] (2, M) of messages that were rejected after the sample, or
+            rejected: l [m] and T [N], (2, M), of messages that were rejected after the sample, or
                 None; see `RejectionError.pull`.
 
         Returns:
@@ -226,7 +226,7 @@ class CommandLimiter:
         return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
-        """Return the shortest length commands [m] (M,) that the rejected messages allow.
+        """Return the shortest length commands [m], (M,), that the rejected messages allow.
 
         A module compares l_target with its own reading of l. If this reading jumps, the module
         winds in, and the tension rises beyond the limit. Therefore l_target follows the jump of a
@@ -247,7 +247,7 @@ class CommandLimiter:
         return relieved
 
     def _tension_rate(self, time: float, tension: Array) -> Array:
-        """Return dT/dt [N/s] (M,) between the last two messages."""
+        """Return dT/dt [N/s], (M,), between the last two messages."""
         rate = np.zeros_like(tension)
         if self._tension is not None:
             before, old, rate = self._tension
@@ -261,7 +261,7 @@ class CommandLimiter:
     def _shortest(
         self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
-        """Return the shortest length [m] (M,) that demands no tension above the limit."""
+        """Return the shortest length [m], (M,), that demands no tension above the limit."""
         robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable
         rate = self._tension_rate(sample.time, tension)

@@ -127,7 +127,7 @@ class LengthMethod(NamedTuple):
 
 
 def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array:
-    """Return l_target [m] (..., M) for θ_target [rad] (..., D) and tension T [N] (..., M)."""
+    """Return l_target [m], (..., M), for θ_target [rad], (..., D), and tension T [N], (..., M)."""
     return mae.lengths(theta, tension) + msc_compensation(robot, tension)
 
 

@@ -65,7 +65,7 @@ class Planner:
     def to_posture(
         self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
     ) -> Plan:
-        """Plan a motion to rest at θ [rad] (D,) through holdable postures.
+        """Plan a motion to rest at θ [rad], (D,), through holdable postures.
 
         Args:
             mae: The network in use.

@@ -114,7 +114,7 @@ class LengthRamps:
         return self._remaining - dt <= 0.0 and not self._goals
 
     def start_from(self, command: Array) -> None:
-        """Continue from a command [m] (M,) and discard all goals."""
+        """Continue from a command [m], (M,), and discard all goals."""
         self._command, self._ramp, self._goal = command.copy(), None, None
         self._goals, self._remaining = [], 0.0
         self.solution = None
@@ -190,7 +190,7 @@ class RampedTarget(ActivityControl):
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the posture [rad] (D,) and the torque in addition to gravity compensation [N·m]."""
+        """Set the posture [rad], (D,), and the torque in addition to gravity compensation [N·m]."""
         self._target = theta, effort
         self.ramps.pursue(self._goals())
 

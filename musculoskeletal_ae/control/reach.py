@@ -54,7 +54,7 @@ STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
-    """Return a text on the largest missing torque at θ [rad] (D,), or '' if θ is holdable."""
+    """Return a text on the largest missing torque at θ [rad], (D,), or '' if θ is holdable."""
     limits, radian = robot.tension, robot.kinematics.radian
     torque = radian * robot.kinematics.holding_torque(theta)
     jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
@@ -180,7 +180,10 @@ class Limits:
 
 
 class PathCost:
-    """The cost of straight paths, by the torque that muscles and joint stops do not provide."""
+    """Computes the cost of straight paths, which rises with the missing torque.
+
+    That is the torque that muscles and joint stops do not provide.
+    """
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
         self._robot, self._mae = robot, mae
@@ -283,7 +286,7 @@ class Roadmap:
 
 
 def _random_postures(robot: Robot, start: Array) -> Array:
-    """Return random postures [rad] (POSTURES, D).
+    """Return random postures [rad], (POSTURES, D).
 
     A joint that is at a stop in `start` is placed at that stop in 30 % of the postures.
     """
@@ -298,7 +301,7 @@ def _random_postures(robot: Robot, start: Array) -> Array:
 
 
 def _shortened(path: Array, cost: PathCost) -> Array:
-    """Return a path [rad] (K, D) without the postures that do not make it cheaper."""
+    """Return a path [rad], (K, D), without the postures that do not make it cheaper."""
     k = 1
     while k < len(path) - 1:
         around = cost.of_edge(path[k - 1], path[k]) + cost.of_edge(path[k], path[k + 1])

@@ -50,7 +50,7 @@ class TorqueControl(ActivityControl):
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the posture [rad] (D,) and the torque in addition to gravity compensation [N·m]."""
+        """Set the posture [rad], (D,), and the torque in addition to gravity compensation [N·m]."""
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:

@@ -142,10 +142,14 @@ class Trajectory:
 
     @classmethod
     def to(cls, start: Setpoint, theta: Array, duration: float) -> Trajectory:
-        """Return a quintic to rest at θ [rad], (D,) or (K, D).
+        """Return a trajectory of quintics that comes to rest at each of one or more postures.
 
-        From rest this is a minimum-jerk motion. With K postures, the arm comes to rest at each of
-        them. `duration` [s] is the time for each posture.
+        A motion that starts at rest is a minimum-jerk motion.
+
+        Args:
+            start: Setpoint at which the trajectory begins.
+            theta: One posture θ [rad], (D,), or K postures, (K, D).
+            duration: Time from each posture to the next [s].
         """
         path = np.atleast_2d(theta)
         (count, joints), still = path.shape, np.zeros(path.shape)
@@ -190,7 +194,7 @@ class Trajectory:
 
     @property
     def path(self) -> tuple[Array, Array]:
-        """Times [s] (N,) that cover every piece, and θ [rad] (N, D) at these times."""
+        """Times [s], (N,), that cover every piece, and θ [rad], (N, D), at these times."""
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
         inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
         theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)
@@ -226,5 +230,5 @@ class Trajectory:
 
 
 def _halt(start: Setpoint, robot: Robot) -> Array:
-    """Return the posture [rad] (D,) at which a motion comes to rest after `STOPPING`."""
+    """Return the posture [rad], (D,), at which a motion comes to rest after `STOPPING`."""
     return np.clip(start.theta + 0.5 * STOPPING * start.velocity, robot.lower, robot.upper)

@@ -210,7 +210,7 @@ class Watchdog:
         self.overload.take(sample.motor_tension * sample.usable, self.age.awake(now))
 
     def take_rejected(self, tension: Array, used: Bools, now: float) -> None:
-        """Check the filtered tensions [N] (M,) of a rejected message for overload.
+        """Check the filtered tensions [N], (M,), of a rejected message for overload.
 
         Args:
             tension: T; −∞ where it is implausible.

@@ -242,7 +242,7 @@ def _parse(arguments: list[str]) -> Namespace:
         metavar='HZ',
         help='expected rate of muscle_states [Hz]',
     )
-    text = 'posture in which the arm is held, if it has no joint sensors [rad or m]'
+    text = 'posture [rad or m] in which the arm is held, if it has no joint sensors'
     add('--posture', type=numbers, metavar='θ,…', help=text)
     text = 'for winches without absolute encoders: do not check the length offsets'
     add('--unzeroed', action='store_true', help=text)

@@ -56,7 +56,8 @@ class _Group(NamedTuple):
     kind: str  # name of the kind in rclpy's wait set
     entities: list[Any]
     add: Callable[[Any], None]  # adds the handle of an entity to the wait set
-    take: Callable[[Any], Any]  # takes an entity's message, and returns a call of its callback
+    #: takes the message of an entity, and returns a function that calls the callback with it
+    take: Callable[[Any], Any]
 
 
 class LeanExecutor(SingleThreadedExecutor):

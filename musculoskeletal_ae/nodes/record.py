@@ -142,7 +142,7 @@ class Record(Node):
         self.writer.write(name, now, info['source_timestamp'], data)
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
-        """Return the QoS that the publishers of a topic offer; the depth of a queue is unknown."""
+        """Return the QoS that the publishers of a topic offer, without the unknown queue depth."""
         offered = [
             offered_qos(
                 info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,

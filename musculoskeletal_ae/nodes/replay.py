@@ -253,7 +253,7 @@ def parse(arguments: list[str]) -> Namespace:
     rate = 'playback speed as a multiple of the recorded speed; needs --clock'
     add('--rate', type=number(1e-3, 1e3), default=1.0, help=rate)
     add('--clock', action='store_true', help='publish the recorded time on /clock')
-    add('--loop', action='store_true', help='start again at the end')
+    add('--loop', action='store_true', help='after the end, start again')
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='duration of the part to play [s]')

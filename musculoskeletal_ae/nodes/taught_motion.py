@@ -99,7 +99,7 @@ class _Answers:
         if not self.reports or self._refused <= self._refused_before:
             return ''
         last = self.reports[-1].get('last rejected', '')
-        return last if last.startswith(TRAJECTORY) else 'see its /diagnostics for the reason'
+        return last if last.startswith(TRAJECTORY) else '/diagnostics shows the reason'
 
 
 def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wait: float) -> None:

@@ -130,7 +130,7 @@ class FrictionDirection:
         self._length: Array | None = None
 
     def step(self, length: Array) -> Array:
-        """Update the directions with the next l [m] (M,), and return s (M,)."""
+        """Update the directions with the next l [m], (M,), and return s (M,)."""
         if self._length is None:
             self._length, self._mean, self._read = length, length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
@@ -160,6 +160,6 @@ class FrictionDirection:
 
 
 def directions(length: Array) -> Array:
-    """Return s (N, M) for the lengths l [m] (N, M) of consecutive messages."""
+    """Return s (N, M) for the lengths l [m], (N, M), of consecutive messages."""
     step = FrictionDirection().step
     return np.array([step(each) for each in length]).reshape(length.shape)

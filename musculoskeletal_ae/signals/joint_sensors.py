@@ -40,7 +40,8 @@ STUCK_MOTION = 0.2
 #: distance of a joint from its reading, according to the lengths, above which a repeated reading is
 #: stuck [rad]
 STUCK_OFFSET = 0.5
-STUCK_EXPLAINED = 0.5  # fraction of the misfit of l that the motion or distance must explain
+#: fraction of the misfit of l that this motion or distance of the joint must explain
+STUCK_EXPLAINED = 0.5
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 
 

@@ -54,7 +54,7 @@ class Pairing(Generic[Message]):
         self._before: float | None = None  # time of the muscle message before the pending one [s]
 
     def joints(self, time: float, theta: Array) -> None:
-        """Record θ [rad] (D,) received at `time` [s]; NaN for joints that are not included."""
+        """Record θ [rad], (D,), received at `time` [s]; NaN for joints that are not included."""
         if time < self._came:
             self.reset()
         self._came = time
