@@ -54,33 +54,33 @@ BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'contro
                  'learner': 338}  # fmt: skip
 PAGE = """# Performance
 
-Written by `python -m bench performance --out doc` on {day}: {machine}. Before: the first version
-that was measured (be0daee), on an idle machine of two cores.
+Written by `python -m bench performance --out doc` on {day}, on {machine}. The columns "before" show
+the first version that was measured (be0daee), on an idle machine of two cores.
 
 ## Goals
 
-On two idle cores, for `{arm}` unless another robot is named.
+The goals hold for two idle cores, and for `{arm}` unless another robot is named.
 
 {goals}
 
 ## One call of the core
 
-CPU time, measured by `bench timings` for `{arm}`:
+The table shows CPU times, measured by `bench timings` for `{arm}`. Two of its columns need an explanation:
 
 - *torch eager*: the same algorithm with the network in torch, or entirely in torch where the row
   says so
 - *bound*: the time of the network's multiply-adds alone, at the speed of matrix products of that
   size on this machine
 
-"Before" was measured on another machine. There, an estimate in torch took {torch_before:.0f} µs;
-on this machine it takes {slower:.1f} times as long. Therefore compare ratios to torch and to
-"messages alone", not times of different days.
+The times "before" were measured on another machine, on which an estimate in torch took
+{torch_before:.0f} µs; on this machine it takes {slower:.1f} times as long. Therefore do not compare
+times of different days, but their ratios to torch or to "messages alone".
 
 {core}
 
 ## At the wire
 
-Measured by `bench wire`:
+The table was measured by `bench wire`. Its words mean:
 
 - *latency*: time from the publishing of `muscle_states` to that of the next command
 - *late*: commands that came after more than two periods
@@ -94,8 +94,8 @@ Measured by `bench wire`:
 
 ## Starting, and memory
 
-The table shows the CPU time until the first command or response, with compiled code, and the
-resident memory. {shared:.0f} MB of the estimator's memory are shared libraries, which all processes
+The table shows the CPU time from the start of a node until the first command, with compiled code,
+and the resident memory. {shared:.0f} MB of the estimator's memory are libraries that all processes
 share. "Messages alone" is a node that has loaded numpy and pinocchio and computes nothing: the
 minimum for a Python node that uses them.
 
@@ -103,7 +103,7 @@ minimum for a Python node that uses them.
 
 ## Learning
 
-Measured on one core. The update uses a full store of samples.
+Times were measured on one core. The update uses a full store of samples.
 
 | | before | now |
 |---|---|---|
