@@ -65,7 +65,8 @@ The goals hold for two idle cores, and for `{arm}` unless another robot is named
 
 ## One call of the core
 
-The table shows CPU times, measured by `bench timings` for `{arm}`. Two of its columns need an explanation:
+The table shows CPU times, measured by `bench timings` for `{arm}`. Two of its columns need an
+explanation:
 
 - *torch eager*: the same algorithm with the network in torch, or entirely in torch where the row
   says so
