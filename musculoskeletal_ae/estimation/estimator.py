@@ -162,7 +162,7 @@ class Estimator:
             self.calibration = LengthCalibration(self.robot, reduced, self.calibration.posture)
 
     def keep_isolated(self) -> None:
-        """Keep the present isolated muscles when another network is used."""
+        """Keep the present isolated muscles even if another network is used later."""
         self._follows_network = False
 
     def isolate(self, muscles: Iterable[int]) -> None:

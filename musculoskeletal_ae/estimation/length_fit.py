@@ -55,7 +55,7 @@ STICKING = 0.003  # motion after a reversal over which the friction of a joint c
 LEAST_WEIGHT = 0.1
 
 # Constants of the search for initial values.
-DRAWN_POSTURES = 3200  # number of random first postures that are compared by torque
+DRAWN_POSTURES = 3200  # number of random postures whose torques at the first moment are compared
 FITTED_POSTURES = 400  # number of the best drawn postures, which are fitted coarsely to the lengths
 COMPARED_FITS = 30  # number of the best coarse fits, which are compared by torque as well
 REFINED_FITS = 6  # number of the best coarse fits, which are refined
@@ -162,7 +162,12 @@ class LengthFit:
         return min(fits, key=lambda fit: fit.cost)
 
     def _guesses(self, moments: Moments, few: Moments) -> Generator[None, None, list[Array]]:
-        """Return the constants that the likeliest of many random first postures imply."""
+        """Return guesses of the constants, from the likeliest of many postures at the first moment.
+
+        Args:
+            moments: All moments.
+            few: The moments with which the search compares postures.
+        """
         mae = self._mae
         tension = np.tile(moments.tension[0], (FITTED_POSTURES, 1))
         # The balance of torques excludes most postures before any offset is known.

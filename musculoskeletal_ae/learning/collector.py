@@ -115,7 +115,7 @@ class SampleCollector:
         self._measure(time, 0, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
-        """Record an accelerometer reading in the axes of a link [m/s²], (3,).
+        """Record an accelerometer reading [m/s²] (3,) in the axes of a link.
 
         At rest the reading is opposite to gravity and therefore gives its direction. Readings
         during motion are not used.

@@ -138,7 +138,7 @@ class MuscleFit:
         least_noise: float,
         m: int,
     ) -> None:
-        """Fit muscle `m` of a body to the samples where `used` (N,) is True."""
+        """Prepare the fit of muscle `m` to the samples where `used` (N,) is True."""
         self._body, self._m = body, m
         self._poses, self._smooth = poses, body.smooth[m].at(observed.theta)
         self._observed = observed
@@ -182,7 +182,7 @@ class MuscleFit:
         self._weight = weight / self._noise**2
 
     def cost(self, point: MusclePoint) -> float:
-        """Return the cost with the present weights."""
+        """Return the cost of a point with the present weights."""
         deviation = self._mean - point.parameters
         return float((self._weight * point.residual**2).sum() + self._precision @ deviation**2)
 

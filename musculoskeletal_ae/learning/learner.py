@@ -142,7 +142,7 @@ class Learner:
         self.collector.joints(time, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
-        """Record an accelerometer reading in the axes of a link [m/s²] (3,) at `time` [s]."""
+        """Record an accelerometer reading [m/s²] (3,) in the axes of a link at `time` [s]."""
         self.collector.imu(time, link, acceleration)
 
     def take(self, message: Any, time: float) -> None:
@@ -328,7 +328,10 @@ class Learner:
             self.keeper.use(mae)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
-        """Mark a muscle as unknown in all samples except the newest ones."""
+        """Mark a muscle as unknown in all but the last `newest` samples, and schedule an update.
+
+        All messages of the healthy arm are discarded.
+        """
         self.samples.forget(muscle, newest)
         self.collector.healthy.clear()
         self.scheduler.note_change()

@@ -208,7 +208,7 @@ class GroupFit:
         return self.stops.pull(unknowns.theta[:, self.model.joints], self.prior.repeated)
 
     def cost(self, point: Point) -> float:
-        """Return the cost with the present weights."""
+        """Return the cost of a point with the present weights."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
         stop, by_stop = self._pull(unknowns)

@@ -204,7 +204,7 @@ def _is_measured(reading: Sample) -> bool:
 
 
 def _mean(values: Array) -> Array:
-    """Return the mean over rows without NaN; NaN where all rows are NaN."""
+    """Return the mean of each column without its NaN entries; NaN if it has no other entries."""
     known = np.isfinite(values)
     mean: Array = np.where(known, values, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.where(known.any(axis=0), mean, np.nan)

@@ -224,7 +224,10 @@ class SampleStore:
         return Observations(theta, tension, length, direction, known, spread, gravity, age)
 
     def _scaled(self, samples: Sequence[Sample]) -> Array:
-        """Return samples as points in units of the thresholds, (N, D + 2 M); NaN is ignored."""
+        """Return samples as points (N, D + 2 M) in units of the thresholds.
+
+        The coordinates are θ, T and l. Those that are not compared are NaN.
+        """
         theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
         distances = self._settings.new_joint_distance, self._settings.new_tension_distance
         joint, newton = (max(distance, LEAST_DISTANCE) for distance in distances)

@@ -47,7 +47,10 @@ class Updater(ABC):
         return None
 
     def update(self, job: Job) -> Update:
-        """Run one update. Its duration is bounded, because the number of samples is bounded."""
+        """Run one update and return its result.
+
+        The duration is bounded, because the numbers of samples and training steps are bounded.
+        """
         start, newest = time.perf_counter(), job.observed[-NEWEST:]
         mae = self._mae.without(job.isolated)
         estimate = observed_theta(mae, newest)

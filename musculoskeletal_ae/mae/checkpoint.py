@@ -359,7 +359,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
 
 
 def _check_fit(mae: Mae, robot: Robot) -> None:
-    """Check that the names fit, and that the estimate of the middle posture is plausible."""
+    """Check that a network fits a robot, and estimates the middle posture plausibly."""
     for kind in ('joints', 'muscles'):
         network_names, robot_names = getattr(mae, kind), getattr(robot, kind)
         if network_names != robot_names:

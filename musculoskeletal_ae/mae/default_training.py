@@ -99,7 +99,7 @@ def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
 
 
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
-    """Return random states, mostly within tension.limit, some with up to tension.max."""
+    """Return random states with tensions up to tension.limit, and in some up to tension.max."""
     highest = highest_tensions(robot, count, rng)
     return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
 

@@ -167,10 +167,10 @@ LINEAR = Activation(_linear, _linear_slope, 1.0)  # at the latent layer, between
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Layers x @ weight + bias, weight (in, out), with an activation after each but the last.
+    """A sequence of layers x @ weight + bias, with an activation after each layer except the last.
 
-    The weights before an activation include its gain. Inputs and outputs have double precision;
-    intermediate values have single precision.
+    The weights (in, out) before an activation include its gain. Inputs and outputs have double
+    precision; intermediate values have single precision.
     """
 
     layers: tuple[tuple[Singles | BlockDiagonal, Singles], ...]

@@ -84,7 +84,7 @@ class DefaultPreset:
         return {name: method for name, method in METHODS.items() if name != 'proposed'}
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return the paper's three steps, with targets that have some joints at their limits."""
+        """Return the paper's three steps, with targets at which some joints are at their limits."""
         from musculoskeletal_ae.control.exploration import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps
 

@@ -22,7 +22,8 @@ class MissingValues(Detector):
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._muscle: int | None = None
-        self._since = self._last = -math.inf  # times of the first and the last message with NaN [s]
+        #: times of the first and the last message in which only `_muscle` had NaN [s]
+        self._since = self._last = -math.inf
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
         """Report the only muscle with NaN in a message, if it has had NaN for SILENT seconds.

@@ -172,7 +172,14 @@ class ResidualDistance(Detector):
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
     ) -> str:
-        """Count messages above the threshold; return the evidence after IN_A_ROW of them, or ''."""
+        """Count messages above the threshold; return the evidence after IN_A_ROW of them, or ''.
+
+        Args:
+            observation: The message.
+            distance: d of the message.
+            has_slack: Whether a tendon is slack, so that the threshold does not grow.
+            waits: Whether the message does not count, because a slack tendon is being wound in.
+        """
         limit, value, name = self._settings.anomaly_threshold, observation.estimate.anomaly, 'A'
         where = ''
         if limit <= 0.0:

@@ -188,7 +188,7 @@ class StretchedTendon(SlackTendon):
         return is_stretched
 
     def _stretch(self, sample: MuscleSample, isolated: tuple[int, ...]) -> Array:
-        """Return x [m], (M,); `isolated` muscles are not used to estimate θ."""
+        """Return x [m] (M,), for which θ is estimated without the `isolated` muscles."""
         theta = self._reduced[isolated].estimate(sample.bone_tension, sample.length).theta
         tension = sample.bone_tension.copy()
         tension[list(isolated)] = 0.0

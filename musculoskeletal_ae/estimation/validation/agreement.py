@@ -60,7 +60,7 @@ class Comparison(NamedTuple):
     source: str  # source of the reference
 
     def faults(self) -> Iterator[str]:
-        """Yield a text on the largest fault, if an error exceeds its limit."""
+        """Yield a text on the error that exceeds its limit most, if there is one."""
         excess = self.error / self.limit
         if not excess.max() <= 1.0:
             worst = int(excess.argmax())
@@ -160,7 +160,7 @@ class AgreementCheck:
         return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
 
     def _shape(self, mae: Mae) -> Comparison:
-        """Compare the shape: how l by ① varies over the fixed states, by the two networks."""
+        """Compare how l through ① varies over the fixed states by `mae` and the network in use."""
         theta, tension = self._postures.theta, self._postures.tension
         used = np.delete(np.arange(self._robot.muscle_count), self._isolated)
         new, old = (each.lengths(theta, tension)[:, used] for each in (mae, self._in_use))

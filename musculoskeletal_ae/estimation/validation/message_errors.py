@@ -13,7 +13,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
-WORSE = 2.0  # largest error relative to the error of the network in use
+WORSE = 2.0  # largest permitted error, relative to the error of the network in use
 #: error that is always permitted: of T [N] and of l [m]
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
 
