@@ -30,7 +30,7 @@ _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 class BagCheck:
     """The report on a recording."""
 
-    lines: list[str] = field(default_factory=list)  # the contents
+    lines: list[str] = field(default_factory=list)  # texts on the contents of the recording
     faults: list[str] = field(default_factory=list)  # why the recording is incomplete or unfit
 
     def __str__(self) -> str:

@@ -47,7 +47,7 @@ class Series(NamedTuple):
 class Pairs(NamedTuple):
     """P pairs of simultaneous θ and (T, l)."""
 
-    time: Array  # [s], (P,)
+    time: Array  # time since the bag's start [s], (P,)
     theta: Array  # θ [rad], (P, D); NaN for joints without a sensor
     length: Array  # l [m], (P, M)
     tension: Array  # T [N], (P, M)
@@ -201,7 +201,8 @@ def read_streams(
     clock_offsets = _bunched(bag, list(takers))
     early = [recorded[name] for name in BODY_TOPICS if name in recorded]
     _deliver(bag, takers, early, clock_offsets, reception)
-    # The topic of the motors may serve as joint_states, but joints without sensors are not in it.
+    # A topic of motors that also counts as joint_states need not contain joint angles, because the
+    # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
     notes = [

@@ -23,7 +23,7 @@ DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
-#: topics of a robot that publishes muscle_states
+#: settings of a robot that publishes muscle_states, and therefore has no topics of motors
 NO_MOTORS = MotorSettings()
 
 

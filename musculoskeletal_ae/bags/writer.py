@@ -38,7 +38,7 @@ class BagWriter:
         self._name = f'{self.directory.resolve().name}_0.mcap'
         try:
             self._name.encode()
-        except UnicodeEncodeError as error:  # Python represents other bytes by surrogates
+        except UnicodeEncodeError as error:  # Python has replaced bytes that are not UTF-8
             problem = 'the name is not UTF-8'
             raise BagError(self.directory, problem, 'choose another name') from error
         #: further entries of metadata.yaml, which are written when the bag is completed

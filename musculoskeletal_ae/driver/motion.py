@@ -78,7 +78,7 @@ class MotionTest(ABC):
         self.done = self.done or next(self._run, self) is self
         return None if self.done or np.isnan(self._target).any() else self._target.copy()
 
-    # -- what the kinds of modules differ in ----------------------------------------------------
+    # -- differences between the kinds of modules -----------------------------------------------
 
     @abstractmethod
     def _hold(self) -> Wait:

@@ -24,7 +24,8 @@ class Effects:
     # Body
     attachment: float = 0.0105  # σ of each coordinate of each route point [m]
     kinks: float = 0.01  # detour of a tendon around the heads of bones and other muscles [m]
-    slip_over: float = 0.0057  # jump when a tendon slips over a ridge, in 5 % of postures [m]
+    #: jump of the length at a ridge, over which a tendon slips in 5 % of the postures [m]
+    slip_over: float = 0.0057
     give: float = 5e-5  # displacement of a route point under its load [m/N]
     #: friction of a joint, relative to its largest load by weight and muscles at T_bias
     joint_friction: float = 0.02

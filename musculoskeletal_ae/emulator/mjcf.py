@@ -437,7 +437,7 @@ def _placements_of_held(
             values = {'body_pos': pose.translation, 'body_quat': _turn(pose.rotation)}
             placements.append((body, values))
     for joint in spec.joints:
-        # A held joint of the same body may come after this one and move it.
+        # A held joint of the same body may come after `joint` and move it.
         if joint.parent.id in holders and joint not in held:
             pose, i = poses[joint.parent.id], joint.id
             axis = pose.rotation.T @ data.xaxis[i]

@@ -34,7 +34,7 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # The following values are chosen by hand, because those of Musashi are not public.
 #: rate at which a module in the safe state approaches T_bias [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # [m/s/N]
+MOTOR_GAIN = 0.004  # speed of winding in per newton of missing tension [m/s/N]
 POSITION_LAG = 0.02  # time constant of a position-controlled module [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
@@ -55,7 +55,7 @@ CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a ten
 #: scale and of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
 ACCELERATION_NOISE = 0.05  # [m/s²]
-MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # [m], [rad]
+MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the orientation [rad]
 
 
 def joint_gear(kinematics: Kinematics) -> Array:
@@ -71,7 +71,7 @@ def joint_gear(kinematics: Kinematics) -> Array:
 class Modules(NamedTuple):
     """Constants of the modules, each of shape (M,)."""
 
-    length_low: Array  # limits of l that the motor can wind to [m]
+    length_low: Array  # limits of the l to which the motor can wind [m]
     length_high: Array
     stiffness: Array  # K of muscle stiffness control [N/m]
     follows_position: Array  # 1 for position-controlled modules

@@ -32,8 +32,8 @@ RIDGE = 5.0  # percentage of a route's lengths that lie beyond the ridge [%]
 BACK = 0.003  # distance before the ridge at which the tendon slips back [m]
 GUIDES = 1.0  # bend of the tendon between its motor and its first route point [rad]
 SPOOL = 0.01  # radius of the spool [m]
-# Time constants [s]: four of creep, at a constant rate over four decades of time, and two of a
-# tendon's delayed stretch.
+# Time constants [s]: four of creep, which is equally large in each of four decades of time, and two
+# of the delayed stretch of a tendon.
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
 LATE = np.array([0.75, 0.25])  # shares of the delayed stretch with the last two time constants
 KNOTS = 200  # number of entries of the table of an elastic law
@@ -258,7 +258,7 @@ def guides_step(arm: Handle, duration: float) -> None:
         for p in range(first, last + 1):
             load[:] = 0.0
             both = True
-            for other in (max(p - 1, first), min(p + 1, last)):  # at an end: the point itself
+            for other in (max(p - 1, first), min(p + 1, last)):  # at an end, the point itself
                 for r in range(3):
                     line[r] = guides.point[other, r] - guides.point[p, r]
                 size = math.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)

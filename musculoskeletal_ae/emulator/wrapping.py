@@ -59,7 +59,7 @@ class Placed(NamedTuple):
     world: Array  # route points [m], (P, 3)
     absolute: Array  # lengths of the routes [m], (M,)
     leave: Array  # unit vector along the tendon at the start of each segment, (S, 3)
-    arrive: Array  # the same at its end, (S, 3)
+    arrive: Array  # unit vector along the tendon at the end of each segment, (S, 3)
 
     @classmethod
     def empty(cls, routes: WrappedRoutes, muscles: int) -> Placed:

@@ -52,7 +52,7 @@ class GraspAndRupture:
         count, self._switched_off = robot.muscle_count, switched_off
         self.grasp, self._motion = 0.5 * duration, duration  # [s]
         self.duration = duration + SLOT * count  # duration of the whole script [s]
-        # Messages of the motion without payload, and of that with payload before the first rupture.
+        # Rows of the motion without the payload, and with the payload before the first rupture.
         self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
         # Start with the second muscle, which the paper deactivates.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))]

@@ -236,7 +236,7 @@ class Row(Strict, frozen=True):
     quantity: str  # name of the quantity, with its unit
     default: str  # key of the value with the preset of the run
     published: str = NOTHING  # value that the paper reports for Musashi
-    paper: str = ''  # key of the value of preset `paper`; its name replaces {preset}
+    paper: str = ''  # key of the value of preset `paper`, whose name replaces {preset} in the key
     bound: str = ''  # key of the reference value
     aim: float | None = None  # goal: the highest value, or the lowest if `more_is_better`
     digits: int = 3

@@ -29,7 +29,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}  # the paper's errors before and after
+#: the errors in the paper before and after learning
+PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
 CYCLE = 10.0  # duration of the exploration's three steps [s]
 MOMENTS = 5  # number of moments that the pictures show
 

@@ -32,11 +32,11 @@ from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-POSTURES = 1000  # postures in which the model and the network are compared
+POSTURES = 1000  # number of postures in which the model and the network are compared
 #: damping of a joint, multiplied by its `joint_gear` [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
 THIN = 0.008  # radius of the capsules that draw bones [m]
-TIMESTEP = 0.002  # [s]
+TIMESTEP = 0.002  # time step of the exported model [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
 moment arm  root mean square difference of dl/dq over all joints, and the size of dl/dq

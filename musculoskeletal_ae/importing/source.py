@@ -21,12 +21,13 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES, ARM_POSTURES = 1000, 200  # numbers of postures to compare lengths, and moment arms
+POSTURES = 1000  # number of postures in which lengths are compared
+ARM_POSTURES = 200  # number of postures in which moment arms are compared
 TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad] or [m]
 SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
 LISTED = 12  # largest number of names in a message
 STRENGTH = 'tension.limit is the largest tension in the source, bias 0.1 and max 1.5 times that'
-EARTH = 9.81  # [m/s²]
+EARTH = 9.81  # gravity of the earth [m/s²]
 #: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 

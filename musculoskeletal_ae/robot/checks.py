@@ -126,7 +126,7 @@ class RobotCheck:
     one_sided: Array  # like `stiffness`, with muscles at the bias tension counted as slack, (N,)
     required: float  # required stiffness [N·m/rad]
     matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
-    faults: tuple[Finding, ...]  # reasons why the arm is not sound; empty if it is
+    faults: tuple[Finding, ...]  # reasons why the arm is not sound; empty if it is sound
     warnings: tuple[Finding, ...]  # questionable properties that do not make the arm unsound
 
     @property

@@ -48,7 +48,7 @@ class DriveEntry(Strict, frozen=True):
     """A motor whose current is measured instead of a tension."""
 
     torque_constant: Positive  # [N·m/A]
-    gear: Positive  # turns of the motor for one of the spool
+    gear: Positive  # turns of the motor per turn of the spool
     spool_radius: Positive  # [m]
 
     @property

@@ -83,7 +83,7 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
             search.tell(candidates, [cost(x) for x in candidates])
     change = change_of(search.best.x)
     if not lacks(change):
-        # Move each point back, the least moved first, if the arm stays sound.
+        # Move each point back to its old place, the least moved first, if the arm stays sound.
         for p in np.argsort(np.linalg.norm(change, axis=1)):
             without_point = np.where(np.arange(len(change))[:, None] == p, 0.0, change)
             if not lacks(without_point):

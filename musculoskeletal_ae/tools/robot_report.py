@@ -45,7 +45,7 @@ def check(args: Namespace) -> int:
     print(f'{name}: not sound, {count} fault{"s" * (count > 1)}' if count else f'{name}: sound')
     if not (count and args.suggest):
         return 1 if count else 0
-    args.out.mkdir(parents=True)  # if this fails, it fails before a search of minutes
+    args.out.mkdir(parents=True)  # raises an error before the search, which takes minutes
     try:
         return _suggested(robot, args)
     finally:

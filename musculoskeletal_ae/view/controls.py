@@ -33,7 +33,7 @@ BUTTONS = {
 }
 PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
 MOST_PUSH = 60.0  # largest force of a push with the mouse [N]
-MOST_PAYLOAD = 5.0  # [kg]
+MOST_PAYLOAD = 5.0  # largest payload that a visitor can choose [kg]
 
 
 def with_buttons(text: str) -> str:

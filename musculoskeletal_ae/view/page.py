@@ -75,7 +75,7 @@ class Page:
         # Visitors must not open a tunnel to the internet.
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self._history = History()
-        self._readings: dict[int, Readings] = {}  # by visitor
+        self._readings: dict[int, Readings] = {}  # by the client id of the visitor
         self._configure_panel()
         self.scene = Scene(server, robot)
         self.controls = None if read_only else Controls(server, robot, self.scene, act)
