@@ -47,7 +47,7 @@ TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of
 HOTTEST_AT_REST = 55.0  # highest temperature of modules without commands [°C]; it is 131 °F
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of both shipped
 # arms (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by 0.31 to 1.55
-# times the model's changes. Where another muscle fits a column 2.5 times better than its own muscle,
+# times the model's changes. If another muscle fits a column 2.5 times better than its own muscle,
 # the misfit to its own muscle is below 8.5 mm.
 ZERO_TOLERANCE = 0.045  # largest length offset of a healthy arm [m]
 SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
@@ -243,7 +243,7 @@ class Listening:
         return False
 
     def _of_source(self, fault: str) -> str:
-        """Return the name of a fault; if the driver reports currents, replace 'tension' in it."""
+        """Return the name of a fault of tensions, or of currents if the driver reports these."""
         if not self._robot.tension_source.is_current:
             return fault
         return fault.replace('tension', 'current')

@@ -64,7 +64,7 @@ def slack(robot: Robot, draw: Draw) -> Array:
 
 
 class Attachments:
-    """Random displacements of the sites of a model's tendons, which can be redrawn by muscle."""
+    """Random displacements of the sites of a model's tendons; `move` redraws single muscles."""
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
         """Move the sites of `model`, whose tendons must have the names of the robot's muscles."""

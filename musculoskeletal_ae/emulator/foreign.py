@@ -57,7 +57,7 @@ class ForeignBody:
         self.length_bias: Array = np.zeros(count)
 
     def set_posture(self, data: Any, theta: Array) -> Any:
-        """Put the bones of an MjData at θ [rad] (D,) and return it, with updated lengths."""
+        """Put the bones of `data`, an MjData, at θ [rad] (D,); update its lengths and return it."""
         data.qpos[self.tree] = self._robot.kinematics.tree.angles(theta)
         mujoco.mj_fwdPosition(self._model, data)
         return data

@@ -146,9 +146,9 @@ def _by_muscle(robot: Robot, change: Array) -> dict[str, float]:
 
 
 def nonlinearity(curve: Array) -> Array:
-    """Return the largest distance of curves (points, M) from their chords, relative to their span.
+    """Return the largest distance of each curve (points, M) from its chord, relative to its range.
 
-    It is 0 for a straight line.
+    The result is 0 for a straight line.
     """
     share = np.linspace(0.0, 1.0, len(curve))[:, None]
     chord = curve[0] + share * (curve[-1] - curve[0])

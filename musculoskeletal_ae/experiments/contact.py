@@ -54,7 +54,7 @@ class ContactLoop(ClosedLoop):
         return self._contact.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
 
     def contacts_during(self, duration: float, exploring: bool = False) -> list[Contact]:
-        """Advance by a time [s]; return the contact estimate of each message."""
+        """Advance by `duration` [s]; return the contact estimate of each message."""
         return [self.contact(exploring) for _ in range(round(duration / SAMPLE_TIME))]
 
     def rest(self, theta: Array) -> None:
@@ -159,7 +159,10 @@ def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
 
 
 def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Array:
-    """Push the moving arm; return the forces [N] and the delays of their detection [s], (2, N)."""
+    """Push the moving arm N times; return the sizes of the forces [N] and the delays of detection.
+
+    The rows of the result (2, N) are the forces [N] and the delays [s].
+    """
     robot, collisions = loop.arm.robot, list[tuple[float, float]]()
     for _ in range(TRIES_PER_COLLISION * count):
         if len(collisions) == count:

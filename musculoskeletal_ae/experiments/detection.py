@@ -40,9 +40,9 @@ LONGEST_WAIT = 5.0
 class GraspAndRupture:
     """Script of the experiment (paper, §IV-B): grasp midway, then rupture every muscle in turn.
 
-    A muscle ruptures when it carries tension. If it never does, it ruptures at the end of its wait,
-    and `carried` is False. With `switched_off`, the tendons stay intact, and the modules are
-    commanded zero tension instead.
+    A muscle ruptures as soon as it carries tension after a random wait. If it carries none until
+    LATEST_RUPTURE, it ruptures then, and `carried` is False. With `switched_off`, the tendons stay
+    intact, and the modules are commanded zero tension instead.
     """
 
     def __init__(

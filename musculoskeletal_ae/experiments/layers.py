@@ -6,8 +6,8 @@ affects the accuracy, but fewer units lower it.
 
 Here. Networks of preset `paper` with other hidden layers are trained on the geometric model, and
 then learn from the messages of the default preset’s exploration of one individual. Only the first
-individual is measured. A network does not learn if checkpoint validation rejects it, because its
-initial training was too inaccurate.
+individual is measured. If initial training leaves a network too inaccurate, checkpoint validation
+rejects it, and the network does not learn.
 
 - model: mean error of θ, T and l after initial training, on states of the geometric model that were
   not used for training

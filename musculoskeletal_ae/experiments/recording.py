@@ -145,10 +145,10 @@ def record(
     """Drive an arm through the three steps of exploration with a fixed list of commands.
 
     Every command is computed by method `first`. Method `second` would need the current tension,
-    which a fixed list cannot contain. Its step therefore uses `first` with the least tension that
-    holds the posture on the geometric model. While a muscle is switched off, all modules follow
-    tensions: 0 N for this muscle, and the tensions of MSC for all other muscles. A
-    position-controlled module is paid out instead.
+    which a fixed list cannot contain. The step of `second` is therefore replaced by `first` with
+    the least tension that holds the posture on the geometric model. While a muscle is switched off,
+    all modules follow tensions: 0 N for this muscle, and the tensions of MSC for all other muscles.
+    A position-controlled module is paid out instead.
 
     Args:
         arm: The arm.

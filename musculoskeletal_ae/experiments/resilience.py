@@ -100,7 +100,7 @@ class IsolatingLoop(ClosedLoop):
             self.estimator.commanded(now, **{command.kind: command.value})
 
     def run(self, duration: float) -> Array:
-        """Advance by a time [s]; return the error of every estimate [rad]."""
+        """Advance by `duration` [s]; return the error of every estimate [rad]."""
         errors = list[float]()
         for _ in range(round(duration / SAMPLE_TIME)):
             self.step()
@@ -148,8 +148,8 @@ class Reach(NamedTuple):
 
     Attributes:
         share: Share of the holdable postures of the true body that remain holdable.
-        distances: Final distance of `proposed` from each target [rad], or None if it refused the
-            target.
+        distances: Final distance of `proposed` from each target [rad]; None if the controller
+            refused the target.
         trapped: The entries of `distances` for motions that ended at a joint stop, in a posture
             that the remaining muscles can neither hold nor leave.
     """

@@ -177,7 +177,7 @@ def play(robot: Robot, file: Path) -> int:
 
 
 def length_verdict(comparison: Comparison | None) -> str:
-    """Return a text about the muscles whose lengths differ most from the source's engine."""
+    """Return a text on the muscles whose lengths differ most from those of the source's engine."""
     errors = comparison.lengths if comparison else None
     if not errors:
         return 'lengths: not compared, because the source computes none'
@@ -189,7 +189,7 @@ def length_verdict(comparison: Comparison | None) -> str:
 
 
 def arm_verdict(comparison: Comparison) -> str:
-    """Return a text about the moment arms that differ most from the source's engine."""
+    """Return a text on the moment arms that differ most from those of the source's engine."""
     worst = sorted(comparison.arms.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
     verdict = f'largest moment arm error over {ARM_POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'

@@ -79,7 +79,7 @@ class Source:
     above: dict[str, str] = field(default_factory=dict)  # parent of each link, if known
 
     def note(self, kind: str, text: str) -> None:
-        """Add the line '`kind`: `text`' to the report; kinds are 'chosen', 'dropped' and others."""
+        """Add a line to the report: `kind`, such as 'chosen' or 'dropped', and then `text`."""
         self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:

@@ -161,7 +161,7 @@ class Actuation(ABC):
 
         Args:
             lag: λ, time by which the modules lag behind [s].
-            speed: Speed at which they pay out [m/s], (M,); not negative.
+            speed: Speed at which the modules pay out [m/s], (M,); not negative.
         """
 
     def fastest(self, rate_limit: float) -> Array:

@@ -352,7 +352,7 @@ def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterat
 
 
 def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
-    """Return the joint on which each muscle acts most, and how often its sign there is reversed.
+    """Return the joint on which each muscle acts most, and how often its sign there changes.
 
     Args:
         moment_arms: r [m] in N postures, (N, M, D).

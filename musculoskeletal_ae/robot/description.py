@@ -101,7 +101,7 @@ Route = tuple[RoutePoint | Wrap, ...]
 
 
 def branches(route: Route) -> list[Route]:
-    """Return the branches of a route. The tendon does not connect them; most routes have one."""
+    """Return the branches of a route. Most routes have one branch, those over pulleys several."""
     starts = [i for i, item in enumerate(route) if isinstance(item, RoutePoint) and item.divisor]
     ends = sorted({0, *starts, len(route)})
     return [route[start:end] for start, end in pairwise(ends)]

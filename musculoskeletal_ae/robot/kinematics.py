@@ -41,7 +41,7 @@ def body_frames(model: pin.Model) -> list[pin.Frame]:
 
 
 def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
-    """Return the joint of the tree that carries a link, and the link's pose in the joint frame."""
+    """Return the joint that carries a link, and the link's pose in the frame of the joint."""
     frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
     return int(frame.parentJoint), frame.placement
 
@@ -83,8 +83,8 @@ class Kinematics:
     ) -> None:
         """Reduce a URDF's model to the joints of θ and the joints coupled to them.
 
-        All other joints are locked at zero; a joint coupled to one of these is locked at its
-        offset.
+        All other joints are locked at zero. A joint that is coupled to a locked joint is locked at
+        the offset of its coupling.
 
         Args:
             full_model: Model of the whole URDF.
@@ -121,7 +121,7 @@ class Kinematics:
         self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
-        """Return the joint of the tree that carries a link, and a point of the link in its frame.
+        """Return the joint that carries a link, and a point of the link in the frame of the joint.
 
         Args:
             link: Name of the link.
@@ -134,7 +134,7 @@ class Kinematics:
         return joint, placement.act(xyz)
 
     def placement(self, link: str) -> tuple[int, pin.SE3]:
-        """Return the joint of the tree that carries a link, and the link's pose in its frame."""
+        """Return the joint that carries a link, and the link's pose in the frame of the joint."""
         return link_placement(self.model, link)
 
     def with_elasticity(self, elasticity: JointElasticity) -> Kinematics:

@@ -135,7 +135,8 @@ class Robot:
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
         """Return the highest load of each joint in N postures [N·m], (D,).
 
-        The load is the size of a torque, plus the sizes of the torques of all muscles at T_bias.
+        The load of a joint is the size of the holding torque, plus the sum of the sizes of the
+        torques that all muscles exert on the joint at T_bias.
 
         Args:
             torque: Torque that holds the arm in N postures [N·m], (N, D).

@@ -181,7 +181,7 @@ class Controls:
             self._timeline.value = round(min(played), 1)
 
     def end_push(self) -> None:
-        """End a push, whose visitor may have left; if a visitor still drags, it begins again."""
+        """End a push, because its visitor may have left; the push of a present visitor resumes."""
         if self._is_pushing:
             self._is_pushing = self._force.visible = False
             self._act('push', np.zeros(3))
