@@ -14,7 +14,8 @@ class Detection:
 
     anomaly_threshold: float = settable(
         0.0,
-        'value of A above which 5 consecutive messages are an anomaly (0: calibrated detector)',
+        'value of A above which 5 consecutive messages are an anomaly '
+        '(0: decide by the calibrated detector instead)',
         'scaled units',
         0.0,
         1e6,
@@ -23,7 +24,7 @@ class Detection:
         0.06, 'longest slack that a muscle module may wind in', 'm', 0.0, 1.0
     )
     slack_speed: float = settable(
-        0.005, 'winding speed below which a muscle module is stationary', 'm/s', 1e-4, 1.0
+        0.005, 'winding speed below which a muscle module counts as stationary', 'm/s', 1e-4, 1.0
     )
     on_anomaly: str = settable(
         'stop',

@@ -13,7 +13,7 @@ class Settings:
     """Thresholds for rest, and for the distance of a new sample from every stored one."""
 
     rest_time: float = Parameter(
-        0.3, 'time for which the arm has to be still', 's', (0.0, 10.0)
+        0.3, 'time for which the arm has to be still before it counts as at rest', 's', (0.0, 10.0)
     ).field()
     rest_joint_rate: float = Parameter(
         0.02,
@@ -26,13 +26,16 @@ class Settings:
     ).field()
     new_joint_distance: float = Parameter(
         0.05,
-        'smallest difference in one joint that makes a sample new '
+        'difference of a joint angle above which two samples count as different '
         '(for prismatic joints times 0.06 m)',
         'rad',
         (0.0, 3.0),
     ).field()
     new_tension_distance: float = Parameter(
-        10.0, 'smallest difference in one tension that makes a sample new', 'N', (0.0, 500.0)
+        10.0,
+        'difference of a tension above which two samples count as different',
+        'N',
+        (0.0, 500.0),
     ).field()
 
 
