@@ -51,7 +51,7 @@ MOST_MEMORY = 500.0  # largest legal memory of a node at any time [MB]
 
 
 class Size(NamedTuple):
-    """Number of trials, over all seeds."""
+    """Numbers of trials of each kind, over all seeds."""
 
     attacks: int | None  # number of known attacks, or None for all of them
     events: int
@@ -77,7 +77,7 @@ class Row(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Changes between successive commands of the controller."""
+    """How fast the commands of one controller process changed."""
 
     count: int
     largest_in: float  # largest winding in within one tick [m]
@@ -86,7 +86,7 @@ class Steps(NamedTuple):
 
 
 def changes(time: Array, number: Array, value: Array, rate: float, relieved: Array) -> Steps:
-    """Check the rate of the commands of one controller process.
+    """Return how fast the commands of one controller process changed, and which did too fast.
 
     Args:
         time: Times of publishing [s], (N,).
@@ -134,7 +134,7 @@ def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscle
 
 
 def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array:
-    """Return for how long [s] each muscle was above `highest` [N] without interruption, at most.
+    """Return the longest uninterrupted time [s] of each muscle above `highest` [N].
 
     `loads` are times [s] and measured T [N] (M,). The result is (M,), or (0,) without loads.
     """
@@ -201,7 +201,7 @@ def attack_graph(
 
 
 def evaluate(attack: 'Attack') -> list[Row]:
-    """Return the promises and their violations, from the recorded data."""
+    """Check the data that the attack recorded; return each promise with its violations."""
     from bench.attack_graph import LENGTH
 
     robot, tried, violations = attack.robot, attack.tried, attack.findings

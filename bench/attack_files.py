@@ -33,7 +33,7 @@ KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
 
 class Attempt(NamedTuple):
-    """Outcome of reading one file: `used`, `refused`, or a finding."""
+    """Outcome of reading one file: `used`, `refused`, or the description of a finding."""
 
     kind: str
     outcome: str

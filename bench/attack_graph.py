@@ -298,7 +298,7 @@ class Attack:
                         self.start(name)
 
     def wait(self, condition: Callable[[], Any], promise: str, what: str) -> bool:
-        """Handle messages until a condition holds; return whether it did before the deadline."""
+        """Handle messages until a condition holds; return False if it does not hold in time."""
         end = time.monotonic() + PATIENCE
         while not condition():
             if time.monotonic() > end:
@@ -348,7 +348,7 @@ class Attack:
         self.call(SetParameters, 'hardware_emulator/set_parameters', request)
 
     def moving(self) -> bool:
-        """Clear latches and explore; return whether commands arrive before the deadline."""
+        """Clear anomalies and stops, and explore; return whether the arm moves in time."""
         self.wait(lambda: set(self.levels) == set(NODES), 'every node goes on', 'all reports')
         self.set_faults([])
         for node, name, value in HEALTHY:
@@ -383,7 +383,7 @@ class Attack:
         return self._topics
 
     def services(self) -> dict[str, str]:
-        """Return the types of all services, by name."""
+        """Return the types of all services that the bench can call, by name."""
         for name in NODES:
             with suppress(NodeNameNonExistentError):
                 pairs = self.node.get_service_names_and_types_by_node(name, self.namespace)

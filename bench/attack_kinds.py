@@ -55,7 +55,7 @@ class Scene:
 
     @contextmanager
     def wrong(self) -> Iterator[None]:
-        """Check that the status line reports a problem within the context."""
+        """Return a context within which the status line must report a problem after some time."""
         begin = time.time()
         yield
         silent = [
@@ -161,7 +161,7 @@ class Scene:
     # -- actions of the hostile node ------------------------------------------------------------
 
     def publish(self, topic: str, *messages: Any, period: float = 0.1, qos: Any = OWN) -> None:
-        """Publish messages from a node of another name."""
+        """Publish messages on a topic of the arm as the hostile node."""
         attack = self.attack
         if topic not in attack.publishers:
             kind = type(messages[0])
@@ -288,7 +288,7 @@ def shifted(topic: str, joints: float) -> Callable[[Scene], None]:
 
 
 def second(name: str, node: str = '') -> Callable[[Scene], None]:
-    """Return an attack that starts a second node."""
+    """Return an attack that starts the node `name` a second time, as `node` if this is given."""
 
     def attack(scene: Scene) -> None:
         begin, graph = time.time(), scene.attack
@@ -309,7 +309,7 @@ def second(name: str, node: str = '') -> Callable[[Scene], None]:
 
 
 def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
-    """Return an attack that proposes a consistently wrong network."""
+    """Return an attack that publishes a network changed by `change`, as the learner would."""
 
     def attack(scene: Scene) -> None:
         mae = checkpoint.from_bytes(
@@ -336,7 +336,7 @@ def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae
 
 
 def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
-    """Return an attack that suspends or kills a node."""
+    """Return an attack that suspends the node `name`, or kills it if not `is_paused`."""
 
     def attack(scene: Scene) -> None:
         # The process ends on purpose. `recover` restarts it if the status line advises that.
@@ -353,7 +353,7 @@ def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
 
 
 def fault(line: str, *services: str) -> Callable[[Scene], None]:
-    """Return an attack that breaks the arm, then calls services."""
+    """Return an attack that injects the fault `line` into the arm, and then calls services."""
 
     def attack(scene: Scene) -> None:
         scene.attack.set_faults([line])

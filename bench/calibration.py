@@ -62,7 +62,7 @@ class Row(NamedTuple):
 def calibration(
     robot: Robot, default: Mae, paper: Mae, seeds: Iterable[int], minutes: float = 5.0
 ) -> list[Row]:
-    """Measure individuals before any learning, on the held-out motion.
+    """Return the errors of individuals on the held-out motion, before any learning.
 
     Args:
         robot: The geometric model.

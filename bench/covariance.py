@@ -53,7 +53,7 @@ class Never(Trainer):
 
 
 def learned(robot: Robot, driver: Mae, exploring: Recording, seed: int, source: str) -> Mae:
-    """Return the network learned from an individual's exploration with a source of θ."""
+    """Return the network that learns from the exploration `exploring`, with one source of θ."""
     learner = Learner(robot, driver, seed=seed, trainer=Never, joint_source=source)
     teach(learner, zip(*exploring, strict=True), VIEWS[source])
     observed, healthy = learner.samples.observations(), learner.collector.healthy.healthy()

@@ -125,7 +125,7 @@ def _joined(lines: list[str]) -> list[str]:
 
 
 def script(page: Path, repository: str) -> str:
-    """Return a shell script that follows a page."""
+    """Return a shell script that runs the commands of a page, with `repository` for REPOSITORY."""
     lines, has_ros2 = [FUNCTIONS], False
     (build_ros2,) = (block for mark, block in _blocks(ROOT / INSTALL) if mark == ROS2)
     for command in commands(page):
@@ -148,7 +148,7 @@ def script(page: Path, repository: str) -> str:
 
 
 def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
-    """Follow a page; return whether every command succeeded."""
+    """Run the commands of a page in a clone; return whether every command succeeded."""
     print(f'\n== {page}', flush=True)
     paths = os.environ['PATH'].split(os.pathsep)
     paths = [path for path in paths if not path.startswith(sys.prefix)]
@@ -184,7 +184,7 @@ def _parse(argv: list[str]) -> Namespace:
 
 
 def main(argv: list[str]) -> int:
-    """Follow the pages; exit status 1 if a command failed."""
+    """Run the commands of the pages; return 1 if a command failed."""
     options = _parse(argv)
     pages = options.pages or PAGES
     if options.list:

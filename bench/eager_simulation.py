@@ -134,7 +134,7 @@ class EagerSimulation:
         return length.detach(), torch.autograd.grad(length, angles, tension)[0]
 
     def _hold(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the results of `load.hold`: (N, D) and (N, D, D)."""
+        """Return the holding torque (N, D) and its derivative by θ (N, D, D), as in `load.hold`."""
         tree, (placement, first, second) = self.tree, self.poses
         poses = [placement.new_tensor(np.eye(4)).expand(len(theta), 4, 4)]
         for i in range(1, len(tree.parent)):
@@ -166,7 +166,7 @@ class EagerSimulation:
         return load, self.springs - self.onto.T @ both @ self.onto
 
     def _slopes(self, theta: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the terms of `add_slopes`: G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D)."""
+        """Return G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D), as `add_slopes` computes them."""
         count, joints = theta.shape
         jacobian = theta.new_zeros(count, tension.shape[1], joints)
         curvature = theta.new_zeros(count, joints, joints)
@@ -181,7 +181,7 @@ class EagerSimulation:
         return jacobian, curvature
 
     def _turn(self, theta: Tensor, push: Tensor, matrix: Tensor, h: float) -> tuple[Tensor, Tensor]:
-        """Return θ after a step, and which joints a joint limit or a hand holds."""
+        """Return θ after a step, and a mask of joints held by a limit or a hand, both (N, D)."""
         low, high, most, fixed = self.body.lower, self.body.upper, JOINT_SPEED * h, self.fixed
         forced = torch.isfinite(fixed)
         held = forced | ((theta <= low) & (push < 0.0)) | ((theta >= high) & (push > 0.0))

@@ -43,7 +43,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
-LOAD, MINUTE = 3.6, 60.0  # mass of the payload [kg]; duration of a minute [s]
+LOAD, MINUTE = 3.6, 60.0  # mass of the payload [kg]; time until it is added or removed again [s]
 
 MESSAGES = {
     'change of l in 10 ms [m]': SIGNAL_LIMITS.step,
@@ -67,7 +67,7 @@ class Spread:
     """The largest value of each measure over networks, and the refused networks."""
 
     def __init__(self) -> None:
-        """Begin without networks."""
+        """Start with no network."""
         self.most: defaultdict[str, float] = defaultdict(float)
         #: smallest d of a ruptured muscle, as a multiple of the detection threshold
         self.least_ruptured = np.inf
@@ -120,7 +120,7 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
 
 
 def limit(name: str) -> float:
-    """Return a measure's limit."""
+    """Return the limit of a measure by its name."""
     if name in (limits := LIMITS | MESSAGES):
         return limits[name]
     return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'in use' in name else 1.0)

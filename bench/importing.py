@@ -52,9 +52,10 @@ LEARNED = ('before [rad]', 'after', 'oracle', '`proposed`')
 
 
 def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Array]], Any]:
-    """Return a function that lets MuJoCo compute the straight muscles of a cardsflow.xml.
+    """Return a function that computes lengths of a cardsflow.xml's straight muscles by MuJoCo.
 
-    It takes joint positions by name, each (N,), and returns lengths by muscle [m], each (N,).
+    The function takes joint positions by name, each (N,), and returns lengths by muscle [m], each
+    (N,).
     """
     urdf = file.with_name('model.urdf')
     tree, root = (parse_xml(each, read_text(each, refuse)) for each in (urdf, file))
@@ -111,7 +112,7 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
 
 
 def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Comparison | None:
-    """Return the comparison with MuJoCo."""
+    """Return the comparison of a robot with MuJoCo, which for a cardsflow.xml is made here."""
     if file.name != 'cardsflow.xml' or not file.with_name('model.urdf').exists():
         return comparison
     source = read_source(file)

@@ -37,7 +37,7 @@ DEADLINE = 60.0  # longest time in which a child may start [s]
 
 
 def samples(robot: Robot, life: int) -> Iterator[Sample]:
-    """Draw the samples of one child process."""
+    """Yield the samples that the child process number `life` accepts, which are random."""
     rng = np.random.default_rng([life, 0x51])
     while True:
         theta = robot.random_postures(1, rng)[0]
@@ -56,7 +56,7 @@ def digest(store: SampleStore) -> int:
 
 
 def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
-    """Learn until killed."""
+    """Run a learner that accepts the samples of `life`, and print its reports until killed."""
 
     def say(*words: object) -> None:
         print(*words, flush=True)
@@ -165,7 +165,7 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
 
 
 def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[SampleStore]:
-    """Return the store after one child, with the reported samples and with one more."""
+    """Return the stores that a child may leave: with the samples it reported, and with one more."""
     drawn = samples(robot, life)
     for _ in range(accepted):
         store.add(next(drawn))

@@ -50,7 +50,7 @@ class LearnedArm(NamedTuple):
 
 
 def initial(robot: Robot, folder: Path) -> Mae:
-    """Return the network of the geometric model."""
+    """Return the network of the geometric model, from the cache in `folder` if it is there."""
     file = folder / 'initial.safetensors'
     if not file.exists():
         checkpoint.save(initial_mae(robot).mae, file)
@@ -58,7 +58,7 @@ def initial(robot: Robot, folder: Path) -> Mae:
 
 
 def learned_arm(robot: Robot, seed: int, folder: Path, minutes: float) -> LearnedArm:
-    """Return an individual that learned for some minutes."""
+    """Return an individual that has learned for `minutes`, from the cache in `folder` if there."""
     folder.mkdir(parents=True, exist_ok=True)
     driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
     messages = folder / f'exploring_{seed}.npz'

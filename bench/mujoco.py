@@ -90,7 +90,7 @@ def parse(text: str) -> tuple[str, Path, dict[str, Any]]:
 
 
 def speed(arm: Arm) -> float:
-    """Return the number of seconds of an arm that one core computes in a second."""
+    """Return how many seconds of an emulated arm one core computes in a second."""
     arm.step(0.2)
     start = time.process_time()
     arm.step(2.0)
@@ -158,7 +158,7 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
 
 
 def attempt(cell: Callable[[], str]) -> str:
-    """Return a cell, or the error that prevented it."""
+    """Return what `cell` returns, or the message of its error."""
     try:
         return cell()
     except MusculoskeletalError as error:

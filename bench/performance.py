@@ -33,7 +33,7 @@ from musculoskeletal_ae.robot.robot import Robot
 ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
-EXPLORING = 60.0  # duration of the exploration whose samples an update is timed with [s]
+EXPLORING = 60.0  # duration of the exploration that provides the samples of the timed update [s]
 FLAME_RATE = 200.0  # rate of muscle_states while a profile is recorded [Hz]
 STARTING = 60.0  # longest wait for the first command [s]
 SETTLING = 15.0  # time from the start of the nodes until profiles are recorded [s]

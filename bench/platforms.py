@@ -77,10 +77,10 @@ class Site:
         return self.folder / 'log.txt'
 
     def run(self, title: str, *lines: str, on_platform: bool = False) -> str:
-        """Run shell lines, on the platform or on the host; return their output.
+        """Run shell lines on the host, or on the platform; return their output.
 
         Raises:
-            MusculoskeletalError: If they fail; the end of their output is printed.
+            MusculoskeletalError: If a line fails; the end of the output is printed before.
         """
         print(f'   {title}', flush=True)
         script, command = ['set -e', *lines], ['bash', '-c']
@@ -116,7 +116,7 @@ def _environment(home: Path) -> dict[str, str]:
 
 
 def interpreter(version: str) -> Path | None:
-    """Return the Python of a version, such as 3.12, from PATH or pyenv."""
+    """Return the path of a Python of a version such as 3.12, from PATH or pyenv, or None."""
     pyenv = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv')) / 'versions'
     candidates = [shutil.which(f'python{version}'), *sorted(pyenv.glob(f'{version}.*/bin/python'))]
     for candidate in filter(None, candidates):
@@ -269,7 +269,7 @@ def check_system(name: str, folder: Path, tests: tuple[str, ...] = TESTS) -> str
 
 
 def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
-    """Return the lines of a requirements file for a Python version; only of `names`, if any."""
+    """Return the pinned requirements in `file` for a Python version; of `names` only, if given."""
     lines = []
     for line in file.read_text('utf-8').splitlines():
         requirement, _, condition = line.partition(';')

@@ -63,7 +63,7 @@ def _rows(run: Run, rows: Any) -> Run:
 
 
 def neck_splits(recording: Recording) -> Iterator[Split]:
-    """Split the soft neck: training with one payload, or with two and test with the third."""
+    """Yield splits of the soft neck: training with one payload, or with two and test with one."""
     none, half, whole = recording.runs
     own = none.at_rest(HALF)
     # The rests of every other pose (HALF) are for training, so test on all rows of the poses
@@ -80,7 +80,7 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
 
 
 def arm_splits(recording: Recording) -> Iterator[Split]:
-    """Split the soft arm: test with other files of the same payload, or with other payloads."""
+    """Yield splits of the soft arm: test with other files of a payload, or with other payloads."""
     files = {load: [run for run in recording.runs if run.load == load] for load in (0.0, 0.5)}
     others = [run for run in recording.runs if run.load not in files]
     bare, held_out = files[0.0][0::2], files[0.0][1::2]
@@ -92,7 +92,7 @@ def arm_splits(recording: Recording) -> Iterator[Split]:
 
 
 def stand_splits(recording: Recording) -> Iterator[Split]:
-    """Split the test stand: training with 20 or 100 of its poses, and test with all others."""
+    """Yield splits of the test stand: training with 20 or 100 poses, and test with all others."""
     run = recording.runs[0]
     order = np.random.default_rng(0).permutation(len(run.length))
     for count in (20, 100):
@@ -158,7 +158,7 @@ def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str,
 
 
 def observations(recording: Recording) -> dict[str, Any]:
-    """Return what the runs of a recording show besides the errors of models."""
+    """Return what runs of a recording show without a model of θ, such as slopes and R², by name."""
     shown: dict[str, Any] = {}
     azimuths = np.array(recording.link.azimuths)
     if recording.link.name == 'soft_neck':

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of recordings: that of this package, and those for comparison.
+"""Models that estimate θ in recordings: that of this package, and others to compare it with.
 
 Every model is trained on rest samples and maps lengths (and efforts) to θ.
 """
@@ -87,10 +87,10 @@ def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], 
 def package(
     link: SoftLink, directory: Path, training: Run, with_effort: bool = False, seed: int = 0
 ) -> Model:
-    """Return the estimate of θ by a network of this package, trained on the rest samples.
+    """Return a model that estimates θ by a network of this package.
 
-    The network learns the body model that was calibrated with them. With efforts, these are taken
-    for tensions; without, the tensions are unknown.
+    The body model is calibrated with the rest samples in `training`, and the network learns this
+    body model. With efforts, the model takes efforts for tensions. Without, tensions are unknown.
     """
     robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
     tension = tensions(robot, training, with_effort)
@@ -106,14 +106,14 @@ def package(
 
 
 class Statics:
-    """Rest postures by the balance of springs, weight, payload and elastic tendons.
+    """Computes rest postures by the balance of springs, weight, payload and elastic tendons.
 
         0 = g(θ) + K θ − λ m Jᵀ F₁ + G(θ)ᵀ T,     T = k max(0, f_geo(θ) − γ l + p)
 
-    F₁ is the weight of 1 kg. The lengths l are known, and the tensions T follow. Unknown are the
+    F₁ is the weight of 1 kg. The lengths l are known, and the tensions T follow from them. The
     spring K, the stiffness k of the tendons, the scale γ of the spools, the pretension p and the
-    share λ of the payload. They are fitted to rest samples with known payloads m. The orientation
-    of the IMU in a run is unknown as well, and 0 in runs without training samples.
+    share λ of the payload are fitted to rest samples with known payloads m. The orientation of the
+    IMU in each of these runs is fitted as well; in other runs it is taken to be 0.
     """
 
     #: means and standard deviations of the prior of log K [N·m/rad], log k [N/m], log γ, p [m], λ

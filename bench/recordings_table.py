@@ -27,8 +27,8 @@ class Result(NamedTuple):
 def table(results: list[Result]) -> str:
     """Return the errors of one recording as a Markdown table.
 
-    Of the polynomials of all rows, only the best one of each split stands there. The best model
-    from the rest samples is in bold.
+    The polynomials that were fitted to all rows share one row of the table, which contains the
+    smallest of their errors for each split. The best model from the rest samples is in bold.
     """
     errors, samples = dict[tuple[str, str], float](), dict[str, int]()
     for result in results:

@@ -73,7 +73,7 @@ class Row(NamedTuple):
 def measured(
     robot: Robot, default: Mae, paper: Mae, seed: int, effects: Effects, share: float
 ) -> Row:
-    """Record an individual, learn it with preset `paper`, and measure it.
+    """Record an individual, learn it with preset `paper`, and return its results.
 
     `share` scales all durations.
     """

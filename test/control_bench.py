@@ -70,7 +70,7 @@ class Bench:
         self.blind = set()
 
     def step(self, count=1):
-        """Return the commands of some steps."""
+        """Run `count` steps of 10 ms with the sensor data of the bench; return the commands."""
         sent = []
         for _ in range(count):
             self.now += self.dt

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real ROS graph for tests: nodes in this process or others, real DDS, waits with deadlines."""
+"""A ROS graph for tests, over DDS: it runs nodes in this process or others, and every wait ends."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticSt
 
 
 def executable(name: str) -> list[str]:
-    """Return the command of an installed executable, found like by `ros2 run`."""
+    """Return the command that runs an installed executable, which is found as by `ros2 run`."""
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         file = Path(prefix) / 'lib' / 'musculoskeletal_ae' / name
         if file.exists():
@@ -43,9 +43,9 @@ def executable(name: str) -> list[str]:
 
 
 class Process:
-    """One command, ended when the test ends.
+    """The process of a command.
 
-    Its output goes to a file, because an unread pipe would block the command when it is full.
+    Its output goes to a file, because a full pipe that nobody reads would block the process.
     """
 
     def __init__(self, name: str, command: list[str], **options: Any) -> None:
@@ -135,7 +135,7 @@ class Graph:
         return process
 
     def run(self, name: str, *options: str) -> Process:
-        """Run a tool, which ends by itself or with the test, in this graph's namespace."""
+        """Start a tool in this graph's namespace; it ends by itself, or when the test ends."""
         remap = ['--ros-args', '-r', f'__ns:={self.namespace}']
         self.tools.append(Process(name, [*executable(name), *options, *remap]))
         return self.tools[-1]
@@ -160,7 +160,7 @@ class Graph:
         node.destroy_node()
 
     def ended(self, process: Process, number: int | None = None) -> tuple[int, str]:
-        """Wait for the end of a process, or send a signal; return exit status and output."""
+        """Send a signal if one is given, wait for the end; return exit status and output."""
         self.processes.remove(process)
         return process.ended() if number is None else process.end(number)
 
@@ -203,7 +203,7 @@ class Graph:
         return value
 
     def next(self, topic: str, count: int = 1) -> Any:
-        """Return the count-th message from now on."""
+        """Wait for `count` more messages on a topic, and return the last of them."""
         messages = self.received[topic]
         wanted = len(messages) + count
         self.wait(lambda: len(messages) >= wanted, f'{count} messages on {topic}')

@@ -29,7 +29,10 @@ def _noise(mae: Mae) -> Mae:
 
 
 def _last(quantity: int, change: Callable[[Array, Array, Array], None]) -> Attack:
-    """Change weight and bias of the decoder's last layer for θ (0), T (1) or l (2)."""
+    """Return an attack that changes the decoder's last layer for θ (0), T (1) or l (2).
+
+    `change` modifies weight and bias in place; its third argument has the rows of the quantity.
+    """
 
     def attack(mae: Mae) -> Mae:
         joints, muscles = len(mae.joints), len(mae.muscles)
@@ -63,7 +66,7 @@ def _lengths(times: float) -> Attack:
 
 
 def _shifted(quantity: int, scaled: float) -> Attack:
-    """Add an offset [scaled units] to the decoder's output for the first joint or muscle."""
+    """Return an attack that adds `scaled` units to the output of the first joint or muscle."""
 
     def attack(mae: Mae) -> Mae:
         row = (0, len(mae.joints), len(mae.joints) + len(mae.muscles))[quantity]
@@ -96,7 +99,7 @@ ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 
 
 def _other_lengths(times: float = 1.0, more: float = 0.0, part: slice = slice(None)) -> Attack:
-    """Scale and shift all lengths of a network consistently; `more` is in [m]."""
+    """Return an attack that scales lengths by `times` and shifts them by ±`more` [m] everywhere."""
 
     def attack(mae: Mae) -> Mae:
         std, mean = mae.std.copy(), mae.mean.copy()
@@ -111,7 +114,7 @@ def _other_lengths(times: float = 1.0, more: float = 0.0, part: slice = slice(No
 
 
 def _other_joint(mae: Mae) -> Mae:
-    """Reverse a joint in all inputs and outputs of a network."""
+    """Return the network with the sign of its first joint reversed in all inputs and outputs."""
     std = mae.std.copy()
     std[0] *= -1.0
     return replace(mae, std=std)

@@ -29,7 +29,7 @@ def test_before_the_first_tick_all_time_counts():
 
 
 def test_a_node_that_is_always_late_still_notices_a_silent_stream():
-    """Once a stream was silent for 90 s on a busy machine, and the status line did not say so."""
+    """This happened: on a busy machine, a stream was silent for 90 s without being reported."""
     now, clock = 0.0, AwakeClock(0.3)
     reception = Reception(print, lambda: clock.at(now))
     clock.tick(now)

@@ -35,7 +35,7 @@ MOMENTS = [(signal.SIGINT, 0.3), (signal.SIGTERM, 0.9), (signal.SIGINT, 2.0), (s
 
 
 def run(name, *arguments, before='', **environment):
-    """Run an executable in another process, after other statements."""
+    """Run an executable in another process, after the Python statements `before`."""
     code = (
         f'import sys\nfrom musculoskeletal_ae import executables\n'
         f'sys.argv[0] = {name!r}\n{before}\nsys.exit(executables.{name}())'

@@ -57,7 +57,7 @@ class Line(NamedTuple):
 
 
 class LineFit:
-    """Fits y = a x + b, without unknowns of single samples."""
+    """The problem to fit a and b of y = a x + b; no unknown belongs to a single sample."""
 
     usual = np.zeros(0), np.full(2, 1e-6)  # a very weak prior
 
@@ -110,7 +110,7 @@ def test_the_noise_of_residuals_without_outliers_is_their_spread():
 
 def test_a_step_that_would_raise_the_cost_is_damped():
     class Curved(LineFit):
-        """Fits an arc tangent, whose Gauss–Newton steps overshoot far from the solution."""
+        """The fit of an arc tangent; far from its solution, Gauss–Newton steps overshoot."""
 
         usual = np.zeros(0), np.ones(1)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Properties of every command line."""
+"""Properties that the command lines of all tools and benches have."""
 
 import argparse
 from importlib import import_module

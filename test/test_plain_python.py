@@ -31,9 +31,9 @@ def imported(files):
 
 
 def extra_of(file):
-    """Return the extra that installs the imports of a file; '' without one.
+    """Return the extra of setup.cfg that installs the imports of a file; '' if it needs none.
 
-    MuJoCo belongs to the extra `experiments`; the example shows that learning works without.
+    MuJoCo belongs to the extra `experiments`; the example shows that learning works without it.
     """
     return 'experiments' if 'mujoco' in imported([file]) else EXTRAS.get(file.parent.name, '')
 
@@ -42,7 +42,7 @@ distributions = cache(packages_distributions)  # cached, because a call takes a 
 
 
 def distribution(module):
-    """Return the name of the distribution of a module; pin installs pinocchio in its own folder."""
+    """Return the name of the distribution that installs a module; for pinocchio it is `pin`."""
     return 'pin' if module == 'pinocchio' else distributions()[module][0].lower()
 
 

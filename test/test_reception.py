@@ -10,7 +10,7 @@ SECOND = 1_000_000_000
 
 
 class Inbox:
-    """A topic with this number of publishers."""
+    """A reception whose topic has a fixed number of publishers, and the messages that it used."""
 
     def __init__(self, publishers=1):
         self.used = []

@@ -18,13 +18,13 @@ __all__ = ['graph']
 
 @pytest.fixture(scope='session')
 def content():
-    """Messages on every topic of the interface."""
+    """Return messages on every topic of the interface."""
     return samples.samples(63, '/left_arm')
 
 
 @pytest.fixture
 def bag(tmp_path, content):
-    """A valid bag of our writer."""
+    """Return a valid bag that our writer has written."""
     samples.write_ours(tmp_path / 'bag', content, 'zstd', finish=True)
     return tmp_path / 'bag'
 
@@ -77,6 +77,6 @@ def tool():
 
 @pytest.fixture(autouse=True, scope='session')
 def private_graph():
-    """Keep the graph off the network if test.sh has not set these variables."""
+    """Keep the ROS graph on this machine if test.sh has not set the variables that do so."""
     os.environ.setdefault('ROS_DOMAIN_ID', '67')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

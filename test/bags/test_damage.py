@@ -33,7 +33,7 @@ def recording(request, tmp_path_factory, content):
 
 
 def damage(data, rng):
-    """Return bytes after truncation, or after a change, removal or insertion in one place."""
+    """Return `data` truncated, or with bytes changed, removed or inserted in one place."""
     changed = bytearray(data)
     at = rng.randrange(len(changed))
     size = rng.choice((1, 4, 8, 30, 300))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Type definitions in bags are compared with those of ROS 2 Jazzy, and never used."""
+"""Type definitions in bags are only compared with those of ROS 2 Jazzy, never used to decode."""
 
 import re
 import sys

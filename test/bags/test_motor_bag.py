@@ -39,7 +39,7 @@ def joint_state(names, position, effort, stamp):
 
 
 def recording(path, topic='/joint_states', joints=ROBOT.joints, stamps=range(1, COUNT + 1)):
-    """Write a bag of motors and joints on one topic; return the arm."""
+    """Write a bag with the states of motors and joints on one topic; return the recorded arm."""
     arm = Arm(ROBOT, count=COUNT)
     arm.content.clear()
     for i, stamp in zip(range(COUNT), stamps):

@@ -89,7 +89,7 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
 
 
 def motion(tmp_path, times, first=()):
-    """Return a bag of a motion sampled at some times [s], after messages of other joints."""
+    """Return the motion taught by a bag: sampled at `times` [s], other joints at `first` [s]."""
     arm = Arm(Robot.load('arm26'), count=1)
     for at in first:
         arm.add(f'/{TAUGHT_TOPIC}', JOINTS, at, joints(['other'], [0.1]))

@@ -39,7 +39,7 @@ def change(bag, **entries):
 @pytest.mark.parametrize('kind', samples.BARE)
 @pytest.mark.parametrize('with_definitions', [True, False])
 def test_mcap_files_of_every_kind_are_read(kind, with_definitions, tmp_path, content):
-    """Without a definition a type is identified by its name, as if rosbag2 had no .msg files."""
+    """A type is identified by its name if the bag contains no definition of it."""
     path = tmp_path / 'a.mcap'
     samples.write_mcap(path, content, with_definitions, **samples.BARE[kind])
     assert read(path) == expected(content)

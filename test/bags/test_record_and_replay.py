@@ -41,7 +41,7 @@ def record(tool, graph, out, *options):
 
 
 def messages(path, namespace):
-    """Return topic and data of all messages except the replay's own status."""
+    """Return topic and data of all messages, except reports of the node `replay`."""
     every = ((m.topic.removeprefix(namespace), m.data) for m in Bag.open(path).messages())
     return [(topic, data) for topic, data in every if b'/replay: state' not in data]
 

@@ -22,7 +22,7 @@ def recover(path, *options):
 
 @pytest.fixture
 def killed(tmp_path, content):
-    """A recording after SIGKILL: chunks of ten messages, of which the last one is incomplete."""
+    """Return a recording whose recorder was killed: its last chunk of messages is incomplete."""
     samples.write_ours(tmp_path / 'bag', content, finish=False)
     file = tmp_path / 'bag' / 'bag_0.mcap'
     file.write_bytes(file.read_bytes()[:-100])

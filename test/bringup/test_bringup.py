@@ -54,7 +54,7 @@ def running(run):
 
 
 def explore_fast(graph, controller):
-    """Explore by short movements, and tolerate late messages on a busy machine."""
+    """Let the controller explore by short movements, and tolerate messages up to 5 s old."""
     for name, value in ('max_age', 5.0), ('first_duration', 2.0):
         assert graph.set_parameter(controller, name, value)[0]
 
@@ -95,7 +95,7 @@ def statuses(output):
 
 
 def errors(output, checkpoints):
-    """Return the errors of status lines that count as many checkpoints as a range contains."""
+    """Return the errors of all status lines whose number of checkpoints lies in `checkpoints`."""
     lines = statuses(output)
     return [float(line['error']) for line in lines if int(line['checkpoints']) in checkpoints]
 

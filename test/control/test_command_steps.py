@@ -33,7 +33,7 @@ MAE = ExactMae(ROBOT)
 
 
 class Arm(RuleBasedStateMachine):
-    """A controlled emulated arm; each of its commands is checked."""
+    """A controlled emulated arm under random events; each command of the controller is checked."""
 
     def __init__(self):
         super().__init__()
@@ -43,7 +43,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(explores=st.booleans())
     def restart(self, explores):
-        """Kill the controller; a new one starts with the body state only."""
+        """Kill the controller, and start a new one, which receives the network and body state."""
         self.core = Controller(ROBOT)
         self.core.use(MAE)
         self.core.use_body(self.core.stream.body.with_offsets(self.offsets))
@@ -169,7 +169,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(seconds=st.floats(0.01, 2.0))
     def sleeps(self, seconds):
-        """Suspend only the controller for a while."""
+        """Suspend the controller for a time [s], while the arm goes on."""
         self.arm.step(seconds)
         self.now += seconds
 

@@ -24,7 +24,7 @@ DT = 0.01
 
 
 class Loop:
-    """The controlled arm on a simulated clock."""
+    """Emulated arm, estimator and controller, on a simulated clock."""
 
     def __init__(self, mae):
         self.arm, self.estimator = EmulatedArm(ROBOT, 1), Estimator(ROBOT)

@@ -15,7 +15,7 @@ DT = 0.01
 
 
 class Loop:
-    """A controller whose arm has length offsets."""
+    """A controller and an emulated arm whose lengths have offsets."""
 
     def __init__(self, robot, mae):
         self.arm, self.core, self.now = EmulatedArm(robot, 1), Controller(robot), 0.0
@@ -27,12 +27,12 @@ class Loop:
         self.commands, self.pulls = [], []
 
     def know(self, offset):
-        """Give the controller the length offsets."""
+        """Tell the controller the length offsets [m], (M,)."""
         offsets = LengthOffsets(offset, np.zeros(len(offset)))
         self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def sent(self, command):
-        """Return the true target length of the modules."""
+        """Return the true length [m] that a command makes the modules go to, (M,)."""
         return command.value + self.core.stream.body.offsets.offset - self.offset
 
     def run(self, seconds):

@@ -24,7 +24,7 @@ TIGHT = np.array([0.05, np.inf])
 
 
 class FollowingBench:
-    """A bench that follows a trajectory of one second, and the result of its goal."""
+    """A controller that follows a trajectory of 1 s, and the goal of the action for it."""
 
     def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0):
         self.bench = Bench()
@@ -39,7 +39,7 @@ class FollowingBench:
         self.bench.core.trajectory(points, delay)
 
     def run(self, steps=1000, moves=True):
-        """Return the result, and the number of steps until it is known."""
+        """Step until the goal has a result; return the result and the number of steps."""
         for step in range(steps):
             if outcome := self.goal.outcome():
                 return outcome, step

@@ -32,7 +32,7 @@ ROBOT_WITHOUT = ROBOT.without([LOST])
 
 
 def held(theta, torque=0.0):
-    """Return whether the remaining muscles hold a posture."""
+    """Return whether the muscles other than LOST hold a posture, with an additional torque."""
     limits, weight = ROBOT.tension, ROBOT.kinematics.holding_torque(theta) + torque
     slope = ExactMae(ROBOT).muscle_jacobian(theta, limits.bias)
     try:
@@ -218,7 +218,7 @@ def test_a_motion_without_a_muscle_is_slow_enough_for_the_torque_of_the_others()
     mae, limits, lag = ExactMae(robot), robot.tension, 0.02
 
     def lack(trajectory):
-        """Return the largest missing torque against tendon friction and modules that lag [N·m]."""
+        """Return the largest torque that the muscles lack [N·m], with friction and module lag."""
         lacks = []
         for at in zip(*trajectory.sample(np.linspace(0.0, trajectory.duration, 40))):
             jacobian = mae.muscle_jacobian(at[0], limits.bias)

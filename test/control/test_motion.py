@@ -34,7 +34,7 @@ def points(goal, duration=1.0):
 
 
 def moved(bench, count):
-    """Move the arm to the setpoint."""
+    """Run `count` steps in which the arm follows the setpoint; return all commands."""
     sent = []
     for _ in range(count):
         sent += bench.step()
@@ -225,9 +225,13 @@ def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(
 
 
 def driven(arm, intervals=(10,), push=0.0, **chosen):
-    """Return the tracking error [rad] of an emulated arm in a motion of 1 s, (N, 2).
+    """Return the tracking error [rad], (N, 2), of an emulated arm in a motion of 1 s.
 
-    Messages come after some of these times [ms]; the hand is pushed by a force [N].
+    Args:
+        arm: The emulated arm.
+        intervals: Times between two messages [ms], of which each is drawn at random.
+        push: Force on the hand [N].
+        chosen: Settings of the controller.
     """
     core, rng = Controller(ROBOT, Settings(rate_limit=0.3, **chosen)), np.random.default_rng(0)
     core.use(ExactMae(ROBOT))

@@ -34,7 +34,7 @@ def vectors(low, high):
 
 
 def pull_in_this_posture(length, tension, command):
-    """Return the tensions [N] after the modules moved from l to l_target, with fixed joints."""
+    """Return the tensions [N] after modules moved from `length` to `command` with fixed joints."""
     stretch = ROBOT.elongation(tension) + length - command
     grid = np.linspace(0.0, 2.0 * MAX[0], 4001)
     table = ROBOT.elongation(grid[:, None] * np.ones(COUNT))
@@ -169,7 +169,7 @@ class WithJointSensors(ClosedLoop):
 
 @pytest.fixture(scope='module')
 def loops():
-    """Return the arm after 5 s with every method: moving to a target, or without one."""
+    """Return the loop of each method after 5 s, in which it moved to its target if it has one."""
     result = {}
     for method in METHODS:
         arm = EmulatedArm(ROBOT, 0, Individual(ROBOT, 0, NOMINAL))

@@ -13,7 +13,7 @@ STOP = Condition(StopCause.OPERATOR)
 
 
 def killed(directory):
-    """Return a copy of a directory as a controller that is killed now leaves it behind."""
+    """Return a copy of the directory, as it would be if the controller were killed now."""
     copy = directory.with_name(f'{directory.name}_of_killed')
     return shutil.copytree(directory, copy, dirs_exist_ok=True)
 

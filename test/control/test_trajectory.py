@@ -26,7 +26,7 @@ rows = st.lists(
 
 
 def made(rows, order):
-    """Return a trajectory through points within the limits, with this number of derivatives."""
+    """Return points within the joint limits with `order` derivatives, and a trajectory by them."""
     table = np.array(rows)
     position = MIDDLE + REACH * table[:, 1:3]
     given_values = [0.3 * table[:, 3:5], table[:, 5:7]][:order] + [None] * (2 - order)

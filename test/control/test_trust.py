@@ -43,7 +43,7 @@ class DistortingBench(Bench):
             self.step()
 
     def lies(self, count=1, **rows):
-        """Step with rows of the message transformed by functions."""
+        """Run `count` steps in which functions falsify rows of the message; return the commands."""
 
         def lie(read):
             return np.array([rows.get(name, np.array)(row) for name, row in zip(QUANTITIES, read)])
@@ -251,7 +251,14 @@ def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(
 
 
 def run(pace, gap=0.0, at=150, count=250):
-    """Send messages every 10 ms of their clock; return the commands and the stop cause."""
+    """Return commands and stop cause of a controller whose message clock runs at another pace.
+
+    Args:
+        pace: Seconds of the message clock per second of the controller's clock.
+        gap: Time without messages [s].
+        at: Number of the message before which the gap begins.
+        count: Number of messages.
+    """
     bench = Bench(first_duration=1.0, max_age=0.2)
     bench.target(OTHER)
     now, time, sent = 100.0, 5.0, []

@@ -66,7 +66,7 @@ class Driver:
     def listen(
         self, seconds: float = 5.0, moved: bool = False, joints: bool = True, zeroed: bool = True
     ) -> Verdict:
-        """Return the verdict of `Listening`, for the arm at rest or with its hand pushed."""
+        """Return the verdict of `Listening` after some seconds; `moved` pushes the hand about."""
         listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)
         for k in range(round(seconds / PERIOD)):
             if moved:
@@ -82,7 +82,7 @@ class Driver:
     def wind(
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
     ) -> Verdict:
-        """Return the verdict of `Winding` or `Positioning`, without that of `Listening`."""
+        """Return the verdict of `Winding` or `Positioning`, begun with the verdict `heard`."""
         kind = self.robot.actuation.choose(Winding, Positioning)
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:

@@ -184,7 +184,7 @@ def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
 
 
 def ros2_control(**wrong):
-    """Return a driver of motors, and the settings by which they are read, some of them wrong."""
+    """Return a driver with messages of ros2_control; the settings in `wrong` misread them."""
     right = MotorSettings(
         motor_state_topic='joint_states', spool_radius=(0.012,), motor_direction=(-1.0,)
     )
@@ -282,7 +282,7 @@ class Messages:
         self.ticks = []  # times at which `Listening` learns that this process is running [s]
 
     def bring(self, count, sent, came, lost=()):
-        """Pass messages; `sent` and `came` compute their times [s] from their number."""
+        """Pass `count` messages; `sent` and `came` compute times [s] from a message's number."""
         for n in range(count):
             self.number += 1
             while self.ticks and self.ticks[0] <= came(n):
@@ -470,7 +470,7 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
 
 
 def stiff_and_strong(stiffness):
-    """Return the arm with K [N/m] and muscles of some kilonewtons."""
+    """Return the robot with the gain K = `stiffness` [N/m] and muscles of some kilonewtons."""
     tension = TensionRange(*np.outer([100.0, 2000.0, 3000.0], np.ones(M)))
     # The elastic element must be stiffer than K, because the module would oscillate otherwise.
     units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))
@@ -480,7 +480,7 @@ def stiff_and_strong(stiffness):
 
 
 def wound_in_stiff(stiffness, seed=0, of_law=None):
-    """Return the verdict on a driver that evaluates MSC with the measured l."""
+    """Return the verdict of winding on a stiff robot, whose driver evaluates the control law."""
     robot = stiff_and_strong(stiffness)
     driver = Driver(robot, seed)
     driver.in_tension = law(
@@ -531,7 +531,7 @@ def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, reporte
 
 
 def unclipped(robot):
-    """Return a driver at rest whose module does not clip; that of the emulator would."""
+    """Return a driver at rest whose modules do not limit the tension to `max`."""
     driver = Driver(robot)
     driver.listen(2.0)
     constants = driver.arm._module_constants

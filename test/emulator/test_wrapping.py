@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Routes of emulated individuals: the Jacobian equals differences, and individuals differ."""
+"""Routes of emulated individuals: their Jacobian is the derivative, and individuals differ."""
 
 import numpy as np
 import pytest

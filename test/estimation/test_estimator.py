@@ -134,7 +134,7 @@ def test_an_old_command_makes_no_muscle_a_suspect(robot, mae, slack):
 def test_messages_before_a_pause_are_no_evidence_of_a_muscle_without_tension(
     robot, mae, slack, pause
 ):
-    """On a computer that stands still again and again, a module may not have received commands."""
+    """If the computer stands still for a while, the modules may not have received the commands."""
     stepped = EstimatorBench(robot, mae)
     for _ in range(10):
         stepped.core.commanded(stepped.now + pause, length=slack.length - 0.003)

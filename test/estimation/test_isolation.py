@@ -17,7 +17,10 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
 
 
 def verdict(tension, length, likely=0.0):
-    """Wind in by 3 mm after a while; functions compute T and l from T_ref and the row's number."""
+    """Return the outcome of a verification that winds in by 3 mm after 1.5 s.
+
+    `tension` computes T from the demanded T and noise, `length` l from the row's number and noise.
+    """
     watched = Verification(0, ModuleLaw(BIAS, STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.003)

@@ -20,7 +20,7 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (600, 2)) * [1.0, 1e-4]
 
 
 def readings(mae, shorter=0.0):
-    """Return l and T with one tendon without tension; its length is below that of a slack one."""
+    """Return l and T with one muscle without tension, `shorter` [m] than a slack tendon."""
     length, tension = rest_readings(ROBOT, THETA, np.full(ROBOT.muscle_count, 60.0))
     tension = tension.copy()
     tension[MUSCLE] = 0.0
@@ -62,9 +62,10 @@ def elongation(tension):
 
 
 def verdict(tension, length, slack):
-    """Wind in by 20 mm after a while; T and l are functions of the wound length and of noise.
+    """Return the outcome of a verification that winds in by up to 28 mm after 1.5 s.
 
-    At first the tendon is longer by `slack` [m] than a taut one.
+    `tension` and `length` compute T and l from the wound length and noise. At first the tendon is
+    longer by `slack` [m] than a taut tendon.
     """
     watched = Verification(MUSCLE, PositionLaw(BIAS[MUSCLE], elongation))
     for n, (shake, stir) in enumerate(NOISE):

@@ -22,7 +22,7 @@ def noticed(robot, mae, slack):
     """Return a function that returns the time [s] until a muscle without tension is reported."""
 
     def run(speed, until, longest=20.0, settings=None):
-        """Wind in a length [m] at a speed [m/s], then stand."""
+        """Wind in `until` [m] at `speed` [m/s], then stand; return the time of the finding [s]."""
         health, rng = HealthMonitor(robot, settings=settings), np.random.default_rng(0)
         health.use(mae)
         state = mae.estimate(*slack)
@@ -70,7 +70,7 @@ def test_noise_of_the_length_sensor_does_not_count_as_winding_in(noticed):
 def test_the_distance_waits_for_slack_but_not_for_a_rupture(
     robot, calibrated, healthy, loose, found
 ):
-    """With a slow winch both look alike, but the rest of a ruptured tendon is too short."""
+    """A slack tendon is longer than a taut one in the same posture; a ruptured one is shorter."""
     health = HealthMonitor(robot)
     health.use(calibrated)
     one = np.eye(6)[MUSCLE]
@@ -89,7 +89,7 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
 def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
     robot, calibrated, speed, commanded
 ):
-    """This also applies before calibration, and before the first command."""
+    """This holds for a detector that is not calibrated yet, and before the first command, too."""
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     arm.step(3.0)
     estimator, hold = Estimator(robot), arm.sense().length

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The consequences of a finding, by its kind and the parameter `on_anomaly`."""
+"""What follows from a finding depends on its kind and on the parameter `on_anomaly`."""
 
 import pytest
 

@@ -14,7 +14,7 @@ MINUTES = 0.35
 
 @pytest.fixture(scope='session')
 def quick(alone) -> Path:
-    """The folder of `experiment all --quick` on arm26 with two processes, once per test run."""
+    """Return the folder in which `experiment all --quick` has run once, on arm26."""
     with alone('experiments') as common:
         folder, done = common / 'experiments', common / 'experiments_done'
         if not done.exists():

@@ -19,7 +19,7 @@ def robot(request):
 
 @pytest.fixture(scope='module')
 def motion(robot):
-    """A slow wave through the joint range, with changing tensions."""
+    """Return θ, T and l of a slow wave through the joint range, with changing tensions."""
     phase = np.linspace(0.0, 2.0 * np.pi, 300)[:, None]
     middle, half = 0.5 * (robot.lower + robot.upper), 0.35 * (robot.upper - robot.lower)
     theta = middle + half * np.sin(phase * np.arange(1, robot.joint_count + 1) / 2.0)
@@ -58,7 +58,7 @@ def test_baselines_that_learn_improve_on_a_body_with_other_lengths(robot, motion
     rng = np.random.default_rng(0)
 
     def other(theta, tension):
-        """A body with thicker joints: its lengths change by 20 % more with the first joint."""
+        """Return the lengths of a body that change by 20 % more with the first joint."""
         lengths = robot.muscle_lengths(theta, tension)
         middle = np.repeat(theta[:, :1], robot.joint_count, axis=1)
         middle[:, 1:] = 0.5 * (robot.lower + robot.upper)[1:]

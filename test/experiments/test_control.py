@@ -25,7 +25,7 @@ def test_proposed_is_nearer_than_first_and_no_method_beats_the_bound_by_much(end
 
 
 def test_a_posture_at_the_target_needs_the_bound(ended):
-    """If an arm comes close to θ_eval, holding it there requires the tension of θ_eval."""
+    """Near the target θ_eval, the least tension that holds the arm is that for θ_eval."""
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 

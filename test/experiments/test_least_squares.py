@@ -61,7 +61,7 @@ def test_the_jacobian_of_the_learned_body_is_its_slope(robot):
 
 
 def test_the_oracle_without_friction_errs_only_by_its_sensors(robot):
-    """The lengths of the recording also have 3 mm of hysteresis."""
+    """The sensor errors in this test are 3 mm of hysteresis in the lengths."""
     rng = np.random.default_rng(2)
     individual = Individual(robot, 0)
     theta = robot.random_postures(10 * COUNT, rng)

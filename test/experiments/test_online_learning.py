@@ -30,7 +30,7 @@ from musculoskeletal_ae.presets.registry import PRESETS
 
 @pytest.fixture(scope='module')
 def twice(tmp_path_factory, arm26, trained):
-    """The same individual measured twice, in different folders."""
+    """Return two measurements of the same individual, in different folders."""
     measured = []
     for _ in range(2):
         study = Study(arm26, 'default', (0,), 0.25, True, tmp_path_factory.mktemp('study'))

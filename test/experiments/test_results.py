@@ -50,12 +50,12 @@ def test_a_number_that_json_cannot_say_is_refused(arm26, tmp_path):
 
 @pytest.fixture
 def kept(tmp_path):
-    """A copy of the committed results."""
+    """Return the folder of a copy of the committed results."""
     return shutil.copytree(Path(__file__).parents[2] / KEPT, tmp_path / 'results')
 
 
 def changed(kept, name, **numbers):
-    """Change the result of an experiment."""
+    """Replace numbers in the result of an experiment in the folder `kept`."""
     file = kept / name / 'result.json'
     result = json.loads(file.read_text('utf-8')) | numbers
     file.write_text(json.dumps(result), encoding='utf-8')
@@ -135,7 +135,7 @@ def test_a_failed_part_is_reported_everywhere_and_the_others_continue(
 
 
 def is_killed(name, study, seed):
-    """Kill the worker of individual 0, at first while individual 1 is being measured."""
+    """Kill the process that measures individual 0; the first time, individual 1 is measured too."""
     if name == 'body_change':
         begun = study.folder / f'{seed}'
         first = not begun.exists()

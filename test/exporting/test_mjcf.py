@@ -48,7 +48,7 @@ def test_an_exported_model_loads_and_is_as_close_to_the_network_as_reported(impo
 
 
 def test_points_that_a_network_has_learned_are_those_of_the_model(imported):
-    """The moment arms of the export are those of an individual with displaced points."""
+    """The exported model has the moment arms of the individual that the network describes."""
     robot, _, folder = imported
     individual = make_arm(robot, 3, str(folder / 'own.xml'), deviates=True).individual
     other = import_robot(folder / 'own.xml', folder / 'other').robot

@@ -74,7 +74,7 @@ def test_all_quantities_that_mujoco_uses_are_imported(mjcf, tmp_path, old, new):
 
 
 def test_a_point_on_the_rim_of_a_wrapped_object_counts_as_outside_it(mjcf, tmp_path):
-    """MuJoCo's choice would depend on rounding, and vary with the posture."""
+    """In MuJoCo, rounding decides whether the point is inside, differently in each posture."""
     drum = (
         '<geom name="pulley" type="cylinder" size="0.03" fromto="0 -0.02 0 0 0.02 0" mass="0.01"/>'
     )
@@ -170,7 +170,7 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
 
 
 def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
-    """An unmodified file of MyoHub has no space between two attributes."""
+    """MuJoCo accepts XML without a space between attributes, which occurs in a file of MyoHub."""
     expected = import_robot(mjcf, tmp_path / 'sound')
     mjcf.write_text('<!-- own -->\n' + mjcf.read_text().replace('ball" type=', 'ball"type='))
     result = import_robot(mjcf, tmp_path / 'loose')
@@ -503,7 +503,7 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
 @settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(st.sampled_from(['CARDSFLOW', 'URDF', 'SDF']), st.data())
 def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, format_, data):
-    """Words of a file are replaced or omitted, and elements are removed."""
+    """The test replaces or omits words of a file, and removes elements."""
     text = getattr(bodies, format_).format(mimic='<mimic joint="shoulder" multiplier="2"/>')
     words = re.split(r'(?<=[ >"])|(?=[<"])', text)
     for _ in range(data.draw(st.integers(1, 3))):

@@ -62,7 +62,7 @@ class Stage:
         return store
 
     def states(self, count: int):
-        """Return θ, T, l without friction."""
+        """Return θ (N, D), T (N, M) and l (N, M) of random rests, without friction."""
         robot = self.body.robot
         theta = robot.random_postures(count, self.rng)
         tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
@@ -70,7 +70,7 @@ class Stage:
         return theta, tension, length
 
     def messages(self, count: int):
-        """Return (T, l, s) without friction."""
+        """Return `count` messages as rows (T, l, s), with friction direction s = 0."""
         _, tension, length = self.states(count)
         return np.concatenate([tension, length, np.zeros_like(length)], axis=1).astype(np.float32)
 

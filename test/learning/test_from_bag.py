@@ -148,7 +148,7 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     arm26, initial, monkeypatch
 ):
     class Monitor(HealthMonitor):
-        """Reports a muscle at the 301st message."""
+        """A health monitor that reports an anomaly of a muscle at the 301st message."""
 
         count = 0
 

@@ -18,7 +18,7 @@ DT = 0.01
 
 
 class IdleTrainer(Trainer):
-    """A trainer that returns its initial network when the test allows it."""
+    """A trainer that does not train: it returns its initial network once `released` is true."""
 
     def __init__(self, *arguments) -> None:
         super().__init__(*arguments)
@@ -59,7 +59,7 @@ def accept(learner, stage, count):
 
 
 def between(start, end, count):
-    """Return the samples between two rests."""
+    """Yield `count` samples on the way from the rest `start` to the rest `end`."""
     for share in np.linspace(0.0, 1.0, count + 2)[1:-1]:
         yield end._replace(length=(1.0 - share) * start.length + share * end.length)
 

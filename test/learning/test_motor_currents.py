@@ -29,7 +29,7 @@ LIMIT = ROBOT.tension.limit
 
 
 def rests(count, seed):
-    """Return noisy rests of an individual, their true T_end and the true transmission."""
+    """Return noisy rest samples of an individual, the true T_end, and the true transmission."""
     rng, true = np.random.default_rng(seed), Individual(ROBOT, seed)
     drive = np.array(
         [

@@ -35,7 +35,7 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
 
 
 def each_some(t, still=True):
-    """Return θ as if two nodes published one joint each by turns."""
+    """Return θ with one joint measured, as if two nodes published one joint each, in turn."""
     angles = np.array([0.3, 0.3 if still else 0.3 + 0.05 * t])
     angles[round(t / 0.01) % 2] = np.nan
     return angles
@@ -178,7 +178,7 @@ class Messages:
         self.collector = SampleCollector(robot, SampleStore(), Reservoir(6), DEFAULT)
 
     def send(self, theta, pull, length, dt=DT):
-        """Return the new samples of one message."""
+        """Send one message to the collector; return the new samples."""
         self.time += dt
         self.collector.joints(self.time, theta)
         states = np.array([length, pull, np.full(6, np.nan)])
@@ -186,7 +186,7 @@ class Messages:
         return [] if paired is None else self.collector.collect(paired)
 
     def rest(self, theta, seconds, tension=60.0, dt=DT):
-        """Return the new samples of an arm that rests; `dt` [s] before its first message."""
+        """Let the arm rest for some seconds, after a pause `dt` [s]; return the new samples."""
         pull = np.full(6, tension)
         length = self.robot.muscle_lengths(theta, pull)
         samples = self.send(theta, pull, length, dt)

@@ -52,7 +52,7 @@ def read(directory, robot):
 
 
 def read_backup(directory, robot, scratch):
-    """Make a backup the newest state of a directory; return its samples and network."""
+    """Read the backup in `directory` as a learner would; return its samples and network."""
     scratch.mkdir()
     shutil.copy(directory / BACKUP, scratch / NEWEST)
     store, mae, not_used = read(scratch, robot)
@@ -70,7 +70,7 @@ def assert_same(one, two):
 
 @contextmanager
 def full_disk():
-    """Make every write fail that enlarges a file, as on a full disk."""
+    """Make every write to a file fail in this context, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
     try:
@@ -285,7 +285,7 @@ def test_a_directory_that_cannot_be_created_is_reported_with_a_remedy(tmp_path, 
 
 @pytest.fixture
 def begun(arm26, initial, tmp_path):
-    """Return a function that starts a learner in one directory, as the successor of the last."""
+    """Return a function that ends the last learner, and starts another in the same directory."""
     learners = []
 
     def begin():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks with isolated muscles ignore the readings of these."""
+"""Networks with isolated muscles ignore the readings of these muscles."""
 
 from dataclasses import replace
 

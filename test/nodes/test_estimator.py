@@ -49,7 +49,10 @@ def values(graph):
 
 
 def answer(graph, message):
-    """Publish until an estimate arrives, because best-effort may lose the first messages."""
+    """Publish a message until an estimate arrives, and return the estimate.
+
+    The estimator's best-effort subscription may lose the first messages.
+    """
     before = len(graph.received['estimated_joint_states'])
 
     def arrived():

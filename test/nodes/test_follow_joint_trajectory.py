@@ -40,7 +40,7 @@ class SentGoal:
         self._graph.wait(response.done, 'an answer to the cancellation')
 
     def ended(self):
-        """Return the status and the result at the end."""
+        """Wait for the end of the goal; return its status and result."""
         self._graph.wait(self._ended.done, 'the end of the goal')
         return self._ended.result().status, self._ended.result().result
 

@@ -50,12 +50,12 @@ class Arm:
         return self.robot.random_postures(1, self.rng)[0], tension
 
     def end(self):
-        """Leave the graph, in which a second arm would be an intruder."""
+        """Stop publishing, because the learner would reject messages of two arms."""
         for publisher in (self.joints, self.muscles):
             self.graph.node.destroy_publisher(publisher)
 
     def publish(self):
-        """Publish one message of each kind; the arm goes to a new posture now and then."""
+        """Publish muscle and joint states 10 ms later; after each rest the arm moves on."""
         self.time += DT
         if self.time > self.until:
             self.before, self.begun = (self.theta, self.tension), self.time
@@ -72,13 +72,13 @@ class Arm:
         self.muscles.publish(array_message(rows, 'quantity', 'muscle'))
 
     def step(self):
-        """Publish in real time."""
+        """Publish once, and handle messages for 10 ms."""
         self.publish()
         self.graph.spin(DT)
 
 
 class HostedLearner:
-    """A learner in this process, faster than real time."""
+    """A learner in this process and an arm, whose common clock the test advances."""
 
     def __init__(self, graph, robot, **parameters):
         self.graph = graph

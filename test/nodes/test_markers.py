@@ -65,7 +65,7 @@ def test_render_writes_a_picture_and_refuses_an_unknown_file_type(graph, tmp_pat
 
 
 def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
-    """There is no emulator with a physical arm. Nothing is drawn before there is a network."""
+    """With a physical arm there is no emulator, and without a network there are no markers."""
     publisher = graph.node.create_publisher(MarkerArray, 'estimated/markers', 10)
     bone = Marker(type=Marker.LINE_STRIP, points=[Point(), Point(z=0.3)])
     out = tmp_path / 'arm.png'

@@ -18,7 +18,7 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 @pytest.fixture
 def now(monkeypatch):
-    """Return a clock in a list."""
+    """Replace the system clock; return a list whose element is the time [ns]."""
     now = [1_000_000_000_000]
     monkeypatch.setattr(stop_recording.time, 'time_ns', lambda: now[0])
     return now

@@ -18,7 +18,7 @@ def test_preset_paper_moves_towards_forced_joint_angles(trained):
 
 
 def test_preset_paper_moves_towards_the_commanded_lengths_without_stiffness_control(trained):
-    """Without external force, w₅ outweighs the others: l reaches the command and not more."""
+    """Without an external force, the loss is dominated by its term of l, with the weight w₅."""
     robot = Robot.load('arm26')
     arms = Simulation(robot, trained['paper'], 'paper')
     resting = arms.step(0.2).length[0]

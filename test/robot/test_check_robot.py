@@ -56,7 +56,7 @@ def in_millimetres(document):
 
 
 def test_routes_in_millimetres_are_the_only_fault(tmp_path, capsys):
-    """All other findings would follow from the wrong unit, and their remedies would mislead."""
+    """Other findings would only follow from the wrong unit, and their remedies would mislead."""
     directory = change(write_robot(tmp_path / 'arm'), in_millimetres)
     status, out, _ = verdict(capsys, directory)
     assert status == 1 and 'in metres, not millimetres' in out

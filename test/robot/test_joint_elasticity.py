@@ -232,7 +232,7 @@ SPRUNG = '<joint name="elbow" stiffness="2" springref="0.4" damping="0.5" '
 
 
 def test_springs_are_learned_from_rest_samples(springy):
-    """With half the stiffness and an offset of 0.2 rad: the remaining errors after 60 rest samples.
+    """The true springs have other stiffnesses and rest angles than stated; 60 samples correct them.
 
     The torque balance has a σ of 0.3 of the muscles' torques, so weak springs beside strong
     muscles keep their stated values.

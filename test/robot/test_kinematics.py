@@ -9,7 +9,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def full_configuration(robot: Robot, theta):
-    """Return q of the whole URDF by joint name, without the code under test."""
+    """Return the configuration q of the whole URDF at θ, computed without the code under test."""
     model = robot.description.model
     q = pin.neutral(model)
     for name, angle in zip(robot.joints, theta, strict=True):

@@ -15,7 +15,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 
 
 class GeometricBody:
-    """Behaves like a network without error."""
+    """The lengths of the geometric model, with the interface of a network."""
 
     friction = np.zeros(8)
     elasticity = None

@@ -111,7 +111,7 @@ def test_a_mirrored_or_reversed_tendon_has_the_same_length(axis, side):
 
 
 def test_length_and_direction_are_continuous_where_the_tendon_lifts_off():
-    """The bound is the angle of the tangent, which grows with the square root of the height."""
+    """Near lift-off, the angle of the tangent grows with the square root of the height."""
     for axis in ((0, 0, 0), (0, 0, 1)):
         for gap in (1e-6, -1e-6):
             length, leave, _ = wire([0.3, 0.1 + gap, 0], [-0.3, 0.1 + gap, 0.1], 0.1, axis)

@@ -25,7 +25,7 @@ def warm(wound, muscle, command, steps):
 
 
 class Motors:
-    """The modules of an emulated arm with stated tensions."""
+    """The motors of an emulated arm, and the thermal model that estimates their temperatures."""
 
     def __init__(self, seed=0, hold=10, most=TENSION.limit):
         self.rng, self.hold, self.most = np.random.default_rng(seed), hold, most
@@ -41,7 +41,7 @@ class Motors:
         self.errors, self.pulled, self.read = [], TENSION.bias, None
 
     def run(self, seconds, tension=None):
-        """Advance the time with stated tensions [N], or random ones."""
+        """Advance the time [s] with the tensions `tension` [N], or with random ones."""
         arm = self.arm
         for n in range(round(seconds)):
             if tension is None and n % self.hold == 0:
@@ -56,12 +56,12 @@ class Motors:
         return np.abs(self.errors[-round(seconds) :])
 
     def hand_on(self):
-        """Pass on the readings."""
+        """Pass the readings of one second to the thermal model."""
         self.heat.step(self.pulled, self.read, 1.0)
 
 
 class ObservedMotors(Motors):
-    """The same modules, observed by the estimator."""
+    """Motors whose readings are passed to an estimator, which contains the thermal model."""
 
     def __init__(self, mae, **options):
         super().__init__(**options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wrong joint sensors of a moving arm are named, by the muscle lengths alone."""
+"""Wrong joint sensors of a moving arm are found by comparing them with the muscle lengths."""
 
 from functools import cache
 from itertools import combinations
@@ -26,7 +26,7 @@ JOINTS = [(name, j) for name, robot in ROBOTS.items() for j in range(robot.joint
 
 @cache
 def motion(name):
-    """Return θ, l and T of the motion test of an emulated arm, and the number of the muscle."""
+    """Return θ, l and T while `check_driver` winds in muscles, and the muscle of each row."""
     driver = Driver(ROBOTS[name], 1)
     driver.listen(2.0)
     winding = Winding(Verdict(ROBOTS[name]))

@@ -137,7 +137,7 @@ def test_a_rejected_message_contains_the_tensions_that_last():
 
 
 def jump_together(stream, size=0.05, pause=0.0):
-    """Make several lengths of a stream jump; return the muscles that the samples name."""
+    """Make three lengths jump at once; return the muscles that the samples report as jumping."""
     jumped, stream_time = [], 0.0
     for n in range(200):
         stream_time += PERIOD + pause * (n == 20)
@@ -166,7 +166,7 @@ def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
 
 
 def jumps_of_a_winding_tendon(by, tension):
-    """Return the muscles named if muscle 1 winds in by `by` [m] while the messages pause."""
+    """Return the muscles reported as jumping if muscle 1 winds in by `by` [m] in a pause."""
     stream, jumped = MuscleStream(ROBOT), []
     for n in range(300):
         if not 20 <= n < 60:
@@ -183,11 +183,11 @@ def test_a_tendon_that_ruptures_while_messages_are_late_is_not_reported_as_a_jum
 
 
 def jumps_of_a_restarting_module(pause, boots=0.5):
-    """Return the muscles named if module 1 restarts and reads l = 0, at first with T = 0.
+    """Return the muscles reported as jumping if module 1 restarts and then reads l = 0.
 
     Args:
         pause: Time without messages [s].
-        boots: Time until it pulls again [s].
+        boots: Time after the restart until the module pulls again; until then T = 0 [s].
     """
     stream, jumped = MuscleStream(ROBOT), []
     for n in range(700):

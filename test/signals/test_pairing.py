@@ -71,7 +71,7 @@ def test_each_angle_is_paired_once_with_the_message_it_is_nearest_to(joints, mus
 
 @given(st.lists(st.tuples(times, st.integers(1, 7)), max_size=3), times, st.integers(2, 40))
 def test_each_joint_is_paired_as_if_it_were_alone(publishers, muscles, period):
-    """Each of several nodes publishes some of three joints."""
+    """Several nodes publish different subsets of three joints."""
     sent = {}  # mask of the published joints, by time; no two messages have the same time
     for moments, joints in publishers:
         for time in moments:

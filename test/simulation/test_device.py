@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator with its network in torch: results of numpy, and on the requested device."""
+"""The simulator with its network in torch has the results of numpy, on the requested device."""
 
 from dataclasses import replace
 

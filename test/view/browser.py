@@ -41,10 +41,10 @@ def find_chromium() -> str | None:
 
 
 class Browser:
-    """One tab."""
+    """A headless Chromium with one tab."""
 
     def __init__(self, profile: Path, url: str, size: tuple[int, int] = (1024, 640)) -> None:
-        """Open a page."""
+        """Start Chromium and open the page `url` in a window of `size` [pixels]."""
         program = find_chromium()
         assert program is not None
         window = f'--window-size={size[0]},{size[1]}'
@@ -112,7 +112,7 @@ class Browser:
         self._wait(lambda: text in self.text, f'{text!r} on the page')
 
     def mouse(self, kind: str, x: float, y: float, pressed: bool = False) -> None:
-        """Move, press or release the left button: mouseMoved, mousePressed, mouseReleased."""
+        """Send a mouse event to (x, y): mouseMoved, mousePressed or mouseReleased (left button)."""
         button = 'left' if kind != 'mouseMoved' or pressed else 'none'
         self.call(
             'Input.dispatchMouseEvent',
@@ -125,13 +125,13 @@ class Browser:
         )
 
     def click(self, x: float, y: float) -> None:
-        """Click the left button."""
+        """Click at (x, y) [pixels] with the left button."""
         self.mouse('mouseMoved', x, y)
         self.mouse('mousePressed', x, y, pressed=True)
         self.mouse('mouseReleased', x, y)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
-        """Press at the start and move to the end, without a release."""
+        """Press the left button at `start` and move to `end`; keep the button pressed."""
         self.mouse('mouseMoved', *start)
         self.mouse('mousePressed', *start, pressed=True)
         for i in range(1, steps + 1):
@@ -140,7 +140,7 @@ class Browser:
             time.sleep(0.06)
 
     def centre(self, button: str) -> tuple[float, float]:
-        """Return the position of the button with a text."""
+        """Return the position [pixels] of the button with the text `button`."""
         result = self._wait(
             lambda: self.evaluate(
                 '(() => { const b = [...document.querySelectorAll("button")].find('
@@ -159,7 +159,7 @@ class Browser:
         time.sleep(0.5)
 
     def screenshot(self, file: Path) -> bytes:
-        """Save a screenshot as a PNG."""
+        """Save a screenshot as a PNG file, and return its bytes."""
         data = base64.b64decode(self.call('Page.captureScreenshot', format='png')['data'])
         file.write_bytes(data)
         return data

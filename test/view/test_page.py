@@ -53,9 +53,10 @@ def free_port() -> int:
 
 @pytest.fixture
 def view(graph):
-    """Start the page of arm26 with options; return its port once it lets visitors in.
+    """Return a function that starts the page of arm26 with options, and returns its port.
 
-    The page logs that moment; it rejects earlier connections, and a browser would retry.
+    The function waits until the page has logged that it admits visitors, because the page rejects
+    earlier connections.
     """
 
     def start(*options: str) -> int:
