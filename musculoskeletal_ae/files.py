@@ -20,10 +20,10 @@ T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
 LARGEST = 5_000_000  # size limit of any file [bytes]
-LARGEST_YAML = 1 << 19  # [bytes]; parsing YAML is slow
-LARGEST_CSV = 1 << 20  # [bytes]; each cell takes fifty bytes of memory
-MOST_ENTRIES = 100_000  # entries of a YAML file after aliases are expanded
-DEEPEST = 50  # nesting levels of a YAML file
+LARGEST_YAML = 1 << 19  # size limit of a YAML file [bytes]; parsing YAML is slow
+LARGEST_CSV = 1 << 20  # size limit of a CSV file [bytes]; each cell takes fifty bytes of memory
+MOST_ENTRIES = 100_000  # largest number of entries of a YAML file after aliases are expanded
+DEEPEST = 50  # largest number of nesting levels of a YAML file
 
 _Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 

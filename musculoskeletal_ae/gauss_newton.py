@@ -47,7 +47,7 @@ from musculoskeletal_ae.arrays import Array
 FREEDOM = 4.0  # ν of the Student distribution
 PRIOR_COUNT = 4.0  # number of residuals that count as much as the prior at σ₀
 WEIGHTINGS = 3  # steps of the EM algorithm in each round
-DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # λ
+DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # values of λ that a round tries
 SMALL = 1e-6  # added to the diagonal of C, so that the Schur complement is positive definite
 
 

@@ -65,7 +65,8 @@ class StopMemory:
             self.close()
             remedy = 'stop that controller, or set another directory if it controls another arm'
             raise MusculoskeletalError(f'{name} is in use by a controller; {remedy}') from error
-        except (OSError, ValueError, RuntimeError) as error:  # a NUL; an unknown home directory
+        # ValueError: a NUL in the path. RuntimeError: the home directory is unknown.
+        except (OSError, ValueError, RuntimeError) as error:
             self.close()
             remedy = "set a writable directory, or '' to save no stop"
             raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error

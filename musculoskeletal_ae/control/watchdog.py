@@ -179,7 +179,7 @@ class HeatLimit:
 
     def conditions(self, robot: Robot, highest: float) -> list[Condition]:
         """Return overheating, if present; it ends when all windings are below `highest` [°C]."""
-        winding = np.fmax(self.heat.core, -np.inf)  # NaN is unknown
+        winding = np.fmax(self.heat.core, -np.inf)  # a temperature that is unknown is NaN
         m = int(winding.argmax())
         is_hot = bool(winding[m] > highest + (0.0 if self._is_overheated else OVERHEATED))
         can_pull = robot.used & (self.planned > robot.tension.bias)

@@ -101,7 +101,7 @@ class Controller(Shell):
         self.listen(TwistStamped, 'target_twist', self._twist, RELIABLE)
         self.states = self.create_publisher(JointTrajectory, 'controller_state', RELIABLE)
         self.action: Any = None
-        with suppress(ImportError):  # control_msgs
+        with suppress(ImportError):  # raised if control_msgs is not installed
             kind = import_module('control_msgs.action').FollowJointTrajectory
             module = import_module('musculoskeletal_ae.nodes.follow_joint_trajectory')
             refuse = self._reception.reject

@@ -156,7 +156,7 @@ class Estimator(Shell):
 
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
-        restored = self.muscles_to_isolate or isolated  # all if the parameter names none
+        restored = self.muscles_to_isolate or isolated  # all muscles if the parameter names none
         self.candidates.validator.declare_repaired(restored, time.monotonic())
         return self._isolate(set(isolated) - set(restored))
 
