@@ -334,11 +334,12 @@ def _turning(theta: Array, sticking: Array) -> Array:
 
 
 def _relative_error(mae: Mae) -> Array:
-    """Return the variance of each muscle's length residual relative to the median one, (M,).
+    """Return the factor of LENGTH_NOISE for each muscle, (M,).
 
-    The errors of a network in neighbouring postures are correlated, so a muscle with large errors
-    would bias the offsets of all others. The weights therefore use the variance where independent
-    errors would require the standard deviation.
+    It is the variance of the muscle's length residual, relative to the median variance. For
+    independent errors, the ratio of standard deviations would be correct. But the errors of a
+    network in neighbouring postures are correlated, so that a muscle with large errors would then
+    bias the offsets of all other muscles. The ratio of variances gives such a muscle less weight.
     """
     if mae.anomaly is None:
         return np.ones(len(mae.muscles))

@@ -13,8 +13,9 @@
     ψᵀ v    residual model: random Fourier features over the joints that the muscle crosses. It
             represents what straight lines between route points miss, such as wrapping round bones
 
-With all parameters zero this is the geometric model. The module `fit` estimates the parameters. The
-springs of the joints do not change lengths; `springs` describes their corrections.
+If all parameters are zero, the calibrated body is the geometric model. The module `fit` estimates
+the parameters. The springs of the joints do not change lengths; `springs` describes their
+corrections.
 """
 
 from __future__ import annotations

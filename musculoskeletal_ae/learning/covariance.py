@@ -43,10 +43,10 @@ def estimate_covariance(
     It is computed from errors drawn at random postures with tensions of the samples. An error has
     two parts. One comes from the error of the joint-sensor offset, which validation messages do not
     show because they contain the same offset. If there are at least MANY_MESSAGES validation
-    messages, the other part is scaled by the ratio between their actual errors and errors drawn at
-    the postures of these messages. Most of these postures are near the samples, so that errors
-    there are smaller than at random postures. With fewer messages, the covariance is multiplied by
-    UNVALIDATED_FACTOR.
+    messages, the other part is scaled by the ratio between the network's actual errors on these
+    messages and errors drawn at their postures. The ratio uses errors at the same postures, because
+    the validation messages are mostly near the samples, where errors are smaller than at random
+    postures. With fewer validation messages, the covariance is multiplied by UNVALIDATED_FACTOR.
 
     Args:
         mae: The network.
@@ -139,7 +139,7 @@ def _drawn_errors(
 def _spread(error: Array) -> Array:
     """Return a covariance whose 95 % ellipsoid contains 95 % of the errors (N, D).
 
-    The ellipsoid of the plain covariance would contain fewer errors than that, because the errors
+    The ellipsoid of the plain covariance would contain less than 95 % of the errors, because they
     have heavier tails than a normal distribution.
     """
     covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])

@@ -79,7 +79,7 @@ class Weights(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Values of the unknowns, and the residuals there."""
+    """Values of the unknowns, and the residuals at these values."""
 
     unknowns: Unknowns
     residuals: Residuals
@@ -148,9 +148,10 @@ class GroupFit:
         The spreads of the prior are scaled by the Birge ratio √(χ²/γ). χ² is the square of the
         deviation from the prior mean in units of the spreads, and γ the number of parameters that
         the samples determine. If the samples show that an arm differs from its model more than the
-        prior expects, it is expected to differ as much in properties that they do not show, such as
-        offsets of joint sensors. With a learned prior the ratio is at least 1: an arm that agrees
-        with a learned prior may still differ in properties that the samples do not show.
+        prior expects, the arm is expected to differ as much in properties that the samples do not
+        show, such as offsets of joint sensors. With a learned prior the ratio is at least 1: an arm
+        that agrees with a learned prior may still differ in properties that the samples do not
+        show.
         """
         prior = self.prior
         # Errors of the body model are common to all samples, so all samples together count as at

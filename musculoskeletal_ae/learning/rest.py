@@ -26,8 +26,8 @@ from musculoskeletal_ae.learning.settings import Settings
 LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]
 #: largest number of readings in a rest, which bounds the memory if the clock stands still
 MOST_READINGS = 20_000
-#: Smallest number of readings in each half of the window. With fewer, noise could hide a drift. If
-#: messages are slow, the window is therefore longer than `rest_time`.
+#: Smallest number of readings in each half of the window. With fewer readings, noise could hide a
+#: drift. If messages are slow, the window is therefore longer than `rest_time`.
 LEAST_READINGS = 4
 NOISE_FACTOR = 3.0  # largest difference of means that counts as noise, in standard errors
 

@@ -14,7 +14,7 @@ from musculoskeletal_ae.robot.robot import Robot
 #: share of samples with most muscles near T_bias, as under muscle stiffness control
 HELD_SHARE = 0.5
 #: share of a joint's range by which postures may exceed its limits, because friction or contact can
-#: move the arm there
+#: move a joint slightly beyond a limit
 MARGIN = 0.02
 
 

@@ -81,7 +81,7 @@ class BodyUpdater(Updater):
         self._trainer.move(self.body_fit.lengthened())
         contradicted = contradicted_muscles(observed, fit)
         # Several contradicted muscles indicate a slipped joint sensor or contact, not replaced
-        # muscles. The robust weights exclude such samples until they are the majority.
+        # muscles. The robust weights exclude the newest samples then, until they are the majority.
         alone = len(contradicted) == 1
         if self._statistics_held and not job.statistics_hold:
             self._trainer.restart()

@@ -298,7 +298,7 @@ def _check_covariance(name: str, covariance: Array) -> None:
     if not np.array_equal(covariance, covariance.T):
         raise CheckpointError(f'tensor {name} is not symmetric')
     try:
-        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # the same one if there is only one
+        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # equal if the matrix is (1, 1)
     except np.linalg.LinAlgError as error:
         raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
     # The detector inverts the matrix, so it must not be close to singular.

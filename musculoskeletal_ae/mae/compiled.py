@@ -4,7 +4,8 @@
     tanh u ≈ u P(u²) / Q(u²),  |u| ≤ 7.9
 
 This rational function, taken from Eigen, is exact to single precision, and a core evaluates it for
-eight units at once. NumPy's activations would take as long as the matrix products of a layer.
+eight units at once. If NumPy computed the activations, they would take as long as the matrix
+products of a layer.
 """
 
 import numpy as np

@@ -443,7 +443,7 @@ class Mae:
         """Return the same network with exactly these muscles isolated.
 
         The anomaly statistics lose the residuals of the isolated muscles. If a muscle is restored,
-        they still lack its residuals and are therefore marked as not calibrated.
+        the statistics still lack its residuals and are therefore marked as not calibrated.
         """
         isolated = tuple(sorted(isolated))
         if isolated == self.isolated:

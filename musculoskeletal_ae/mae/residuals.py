@@ -19,8 +19,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
 # Lowest standard deviation of a residual in scaled units. It corresponds to 0.02 N or 0.01 mm,
-# which is below any sensor's resolution. It keeps the covariance invertible if a network restores
-# some combination of its inputs perfectly.
+# which is below any sensor's resolution. This lower limit keeps the covariance invertible if a
+# network restores some combination of its inputs perfectly.
 FLOOR = 1e-4
 ANYTHING = 10.0  # standard deviation of a residual that is ignored, in scaled units
 LEAST_MOTION = 60.0  # duration of motion that calibrated touch statistics require [s]

@@ -40,7 +40,7 @@ class StepSearch(NamedTuple):
 
 
 class Loss:
-    """The loss L. It evaluates all terms by one matrix product, which is faster than several."""
+    """The loss L. All terms are evaluated by one matrix product, because this is faster."""
 
     def __init__(self, terms: Sequence[Term]) -> None:
         """Stack the rows of all terms."""

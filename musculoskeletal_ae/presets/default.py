@@ -78,7 +78,7 @@ class DefaultPreset:
         return ResidualDistance(robot, settings, slack), [slack, jammed]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return the paper's methods except `proposed`; in this preset, it follows trajectories."""
+        """Return the paper's methods except `proposed`, which follows trajectories here."""
         from musculoskeletal_ae.paper.control import METHODS
 
         return {name: method for name, method in METHODS.items() if name != 'proposed'}

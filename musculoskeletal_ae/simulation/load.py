@@ -5,7 +5,7 @@
 
 (paper, §III-F: the necessary torque from the geometric model), compiled by numba. K and b describe
 the springs of the joints (`JointElasticity`). Pinocchio computes the same torque of the weight, and
-a test compares the two. However, Pinocchio has no gradient with a wrench, and calling it from
+a test compares both results. However, Pinocchio has no gradient with a wrench, and calling it from
 Python takes as long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with
 axis a_k needs only sums over the bodies that it carries:
 

@@ -42,7 +42,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle with a frozen sensor, if it moves according to the other muscles."""
+        """Report a muscle whose reading is constant while the other muscles indicate its motion."""
         sample, robot = observation.sample, self._robot
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])

@@ -3,8 +3,8 @@
 
     |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
 
-A position-controlled module has no T_ref. It is jammed if it does not move although its length
-differs from l_target and it does not pull with its largest tension:
+A position-controlled module has no T_ref. It is jammed if it neither reaches l_target nor moves,
+although it could pull harder:
 
     |l − l_target| > BEHIND, T < T_max and |Δl| < STANDS for JAM_TIME
 

@@ -58,8 +58,8 @@ GAP_LEARNED = Largest(0.035, 0.016)  # limits of g with calibrated networks
 HEALTHY_SPACING = 1.0  # time between the healthy messages from which g_usual is computed [s]
 HEALTHY_COUNT = 60  # largest number of messages from which g_usual is computed
 ENOUGH = 5  # smallest number of messages from which g_usual is computed
-#: Δ relative to its limits up to which a message counts as healthy; it is low, so that g_usual does
-#: not follow a drift
+#: Δ relative to its limits up to which a message counts as healthy; this value is low, so that
+#: g_usual does not follow a drift
 HEALTHY_EXCESS = 0.5
 #: largest part of Δ that a joint-sensor offset may leave unexplained, relative to Δ
 UNEXPLAINED = 0.5

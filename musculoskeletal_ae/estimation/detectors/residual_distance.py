@@ -57,7 +57,7 @@ class Reading(NamedTuple):
 class ResidualDistance(Detector):
     """Compares d with its threshold and names the most suspect muscle.
 
-    A subclass may use another statistic of the residual.
+    A subclass may use a statistic of the residual other than d.
 
     Attributes:
         symbol: Symbol of the statistic, for messages.
