@@ -49,7 +49,7 @@ class EagerSimulation:
         count, ways = len(tree.parent), np.eye(len(tree.parent), dtype=bool)
         for i in range(1, count):
             ways[i] |= ways[tree.parent[i]]
-        # whether joint j turns and lies at or before k, so that ∂τ_k/∂θ_j is not 0 for this reason
+        # mask (k, j): joint j is revolute, and is joint k or lies between the root and joint k
         turning = ways[:, 1:] & ~tree.slides[1:]
         self.before = _single(turning[1:])
         onto = np.zeros((count - 1, robot.joint_count))

@@ -112,7 +112,7 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
 
 
 def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Comparison | None:
-    """Return the comparison of a robot with MuJoCo, which for a cardsflow.xml is made here."""
+    """Return `comparison`, or for a cardsflow.xml a comparison with lengths by MuJoCo."""
     if file.name != 'cardsflow.xml' or not file.with_name('model.urdf').exists():
         return comparison
     source = read_source(file)

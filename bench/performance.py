@@ -163,7 +163,7 @@ def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
 
 
 def goals(numbers: dict[str, tuple[float, str, float]]) -> str:
-    """Return the table of goals: measured value, ≤ or ≥, and limit of each."""
+    """Return the table of goals; `numbers` has a measured value, ≤ or ≥, and a limit for each."""
     cells = []
     for name, (value, sign, limit) in numbers.items():
         met = value <= limit if sign == '≤' else value >= limit
@@ -180,7 +180,7 @@ def resident(pid: int) -> tuple[float, float]:
 
 
 def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Return the CPU time of each node until the first command [s], and its memory later."""
+    """Return by node the CPU time until the first command [s], and the memory later [MB]."""
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
         deadline = time.monotonic() + STARTING

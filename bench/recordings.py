@@ -46,7 +46,7 @@ HALF = slice(0, None, 2)  # every other rest is for training
 
 
 class Split(NamedTuple):
-    """Training and test data."""
+    """One way to divide a recording into training and test data."""
 
     name: str
     training: Run  # rest samples
@@ -184,7 +184,7 @@ def observations(recording: Recording) -> dict[str, Any]:
 
 
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
-    """Return the clone of a repository, or None if there is none."""
+    """Return the path of the clone of a repository, or None; `fetch` clones a missing one."""
     owner, short = repository.name.split('/')
     for name in (f'{owner}+{short}', short):
         for path in (clones / name / 'repo', clones / name):

@@ -158,7 +158,7 @@ def draw(rows: dict[str, Row], file: Path) -> None:
 
 
 def run(bodies: list[str], minutes: float, out: Path) -> None:
-    """Measure bodies without results, print the table and draw the plot."""
+    """Measure the bodies that have no results in `out` yet; print the table and draw the plot."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / 'rows.json'
     rows: dict[str, Row] = json.loads(file.read_text()) if file.exists() else {}

@@ -101,7 +101,7 @@ def microseconds(function: Callable[[], object], calls: int = 100, rounds: int =
 
 
 def row_time(row: Row, function: Callable[[], object]) -> float:
-    """Return the time [µs] of one side of a row."""
+    """Return the CPU time [µs] of `function`, which is one of the two implementations of a row."""
     return microseconds(function) / row.several
 
 

@@ -160,7 +160,7 @@ class Response(NamedTuple):
 
 
 def responses(robot: Robot, mae: Mae, preset: str) -> list[Response]:
-    """Return the responses of the geometric model and of the simulator."""
+    """Return how the geometric model and the simulator respond to pushes and a forced joint."""
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[robot.joints.index(FLEXED)] = FLEXION
     tension = holding_tension(robot, theta, 2.0 * robot.tension.bias)

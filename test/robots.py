@@ -99,7 +99,7 @@ def write_robot(
     slider: bool = False,
     **top: Any,
 ) -> Path:
-    """Write a sound arm of 3 joints and 8 muscles with foreign names.
+    """Write a sound arm of 3 joints and 8 muscles, whose names no shipped robot has.
 
     Args:
         directory: Directory; it is created if it is missing.

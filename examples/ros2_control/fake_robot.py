@@ -54,7 +54,7 @@ class Hardware:
         return states
 
     def write(self, angles: dict[str, float]) -> None:
-        """Let each drive follow a spool angle: by the MSC law, or with `actuation: position`."""
+        """Command a spool angle [rad] to each drive, which follows it as muscles.yaml states."""
         angle = np.array([angles[motor] for motor in self.motors])
         self.arm.command_length(self.direction * SPOOL_RADIUS * (angle - self.zero))
 

@@ -112,7 +112,7 @@ def write_ours(
 def write_mcap(
     path: Path, content: list[Sample], with_definitions: bool = True, **options: Any
 ) -> None:
-    """Write a bare file with the mcap library, like other recorders."""
+    """Write a bare file with the mcap library, as other recorders do."""
     with path.open('wb') as file:
         writer = Writer(file, **({'chunk_size': 2000, 'enable_data_crcs': True} | options))
         writer.start(profile='ros2')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No published command exceeds the limits of rate and tension or is not finite."""
+"""Every published command is finite, and within the limits of rate and tension."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stop that outlives its controller."""
+"""A stop is stored in a file, so the next controller begins with it."""
 
 import shutil
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torque control: exact with an exact network, and with a report of missing torque."""
+"""Torque control is exact with an exact network, and reports the torque that muscles lack."""
 
 import numpy as np
 import pytest

@@ -75,7 +75,7 @@ def test_a_bad_network_is_refused_without_any_message_and_the_error_names_figure
 
 
 class RestoringAll:
-    """A network that restores every state, with its own lengths."""
+    """A network that restores every state; its elongations are `softness` times the model's."""
 
     def __init__(self, softness, offset=0.0):
         self.softness, self.offset = softness, offset

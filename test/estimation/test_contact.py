@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contact: exact with an exact network, and not reported without an external force."""
+"""External forces are exact with an exact network, and without a force there is no contact."""
 
 from dataclasses import dataclass, replace
 from types import SimpleNamespace

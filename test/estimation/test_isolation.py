@@ -69,7 +69,7 @@ def test_a_suspect_that_is_not_wound_in_stays_isolated():
 
 
 class Loop:
-    """An estimator that isolates suspects, with commands of the test."""
+    """An estimator with `on_anomaly: isolate`, stepped with messages and commands of the test."""
 
     def __init__(self, robot, mae, healthy):
         self.core, self.now, self.command = Estimator(robot), 100.0, healthy.length.copy()

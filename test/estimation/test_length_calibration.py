@@ -22,7 +22,7 @@ def states(tension, length):
 
 
 def swinging(robot, mae):
-    """Return T [N] and l [m] of the network's body at time t [s] of a slow swing."""
+    """Return a function that computes θ, T and l by a network at time t [s] of a slow swing."""
 
     def at(t):
         middle, half = 0.5 * (robot.lower + robot.upper), 0.4 * (robot.upper - robot.lower)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Import of every format: lengths equal the source's, parts of chains, and damaged files."""
+"""Import of every format: equal lengths, chains that are cut out, and damaged files."""
 
 import os
 import re

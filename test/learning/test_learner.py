@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The life cycle of the learner, and its rules on time, which the caller provides."""
+"""The life cycle of the learner, and its rules that depend on time, which the tests provide."""
 
 from dataclasses import replace
 

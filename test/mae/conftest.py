@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shared networks, one preset at a time."""
+"""Fixtures with the briefly trained networks, for one preset at a time."""
 
 import pytest
 

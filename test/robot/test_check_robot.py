@@ -305,7 +305,7 @@ FINGER = """<robot name="finger"><link name="palm"/>
 
 
 def finger(directory, **top):
-    """Write a finger with tensions up to 5 N and moment arms of 3 to 5 mm."""
+    """Write the robot directory of a finger: tensions up to 5 N, moment arms of 3 to 5 mm."""
     directory.mkdir()
     (directory / 'robot.urdf').write_text(FINGER)
     muscles = [
