@@ -137,7 +137,7 @@ class ContactEstimator:
         """
         kinematics, joint_count = self._robot.kinematics, len(theta)
         near = np.abs(theta - self._evaluated_at) <= self._near
-        if np.count_nonzero(near) < joint_count:  # also if θ is NaN
+        if np.count_nonzero(near) < joint_count:  # this also applies if θ is NaN
             self._jacobian = self._mae.muscle_jacobian(theta, end_tension)
             self._evaluated_at = theta
         moments = end_tension @ self._jacobian  # Gᵀ T_end

@@ -57,7 +57,7 @@ LEAST_WEIGHT = 0.1
 # Constants of the search for initial values.
 DRAWN_POSTURES = 3200  # number of random postures whose torques at the first moment are compared
 FITTED_POSTURES = 400  # number of the best drawn postures, which are fitted coarsely to the lengths
-COMPARED_FITS = 30  # number of the best coarse fits, which are compared by torque as well
+COMPARED_FITS = 30  # number of the best coarse fits, which are then also compared by torque
 REFINED_FITS = 6  # number of the best coarse fits, which are refined
 FEW_MOMENTS = 24  # number of moments that the search uses
 BATCH = 20  # number of postures that are fitted during one message
@@ -67,7 +67,7 @@ COARSE_ANGLE = 0.1  # standard deviation of the excess over joint limits in coar
 
 FARTHEST = 0.3  # largest offset [m], and largest change of an angle in a Gauss–Newton step [rad]
 ROUNDS = 20  # largest number of Gauss–Newton steps
-FIRST_ROUNDS = 6  # largest number of Gauss–Newton steps in the search for a start
+FIRST_ROUNDS = 6  # largest number of Gauss–Newton steps in the search for initial values
 STEP = 1e-3  # step of numerical derivatives, of θ [rad] and of μ
 LARGEST_DAMPING = 1e4  # damping at which the fit ends, because no step lowers the cost
 
@@ -117,7 +117,7 @@ class LengthFit:
         self._torque_noise = TORQUE_NOISE / radian
         self.used = ~np.isin(np.arange(muscle_count), mae.isolated)
         length_weight = np.where(self.used, 1.0, ISOLATED_WEIGHT)
-        length_noise = LENGTH_NOISE * _relative_error(mae) / length_weight
+        length_noise = LENGTH_NOISE * _noise_factors(mae) / length_weight
         #: standard deviations of the residuals, (M + 2D,)
         self._noise = np.concatenate((length_noise, self._torque_noise, LIMIT_NOISE * radian))
 
@@ -333,7 +333,7 @@ def _turning(theta: Array, sticking: Array) -> Array:
     return result
 
 
-def _relative_error(mae: Mae) -> Array:
+def _noise_factors(mae: Mae) -> Array:
     """Return the factor of LENGTH_NOISE for each muscle, (M,).
 
     It is the variance of the muscle's length residual, relative to the median variance. For

@@ -162,7 +162,7 @@ class PositionLaw(ModuleLaw):
     def demand(self, row: _Reading, is_reference: bool) -> float:
         """Return T_ref [N]; while `is_reference` is true, also store x_0 and T_0."""
         stretch = self.stretch(row)
-        if is_reference:  # x_0 of a slack tendon is not known
+        if is_reference:  # for a slack tendon, x_0 − L_e(T_0) is unknown and assumed to be 0
             is_slack = row.tension < LIMITS.slack_share * self.bias
             self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
         wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION

@@ -122,7 +122,7 @@ class GroupFit:
         #: effective number of unknowns that each muscle's lengths determine
         self._determined = np.zeros(len(mean))
         self._weights: Weights
-        self._stiffness: Array  # ∂τ/∂θ in the last normal equations
+        self._stiffness: Array  # −∂τ/∂θ in the last normal equations [N·m/rad], (N, D, D)
         radian = model.body.robot.kinematics.radian
         self.usual = (
             1.0 / (TYPICAL_STEP * radian) ** 2,

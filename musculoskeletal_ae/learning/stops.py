@@ -144,7 +144,7 @@ class Stops:
         self.is_balanced = ~(changed @ robot.routes.crossed)
         if not robot.tension_source.is_known:
             self.is_balanced[:] = False
-        #: stop of each joint that is at one [rad], otherwise NaN
+        #: limit [rad] at whose stop each joint is, NaN for joints that are not at a stop, (N, D)
         self._at = np.full(model.by_sensor.shape, np.nan)
 
     def lean(self, own: Array, score: Array) -> Bools:

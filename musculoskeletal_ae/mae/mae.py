@@ -389,7 +389,7 @@ class Mae:
         Sensor values of isolated muscles are not used; their T and l are estimates as well.
 
         Args:
-            tension: Bone-side tension, after tendon friction (`friction`) [N], (..., M).
+            tension: Bone-side tension T_end [N], from which tendon friction is removed, (..., M).
             length: Muscle length [m], (..., M).
         """
         if not self.isolated:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a muscle that has no tension although tension is commanded: it is ruptured or slack.
 
-    T < slack_share · T_ref for DEAD_TIME, and not being wound in
+    T < slack_share · T_ref for DEAD_TIME, and the tendon is not being wound in
 
 The rule needs no statistics, because a healthy module maintains at least T_bias. A slow winch takes
 time to wind in slack. The detector waits while the winch moves at `slack_speed` or faster, until it

@@ -14,7 +14,8 @@ larger than that of the network in use.
 
 Without joint sensors, the network in use is the reference. The limits of the median differences are
 ANGLE_MOVED and LENGTH_MOVED, and that of the relative difference in shape is SHAPE_MOVED. If there
-are too few messages, the fixed states replace them. The network in use then computes the lengths.
+are too few messages, they are replaced by the fixed states with lengths that the network in use
+computes.
 """
 
 from __future__ import annotations
