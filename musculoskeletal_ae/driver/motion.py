@@ -49,17 +49,22 @@ class MotionTest(ABC):
         """Prepare to test muscles, by default all. The verdict receives the results."""
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._muscles = robot, muscles or range(robot.muscle_count)
-        self.trying = ''  # current step, for messages
-        self._tested = -1  # index of the muscle that is being tested, −1 for none
+        #: index of the muscle that is being tested; None while the arm is held
+        self._tested: int | None = None
         self.done = False
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
         self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
         #: last time at which each muscle was within its limits [s]
         self._tame_at: Array = np.zeros(robot.muscle_count)
-        #: θ (D,), states (3, M) and tested muscle of each message, −1 for none
+        #: θ (D,), states (3, M) and tested muscle of each message, −1 while the arm is held
         self._history: list[tuple[Array, Array, int]] = []
         self._run = self._sequence()
+
+    @property
+    def trying(self) -> str:
+        """The present step of the test, for messages: `hold`, or the name of a muscle."""
+        return 'hold' if self._tested is None else self._robot.muscles[self._tested]
 
     def step(self, states: Array, now: float, theta: Array | None = None) -> Array | None:
         """Take the newest readings; return l_target [m] (M,), or None for no command.
@@ -71,7 +76,8 @@ class MotionTest(ABC):
         """
         self._now = now
         if theta is not None:
-            self._history.append((theta, states, self._tested))
+            segment = -1 if self._tested is None else self._tested
+            self._history.append((theta, states, segment))
         self._recent.append((now, states))
         while now - self._recent[0][0] > MEAN:
             self._recent.popleft()
@@ -106,10 +112,9 @@ class MotionTest(ABC):
     def _sequence(self) -> Wait:
         """Run the whole test."""
         try:
-            self.trying = 'hold'
             yield from self._hold()
             for m in self._muscles:
-                self.trying, self._tested = self._robot.muscles[m], m
+                self._tested = m
                 yield from self._try(m)
             self._judge_joints()
         except RunAwayError as error:
