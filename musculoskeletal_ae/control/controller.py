@@ -189,7 +189,9 @@ class Controller:
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
         self.rejected_pull: Array | None = None  # `RejectionError.pull` since the last sample
-        self.estimate: Array | None = None  # θ [rad], (D,)
+        #: θ [rad] (D,) under the present length offsets; None until the first such estimate, for
+        #: example from the start of a length calibration. Without it, the arm does not move.
+        self.estimate: Array | None = None
         self.target_state = Target(np.zeros(robot.joint_count))
         self.supervisor = Supervisor()
         self.watchdog = Watchdog(robot, self.settings)
@@ -199,8 +201,6 @@ class Controller:
         self.stopping = SafeStop(robot, self.settings, self.limiter)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
-        #: whether a length calibration has begun and there is no estimate yet
-        self._awaits_estimate = False
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
         if self.settings.method == 'float':
@@ -293,7 +293,7 @@ class Controller:
         self._estimate_problem.note('', now)
         if is_new:
             self.watchdog.take_estimate(now)
-        self.estimate, self._awaits_estimate = theta, False
+        self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
         """Apply a body state: isolated muscles and length offsets."""
@@ -321,10 +321,10 @@ class Controller:
         if is_known != before.known or (body.offsets.offset != before.offset).any():
             self.activities.leave()
         if not is_known and not body.offsets.is_suspect:
-            # A length calibration begins or continues. Until its first estimate, the arm waits.
+            # A length calibration begins or continues. An estimate from other offsets is wrong.
             age = self.watchdog.age
             age.expect_later(StopCause.STALE_ESTIMATE, age.stepped_at, FIRST_ESTIMATE)
-            self._awaits_estimate = True
+            self.estimate = None
         self.limiter.offsets_known = is_known
         self.supervisor.on_offsets(is_known)
 
@@ -536,7 +536,7 @@ class Controller:
 
     def _desired(self, dt: float) -> Command | None:
         """Return the activity's command; any exception stops the arm."""
-        if self._awaits_estimate:
+        if self.estimate is None:  # a length calibration provides the next one
             self.activities.leave()
             return self.limiter.command
         control = self.activities.of(self.supervisor.activity, self.settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach, stops
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import Follower
@@ -89,14 +90,16 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         warnings.append('the target needs more torque than the muscles can exert')
     if target.unreachable_reason:
         warnings.append(f'out of reach: {target.unreachable_reason}')
-    if core.is_following and follower.has_fallen:
-        warnings.append(_fallen(core))
+    if core.is_following and core.estimate is not None and follower.has_fallen:
+        warnings.append(_fallen(core, core.estimate))
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
         unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
         values['unknown length offsets'] = robot.names(unknown)
-        warnings.append('the length offsets are unknown, so the arm can only explore gently')
+        waits = 'waits for the first estimate of the length calibration'
+        doing = waits if core.estimate is None else 'can only explore gently'
+        warnings.append(f'the length offsets are unknown, so the arm {doing}')
     if not robot.tension_source.is_known:
         values['tension'] = f'tension_source: none: {NO_TENSION}'
     elif robot.tension_source.is_current:
@@ -166,11 +169,14 @@ def slowed(follower: Follower) -> str:
     return f'slowed to {share:.0f} % of its speed for the muscle modules'
 
 
-def _fallen(core: Controller) -> str:
-    """Return a text on a fallen arm: its distance from the target, and the missing torque."""
-    mae, estimate, robot = core.mae, core.estimate, core.robot
+def _fallen(core: Controller, estimate: Array) -> str:
+    """Return a text on a fallen arm: its distance from the target, and the missing torque.
+
+    `estimate` is θ [rad], (D,).
+    """
+    mae, robot = core.mae, core.robot
     error = core.activities.follower.error
-    assert mae is not None and estimate is not None  # the arm has moved
+    assert mae is not None  # the arm has moved
     joint = int(np.abs(error / robot.kinematics.radian).argmax())
     distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
     text = f'the arm has fallen: {robot.joints[joint]} rests {distance} away from its target'

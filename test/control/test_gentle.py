@@ -7,6 +7,7 @@ import pytest
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.calibrating import SPEED, gentle_limit
 from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
@@ -21,10 +22,14 @@ class Loop:
         self.arm, self.core, self.now = EmulatedArm(robot, 1), Controller(robot), 0.0
         self.offset = np.zeros(robot.muscle_count)
         self.core.use(mae)
-        self.core.use_body(
-            self.core.stream.body.with_offsets(LengthOffsets.unknown(len(self.offset)))
-        )
         self.commands, self.pulls = [], []
+        self.has_estimates = True
+        self.begin_calibration()
+
+    def begin_calibration(self):
+        """Let the controller know that a length calibration begins."""
+        offsets = LengthOffsets.unknown(len(self.offset))
+        self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def know(self, offset):
         """Tell the controller the length offsets [m], (M,)."""
@@ -41,7 +46,8 @@ class Loop:
             read = self.arm.sense()
             length = read.length + self.offset
             self.core.muscles(np.array([length, read.tension, read.temperature]), self.now)
-            self.core.estimated(self.arm.theta, self.now)
+            if self.has_estimates:
+                self.core.estimated(self.arm.theta, self.now)
             command = self.core.step(self.now)
             if command is not None:
                 self.commands.append(self.sent(command))
@@ -91,3 +97,22 @@ def test_new_length_offsets_do_not_move_the_arm(loop):
     assert np.abs(loop.sent(loop.core.step(loop.now)) - before).max() < 0.002
     loop.run(DT)
     assert np.abs(loop.commands[-1] - before).max() < 0.002
+
+
+def test_a_length_calibration_moves_the_arm_only_after_its_first_estimate_even_after_a_stop(loop):
+    loop.core.explore(True)
+    loop.run(1.0)
+    loop.begin_calibration()
+    loop.has_estimates = False
+    before = loop.commands[-1]
+    loop.run(0.5)
+    loop.core.stop(StopCause.OPERATOR)
+    loop.run(0.1)
+    assert loop.core.reset(loop.now) is None
+    loop.core.explore(True)
+    loop.run(0.5)
+    np.testing.assert_array_equal(loop.commands[-110:], np.tile(before, (110, 1)))
+    assert 'waits for the first estimate' in status.report(loop.core, loop.now).message
+    loop.has_estimates = True
+    loop.run(0.5)
+    assert np.abs(loop.commands[-1] - before).max() > 0.001
