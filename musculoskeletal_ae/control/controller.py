@@ -495,9 +495,10 @@ class Controller:
         stream = self.stream
         if stream.body.offsets.is_suspect:
             return 'the estimator has revoked the length offsets'
-        has_jumped = stream.displaced and not stream.has_displaced_unseen
+        displaced = self.stream.displaced
+        has_jumped = displaced.muscles and not displaced.is_unseen
         if has_jumped and stream.body.offsets.known and now - self._jumped_at > REACTION_TIME:
-            return f'the lengths of {self.robot.names(sorted(stream.displaced))} have jumped'
+            return f'the lengths of {self.robot.names(sorted(displaced.muscles))} have jumped'
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:

@@ -360,10 +360,10 @@ class Estimator:
 
         In all other cases, the detector `LengthJump` reports it.
         """
-        if self.stream.jumps == self._jumps:
+        if self.stream.displaced.jumps == self._jumps:
             return
-        self._jumps = self.stream.jumps
-        jumped = tuple(sorted(self.stream.displaced))
+        self._jumps = self.stream.displaced.jumps
+        jumped = tuple(sorted(self.stream.displaced.muscles))
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
             self.calibrate_lengths(self._stated_posture)

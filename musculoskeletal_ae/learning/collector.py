@@ -93,12 +93,13 @@ class SampleCollector:
     @property
     def has_jumped(self) -> bool:
         """Whether a jump of lengths was observed and the length offsets date from before it."""
-        return bool(self._stream.displaced) and not self._stream.has_displaced_unseen
+        displaced = self._stream.displaced
+        return bool(displaced.muscles) and not displaced.is_unseen
 
     @property
     def jumps(self) -> int:
         """How often lengths have jumped."""
-        return self._stream.jumps
+        return self._stream.displaced.jumps
 
     @property
     def is_anomaly(self) -> bool:

@@ -151,18 +151,18 @@ def jump_together(stream, size=0.05, pause=0.0):
 def test_lengths_that_jump_together_are_all_named_and_displaced_until_new_offsets_are_found():
     stream = MuscleStream(ROBOT)
     assert jump_together(stream) == [0, 1, 2]
-    assert stream.displaced == {0, 1, 2}
-    assert not stream.has_displaced_unseen
+    assert stream.displaced.muscles == {0, 1, 2}
+    assert not stream.displaced.is_unseen
     stream.use_body(HEALTHY.with_offsets(HEALTHY.offsets.revoked()))
-    assert stream.displaced == {0, 1, 2}
+    assert stream.displaced.muscles == {0, 1, 2}
     stream.use_body(HEALTHY.with_offsets(LengthOffsets.unknown(M)))
-    assert not stream.displaced
+    assert not stream.displaced.muscles
 
 
 def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
     stream = MuscleStream(ROBOT)
     assert jump_together(stream, size=0.09, pause=2.0 * LIMITS.pause) == [0, 1, 2]
-    assert stream.has_displaced_unseen
+    assert stream.displaced.is_unseen
 
 
 def jumps_of_a_winding_tendon(by, tension):
@@ -214,7 +214,7 @@ def test_an_isolated_muscle_is_no_longer_displaced():
     stream = MuscleStream(ROBOT)
     jump_together(stream)
     stream.use_body(stream.body.with_isolated([1]))
-    assert stream.displaced == {0, 2}
+    assert stream.displaced.muscles == {0, 2}
 
 
 def test_implausible_messages_are_a_fault_once_they_outlast_a_glitch():

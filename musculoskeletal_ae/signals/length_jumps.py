@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rejects messages after a length has jumped, until its new level has lasted.
+
+A length jumps if it changes faster than a muscle can, for example because a module has lost its
+length offset. `LengthJumps.step` receives every message and decides:
+
+    no jump ── a length jumps ──────────────────────────────► waiting: messages are rejected
+    waiting ── the lengths have returned ───────────────────► no jump
+    waiting ── no length has jumped for `LIMITS.settled` ───► no jump: the new level is accepted
+
+The muscles whose new level is accepted are displaced until the next length calibration
+(`DisplacedMuscles`), unless a rupture explains the jump (`PresumedRupture`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
+
+
+class Verdict(NamedTuple):
+    """What the lengths of one message show.
+
+    Attributes:
+        problem: Reason and detail if the message is rejected, or None.
+        displaced: Muscles that are displaced from now on; usually none.
+        is_unseen: Whether these jumped during a pause of the messages, in which the arm may have
+            moved.
+    """
+
+    problem: tuple[str, str] | None = None
+    displaced: tuple[int, ...] = ()
+    is_unseen: bool = False
+
+
+@dataclass
+class Jump:
+    """A jump whose new level is not accepted yet; arrays have the shape (M,).
+
+    The changes that were too large are added up for each muscle. The sum shows whether a length is
+    still at another level. Its present value does not: a module whose length jumped winds in or
+    pays out, which can bring the length back to the previous value.
+
+    Attributes:
+        change: Sum of the changes that were too large [m].
+        allowed: The largest change that was legal at any of them [m].
+        winding: What motors can have wound in meanwhile [m].
+        is_unseen: Whether the first change followed a pause of the messages.
+        last_at: Time of the last change that was too large [s].
+    """
+
+    change: Array
+    allowed: Array
+    winding: Array
+    is_unseen: bool
+    last_at: float = math.inf
+
+    @classmethod
+    def begin(cls, muscle_count: int, pause: float) -> Jump:
+        """Return an empty jump after a `pause` [s] of the messages."""
+        nothing = np.zeros(muscle_count)
+        return cls(nothing, nothing.copy(), nothing.copy(), pause > LIMITS.pause)
+
+    def add(self, jumps: Bools, change: Array, allowed: float, pause: float, now: float) -> None:
+        """Add the changes [m] (M,) of the muscles `jumps` (M,), after a `pause` [s]."""
+        self.last_at = now
+        self.change[jumps] += change[jumps]
+        self.allowed[jumps] = np.maximum(self.allowed[jumps], allowed)
+        self.winding[jumps] += LIMITS.step + LIMITS.speed * pause
+
+    def remaining(self, used: Bools) -> Bools:
+        """Return which of the muscles `used` are at another level, (M,)."""
+        is_far: Bools = (np.abs(self.change) > self.allowed) & used
+        return is_far
+
+
+class PresumedRupture:
+    """Recognizes a jump that the rupture of a tendon explains.
+
+    A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, its length
+    appears to jump as well. One slack tendon that has become shorter while the others pull is
+    therefore not counted as displaced, and left to the detectors of ruptures. This requires that
+    the motor can have wound in so much since the last message. If the tendon pulls again, it has
+    not ruptured: its module may have lost its length offset, so the muscle is displaced then.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._slack = LIMITS.slack_share * robot.description.tension.bias
+        self._presumed: Bools = np.zeros(robot.muscle_count, dtype=bool)  # (M,)
+        #: time since when each of these pulls again [s]; ∞ if it does not, (M,)
+        self._taut_since: Array = np.full(robot.muscle_count, math.inf)
+
+    def explains(self, jump: Jump, tension: Array, used: Bools) -> bool:
+        """Return whether one tendon alone is slack and wound in, and remember it if so.
+
+        Args:
+            jump: The jump.
+            tension: T_read [N], (M,); NaN where it is unknown.
+            used: Which muscles are not isolated, (M,).
+        """
+        muscles = np.flatnonzero(jump.remaining(used))
+        slack = np.flatnonzero((tension < self._slack) & used)
+        if not np.array_equal(slack, muscles) or len(muscles) != 1:
+            return False
+        m = muscles[0]
+        if not -jump.winding[m] <= jump.change[m] < 0.0:
+            return False
+        self._presumed[m] = True
+        return True
+
+    def refuted(self, tension: Array, used: Bools, now: float) -> tuple[int, ...]:
+        """Return muscles that pull again, for which no rupture is presumed any more."""
+        if not self._presumed.any():
+            return ()
+        is_taut = self._presumed & used & (tension >= self._slack)
+        self._taut_since = np.where(is_taut, np.minimum(self._taut_since, now), math.inf)
+        is_refuted = now - self._taut_since > LIMITS.settled
+        self._presumed &= ~is_refuted
+        return tuple(np.flatnonzero(is_refuted).tolist())
+
+    def forget(self) -> None:
+        """Forget all presumed ruptures, because the length offsets have been calibrated."""
+        self._presumed[:] = False
+
+
+class LengthJumps:
+    """Detects jumps between successive messages, and waits for the new level to last.
+
+    It uses lengths as measured, so that new length offsets do not look like jumps.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._last: Array | None = None  # the last lengths, accepted or not [m], (M,)
+        self._last_at = math.inf  # time of the last message [s]
+        self._jump: Jump | None = None  # the jump whose new level is not accepted yet
+        self._was_unseen = False  # `Jump.is_unseen` of the last accepted jump
+        self._rupture = PresumedRupture(robot)
+
+    def step(self, length: Array, tension: Array, used: Bools, now: float) -> Verdict:
+        """Return what the lengths of the newest message show.
+
+        Args:
+            length: Lengths as measured [m], (M,).
+            tension: T_read [N], (M,); NaN where it is unknown.
+            used: Which muscles to check, (M,).
+            now: Time of reception by a steady clock [s].
+        """
+        last, pause = self._last, max(now - self._last_at, 0.0)
+        self._last, self._last_at = length, now
+        if last is None:
+            return Verdict()
+        allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
+        change = length - last
+        jumps = (np.abs(change) > allowed) & used
+        if jumps.any():
+            if self._jump is None:
+                self._jump = Jump.begin(len(length), pause)
+            self._jump.add(jumps, change, allowed, pause, now)
+        jump = self._jump
+        if jump is None or not jump.remaining(used).any():
+            self._jump = None
+            return Verdict(None, self._rupture.refuted(tension, used, now), self._was_unseen)
+        if now - jump.last_at <= LIMITS.settled:
+            return Verdict(self._problem(jump, used))
+        # The new level has lasted, so it is accepted.
+        self._jump, self._was_unseen = None, jump.is_unseen
+        if self._rupture.explains(jump, tension, used):
+            return Verdict()
+        muscles = np.flatnonzero(jump.remaining(used)).tolist()
+        return Verdict(None, tuple(muscles), jump.is_unseen)
+
+    def _problem(self, jump: Jump, used: Bools) -> tuple[str, str]:
+        """Return reason and detail of the rejection of a message."""
+        muscle = int(np.abs(jump.change * used).argmax())
+        return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {1e3 * jump.change[muscle]:.0f} mm'
+
+    def calibrated(self) -> None:
+        """Take into account that the length offsets have been calibrated."""
+        self._rupture.forget()
+
+
+@dataclass
+class DisplacedMuscles:
+    """Records muscles whose lengths have jumped since their last length calibration.
+
+    Attributes:
+        muscles: These muscles; their lengths are not reliable.
+        jumps: Number of accepted jumps since the start.
+        is_unseen: Whether the last jump was during a pause of the messages, in which the arm may
+            have moved.
+    """
+
+    muscles: frozenset[int] = frozenset()
+    jumps: int = 0
+    is_unseen: bool = False
+
+    def note(self, verdict: Verdict) -> None:
+        """Record the muscles that are displaced from now on."""
+        if verdict.displaced:
+            self.muscles |= set(verdict.displaced)
+            self.jumps += 1
+            self.is_unseen = verdict.is_unseen
+
+    def use_body(self, body: BodyState, is_calibrated: bool) -> None:
+        """Drop isolated muscles, and all muscles if new length offsets have been calibrated."""
+        if is_calibrated:
+            self.muscles = frozenset()
+        self.muscles -= set(body.isolated)

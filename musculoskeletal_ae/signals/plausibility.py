@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks single values of `muscle_states` for plausibility. Jumps are checked in `length_jumps`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import (
+    LENGTH,
+    LIMITS,
+    TEMPERATURE,
+    TENSION,
+    longest_lengths,
+    reading_range,
+)
+
+
+class LevelCheck:
+    """Checks every value of a message against the limits of plausible sensor values."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        longest = longest_lengths(robot)
+        (least, most), ones = reading_range(robot), np.ones_like(longest)
+        #: lowest and highest l [m], T [N] and temperature [°C], (3, M)
+        self._low = np.array([-longest, least, LIMITS.lowest_temperature * ones])
+        self._high = np.array([longest, most, LIMITS.highest_temperature * ones])
+        self._slack = LIMITS.slack_share * robot.description.tension.bias
+
+    def plausible_pull(self, states: Array, offset: Array) -> Array:
+        """Return l [m] with `offset` [m] (M,) removed and T [N], (2, M); −∞ where implausible.
+
+        A length may be as far beyond any posture as that of a module that lost its length offset.
+        """
+        pull = states[:2].copy()
+        pull[0] -= offset
+        margin = np.array([[LIMITS.slack_length_margin], [0.0]])
+        legal = (pull >= self._low[:2] - margin) & (pull <= self._high[:2] + margin)
+        plausible: Array = np.where(legal, pull, -np.inf)
+        return plausible
+
+    def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
+        """Return reason and detail of the first implausible value, or None.
+
+        Args:
+            states: l [m], T [N] and temperature [°C] (3, M); NaN is ignored.
+            used: Which muscles to check, (M,).
+            lengths_known: Whether to check l, which requires known length offsets.
+        """
+        low = self._low.copy()
+        # A slack tendon, such as that of a ruptured muscle, can be wound in beyond any posture.
+        low[0] -= np.where(states[1] < self._slack, LIMITS.slack_length_margin, 0.0)
+        beyond = ((states < low) | (states > self._high)) & used
+        beyond[0] &= lengths_known
+        if not np.count_nonzero(beyond):
+            return None
+        quantity, muscle = np.argwhere(beyond)[0]
+        reason, unit = ((LENGTH, 'm'), (TENSION, 'N'), (TEMPERATURE, '°C'))[quantity]
+        place = quantity, muscle
+        value, least, most = distinct(states[place], low[place], self._high[place])
+        legal = f'{least} to {most} {unit}'
+        return reason, f'{self._robot.muscles[muscle]} {value} {unit}, legal: {legal}'
+
+
+class TemperatureCheck:
+    """Accepts a temperature only if the housing can have reached it since the last accepted one.
+
+    A few messages with 199 °C have no effect. A sensor that continues to read 199 °C is accepted
+    some seconds later, because a hot module must stop the arm.
+    """
+
+    def __init__(self, muscle_count: int) -> None:
+        self._believed: Array = np.full(muscle_count, math.nan)  # last accepted [°C], (M,)
+        self._age: Array = np.zeros(muscle_count)  # age of the last accepted temperature [s]
+        self._first: Array = self._believed.copy()  # candidate for the first temperature [°C]
+        #: time for which readings have agreed with it [s]
+        self._first_age: Array = np.zeros(muscle_count)
+        self._last_at = math.nan
+
+    def step(self, read: Array, now: float) -> Array:
+        """Return the accepted temperatures [°C] (M,), or NaN, after readings at `now` [s]."""
+        elapsed = max(now - self._last_at, 0.0) if math.isfinite(self._last_at) else 0.0
+        self._last_at = now
+        possible = (read >= LIMITS.lowest_temperature) & (read <= LIMITS.highest_temperature)
+        self._age += elapsed
+        change = LIMITS.temperature_step + LIMITS.temperature_rate * self._age
+        accepted = possible & (np.abs(read - self._believed) <= change)
+        accepted |= self._begins(np.where(possible, read, math.nan), elapsed)
+        self._believed = np.where(accepted, read, self._believed)
+        self._age = np.where(accepted, 0.0, self._age)
+        return np.where(possible, self._believed, math.nan)
+
+    def _begins(self, read: Array, elapsed: float) -> Bools:
+        """Return where readings have agreed long enough to accept a first temperature, (M,)."""
+        agrees = np.abs(read - self._first) <= LIMITS.temperature_step
+        self._first_age = np.where(agrees, self._first_age + elapsed, 0.0)
+        self._first = np.where(agrees, self._first, read)
+        begins: Bools = np.isnan(self._believed) & (self._first_age > LIMITS.glitch)
+        return begins
