@@ -95,6 +95,10 @@ class Bench:
         self.core.stop(StopCause.OPERATOR)
 
     @property
+    def follower(self):
+        return self.core.activities.follower
+
+    @property
     def cause(self):
         """The identifier of the stop cause, or ''."""
         condition = self.core.supervisor.condition

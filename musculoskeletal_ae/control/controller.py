@@ -418,8 +418,8 @@ class Controller:
             MessageError: If the pose is refused; nothing is changed then.
         """
         start, mae = self._ready()
-        follower = self.activities.follower
-        if follower.is_moving and self.planner.is_under_way(pose, whole, follower.latest):
+        progress = self.activities.follower.progress
+        if progress.is_moving and self.planner.is_under_way(pose, whole, progress.latest):
             self.planner.repeat_pose(now)
             return
         self._follow(self.planner.to_pose(mae, start, pose, whole, now))
@@ -579,9 +579,9 @@ class Controller:
         number of attempts is limited.
         """
         state, follower = self.target_state, self.activities.follower
-        if follower.trajectory is None and state.theta is not None:
+        if follower.progress.trajectory is None and state.theta is not None:
             self._approach(self.settings.first_duration)
-        elif follower.has_lost_path and state.approaches_left:
+        elif follower.progress.has_lost_path and state.approaches_left:
             state.approaches_left -= 1
             follower.leave()
             self._approach(self.settings.target_duration or self.settings.first_duration)
@@ -671,7 +671,7 @@ class Controller:
 
     def _begin(self, plan: Plan, delay: float, effort: Array) -> None:
         follower = self.activities.follower
-        if follower.trajectory is None and delay > 0.0:
+        if follower.progress.trajectory is None and delay > 0.0:
             start, _ = self._ready()
             follower.follow(self.planner.to_rest(start).trajectory)
         follower.follow(plan.trajectory, delay)
@@ -684,7 +684,7 @@ class Controller:
         activity = self.supervisor.activity
         follower = self.activities.follower
         is_used = self.activities.of(activity, self.settings) is follower
-        return is_used and follower.trajectory is not None
+        return is_used and follower.progress.trajectory is not None
 
     @property
     def _is_ready(self) -> bool:
@@ -706,9 +706,9 @@ class Controller:
             raise MessageError('stopped', str(condition))
         if not self.stream.body.offsets.known:
             raise MessageError('length offsets are unknown', 'call estimator/zero')
-        follower = self.activities.follower
-        if follower.trajectory is not None and not follower.has_lost_path:
-            return follower.ahead(delay), self.mae
+        progress = self.activities.follower.progress
+        if progress.trajectory is not None and not progress.has_lost_path:
+            return progress.ahead(delay), self.mae
         inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
         return Setpoint.resting(inside), self.mae
 

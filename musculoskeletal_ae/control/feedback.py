@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feedback at rest: corrects the estimated posture error and reduces needless tension."""
+"""Feedback: corrects the estimated posture error, and at rest reduces needless tension.
+
+`MotionFeedback` works while the arm moves and settles, `RestFeedback` afterwards.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,8 @@ CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times RACK [m
 #: never rest.
 DEADBAND = 0.03
 RELIEF_INTERVAL = 0.1  # time between two computations of the needless tension [s]
+PROPORTIONAL = 0.7  # proportional gain k_p in motion
+INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
 SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
 
 
@@ -120,3 +125,29 @@ class RestFeedback:
     def shift(self, jacobian: Array) -> Array:
         """Return the length correction G c + r [m], (M,); `jacobian` is G at the target, (M, D)."""
         return jacobian @ self.correction + self.relief
+
+
+class MotionFeedback:
+    """Shifts the posture along a trajectory by k_p e + c, with dc/dt = k_i e.
+
+    c is the correction of the rest feedback, so that it continues from one motion to the next.
+    """
+
+    def __init__(self, rest: RestFeedback) -> None:
+        self._rest = rest
+        self._shift: Array = np.zeros_like(rest.correction)  # shift of θ [rad], (D,)
+
+    def step(self, error: Array, dt: float) -> Array:
+        """Return the shift of θ [rad] (D,) after an error [rad] (D,) over dt [s]."""
+        rest = self._rest
+        correction = rest.correction + INTEGRAL * dt * error
+        rest.correction = np.clip(correction, -rest.largest, rest.largest)
+        rest.moving()
+        # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
+        shift = rest.correction + PROPORTIONAL * error
+        self._shift = np.clip(shift, -rest.largest, rest.largest)
+        return self._shift
+
+    def continue_at_rest(self) -> None:
+        """Let the rest feedback continue from the present shift."""
+        self._rest.correction = self._shift

@@ -51,13 +51,13 @@ class FollowedGoal:
             patience: Longest time after the end of the trajectory until the tolerances `goal` are
                 met [s]; 0 for no limit.
         """
-        self._core, self._trajectory = core, core.activities.follower.latest
+        self._core, self._trajectory = core, core.activities.follower.progress.latest
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
 
     def outcome(self) -> tuple[int, str] | None:
         """Return an error code and its reason, or None while the goal is active."""
         core, trajectory = self._core, self._trajectory
-        follower, condition = core.activities.follower, core.supervisor.condition
+        progress, condition = core.activities.follower.progress, core.supervisor.condition
         if condition is not None:
             return INVALID, f'stopped: {condition}'
         if not core.is_following or trajectory is None:
@@ -65,15 +65,15 @@ class FollowedGoal:
                 INVALID,
                 f'the trajectory ended, because the mode changed to {core.supervisor.mode}',
             )
-        if follower.latest is not trajectory:
+        if progress.latest is not trajectory:
             return INVALID, 'the trajectory was replaced by another target'
-        if follower.trajectory is not trajectory:
+        if progress.trajectory is not trajectory:
             return None  # the trajectory has not started yet
-        off = np.abs(follower.error)
-        if follower.time < trajectory.duration:
+        off = np.abs(progress.error)
+        if progress.time < trajectory.duration:
             return self._beyond(BEYOND_PATH, off, self._path)
         if missed := self._beyond(BEYOND_GOAL, off, self._goal):
-            return missed if 0.0 < self._patience < follower.over else None
+            return missed if 0.0 < self._patience < progress.over else None
         return SUCCESSFUL, ''
 
     def _beyond(self, code: int, off: Array, bounds: Array) -> tuple[int, str] | None:

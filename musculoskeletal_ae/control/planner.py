@@ -14,9 +14,9 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach
-from musculoskeletal_ae.control.follower import slowness
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.slowness import slowness
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae

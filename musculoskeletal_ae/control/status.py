@@ -80,7 +80,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
     follower = core.activities.follower
     if core.is_following:
         values['lag of the winches'] = f'{1000.0 * follower.winches.lag:.0f} ms'
-        if follower.is_moving and (slow := slowed(follower)):
+        if follower.progress.is_moving and (slow := slowed(follower)):
             warnings.append(f'trajectory {slow}')
     control = core.activities.of(core.supervisor.activity, core.settings)
     missing = None if control is None else control.missing_torque
@@ -90,7 +90,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         warnings.append('the target needs more torque than the muscles can exert')
     if target.unreachable_reason:
         warnings.append(f'out of reach: {target.unreachable_reason}')
-    if core.is_following and core.estimate is not None and follower.has_fallen:
+    if core.is_following and core.estimate is not None and follower.progress.has_fallen:
         warnings.append(_fallen(core, core.estimate))
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
@@ -140,7 +140,7 @@ def _heat_warnings(core: Controller, values: dict[str, str]) -> list[str]:
 
 
 def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
-    solution = core.activities.follower.solution
+    solution = core.activities.follower.plan.solution
     if core.settings.method != 'stiffness' or solution is None or solution.stiffness is None:
         return
     expected, *reachable = solution.stiffness
@@ -156,7 +156,7 @@ def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
 
 def slowed(follower: Follower) -> str:
     """Return a text on how much the last trajectory was slowed; '' if it was not slowed."""
-    last = follower.latest
+    last = follower.progress.latest
     if last is None or last.slowed == 1.0:
         return ''
     share = 100.0 / last.slowed
@@ -175,7 +175,7 @@ def _fallen(core: Controller, estimate: Array) -> str:
     `estimate` is θ [rad], (D,).
     """
     mae, robot = core.mae, core.robot
-    error = core.activities.follower.error
+    error = core.activities.follower.progress.error
     assert mae is not None  # the arm has moved
     joint = int(np.abs(error / robot.kinematics.radian).argmax())
     distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'

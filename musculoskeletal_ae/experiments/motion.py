@@ -125,7 +125,7 @@ def follow(
     planned = Trajectory.to(Setpoint.resting(start), goal, duration)
     if method == OURS:
         core.trajectory(planned.points)
-        followed = core.activities.follower.trajectory
+        followed = core.activities.follower.progress.trajectory
         assert followed is not None
         planned = followed
     elif method != 'tension':

@@ -31,7 +31,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import Command
 from musculoskeletal_ae.control.exploration import TRIES
-from musculoskeletal_ae.control.follower import FALLEN
+from musculoskeletal_ae.control.progress import FALLEN
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
@@ -185,7 +185,7 @@ def measure_reach(loop: IsolatingLoop, muscle: int, rng: np.random.Generator) ->
                     break
                 loop.run(1.0)
                 still = np.abs(loop.arm.theta - before).max() < STILL
-                is_resting = still and not loop.core.activities.follower.is_moving
+                is_resting = still and not loop.core.activities.follower.progress.is_moving
                 rest_time = rest_time + 1 if is_resting else 0
                 before = loop.arm.theta
             distance = float(np.linalg.norm(before - theta))

@@ -220,16 +220,16 @@ class Controller(Shell):
 
     def _state(self) -> JointTrajectory:
         """Return the desired state, the estimated posture and the error, as three points."""
-        follower = self.core.activities.follower
-        desired, names = follower.desired, ('positions', 'velocities', 'accelerations')
+        progress = self.core.activities.follower.progress
+        desired, names = progress.desired, ('positions', 'velocities', 'accelerations')
         parts = {name: part.tolist() for name, part in zip(names, desired, strict=True)}
-        estimated = desired.theta - follower.error
+        estimated = desired.theta - progress.error
         points = [
             JointTrajectoryPoint(**parts),
             JointTrajectoryPoint(positions=estimated.tolist()),
-            JointTrajectoryPoint(positions=follower.error.tolist()),
+            JointTrajectoryPoint(positions=progress.error.tolist()),
         ]
-        points[0].time_from_start = Duration(seconds=follower.time).to_msg()
+        points[0].time_from_start = Duration(seconds=progress.time).to_msg()
         message = JointTrajectory(joint_names=self.robot.joints, points=points)
         message.header.stamp = self.get_clock().now().to_msg()
         return message
@@ -313,7 +313,7 @@ class Controller(Shell):
         if left_out := self.recording.left_out:
             report.values['messages too large for a stop recording'] = str(left_out)
         stopped = [] if self.core.supervisor.is_running else [report.message]
-        changing = self.core.is_following and self.core.activities.follower.is_moving
+        changing = self.core.is_following and self.core.activities.follower.progress.is_moving
         held = {} if changing else report.values
         stiffness = [f'{k}: {v}' for k, v in held.items() if k.startswith('joint stiff')]
         before, self.logged = self.logged, stopped + stiffness

@@ -281,12 +281,12 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     planned = []
     for step in range(1200):
         if step == 300:
-            strongest = int(np.argmax(core.activities.follower.tension))
+            strongest = int(np.argmax(core.activities.follower.plan.tension.bone))
             temperature[strongest] = 84.0
         core.muscles(np.array([length, tension, temperature]), 0.01 * step)
         core.estimated(theta, 0.01 * step)
         core.step(0.01 * step)
-        planned.append(core.activities.follower.tension)
+        planned.append(core.activities.follower.plan.tension.bone)
     limit = core.watchdog.heat.planned[strongest]
     assert limit < planned[299][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
@@ -344,12 +344,12 @@ def test_a_new_network_keeps_the_correction_of_rest_feedback():
     bench.step(50)
     bench.theta = REST + 0.05  # the arm rests beside its target, as friction may cause
     bench.step(1000)
-    correction = bench.core.activities.follower.feedback.correction.copy()
+    correction = bench.follower.feedback.correction.copy()
     assert np.abs(correction).max() > 0.02
     bench.theta = REST
     bench.core.use(ExactMae(ROBOT))
     bench.step(300)
-    np.testing.assert_allclose(bench.core.activities.follower.feedback.correction, correction)
+    np.testing.assert_allclose(bench.follower.feedback.correction, correction)
 
 
 @pytest.mark.parametrize('chosen', [{'method': 'stiffness'}, {'method': 'second'}])
@@ -358,7 +358,7 @@ def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench.target(REST)
     bench.step(200)
     if chosen['method'] == 'stiffness':  # measure the tensions that this method demands
-        bench.tension = bench.core.activities.follower.tension
+        bench.tension = bench.follower.plan.tension.bone
     still = bench.step(200)[-1].value
     bench.theta = REST + 0.05
     bench.core.estimated(bench.theta, bench.now)
@@ -369,7 +369,7 @@ def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused
     bench = Bench(method='stiffness', first_duration=0.5)
     bench.target(REST)
     before = bench.step(100)[-1].value
-    free = bench.core.activities.follower.solution.stiffness
+    free = bench.follower.plan.solution.stiffness
     stiffer = 0.25 * free.lowest + 0.75 * free.highest
     with pytest.raises(MusculoskeletalError, match='2 numbers'):
         bench.configure(joint_stiffness=(1.0, 2.0, 3.0))
@@ -378,7 +378,7 @@ def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused
     after = values(bench.step(100))
     assert np.abs(np.diff(after, axis=0)).max() <= bench.core.settings.rate_limit * DT + 1e-9
     assert np.abs(after[-1] - before).max() > 1e-4
-    planned = bench.core.activities.follower.solution.stiffness.expected[0, 0]
+    planned = bench.follower.plan.solution.stiffness.expected[0, 0]
     assert planned == pytest.approx(stiffer[0], rel=0.01)
     bench.configure(joint_stiffness=(1e3, 0.0))
     bench.step(100)

@@ -45,7 +45,7 @@ class FollowingBench:
                 return outcome, step
             self.bench.step()
             if moves and self.bench.core.is_following:
-                self.bench.theta = self.bench.core.activities.follower.desired.theta.copy()
+                self.bench.theta = self.bench.follower.progress.desired.theta.copy()
         return None, steps
 
 
@@ -53,7 +53,7 @@ def test_a_goal_that_is_reached_succeeds_at_the_end_of_its_trajectory():
     followed = FollowingBench(path=TIGHT, goal=TIGHT)
     (code, reported), steps = followed.run()
     assert (code, reported) == (SUCCESSFUL, '')
-    duration = followed.bench.core.activities.follower.trajectory.duration
+    duration = followed.bench.follower.progress.trajectory.duration
     assert 100.0 * duration - 1.5 <= steps <= 100.0 * duration + 5.0
 
 
@@ -76,7 +76,7 @@ def test_an_arm_that_does_not_arrive_fails_after_the_goal_time_tolerance():
     followed = FollowingBench(goal=TIGHT, patience=0.5)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
-    assert steps > 100.0 * (followed.bench.core.activities.follower.trajectory.duration + 0.5) - 2.0
+    assert steps > 100.0 * (followed.bench.follower.progress.trajectory.duration + 0.5) - 2.0
 
 
 def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
@@ -91,7 +91,7 @@ def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
     monkeypatch.setattr(bench, 'step', learning)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
-    assert steps < 100.0 * (bench.core.activities.follower.trajectory.duration + 3.5)
+    assert steps < 100.0 * (bench.follower.progress.trajectory.duration + 3.5)
 
 
 @pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])

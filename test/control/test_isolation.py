@@ -12,12 +12,14 @@ from robots import write_robot
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
-from musculoskeletal_ae.control.follower import FRICTION, TURNING, slowness
+from musculoskeletal_ae.control.friction import FRICTION
 from musculoskeletal_ae.control.planner import Planner
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.slowness import slowness
 from musculoskeletal_ae.control.stopping import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.control.tension_plan import TURNING
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.robot.actuation import DEPTH
@@ -171,10 +173,10 @@ def test_an_arm_without_a_muscle_that_falls_approaches_its_target_again_a_few_ti
         bench.theta = REST
         bench.step()
         bench.target(THERE)
-        ways = [bench.core.activities.follower.trajectory]
+        ways = [bench.follower.progress.trajectory]
         for _ in range(4 * (APPROACHES + 1)):
             bench.step(100)
-            if (last := bench.core.activities.follower.trajectory) is not ways[-1]:
+            if (last := bench.follower.progress.trajectory) is not ways[-1]:
                 ways.append(last)
             np.testing.assert_array_equal(last.end, THERE)
         assert len(ways) == 1 + times
@@ -252,9 +254,9 @@ def test_an_arm_without_a_muscle_that_falls_on_the_way_starts_again_before_the_e
         bench.theta = REST
         bench.step()
         bench.target(THERE)
-        first = bench.core.activities.follower.trajectory
+        first = bench.follower.progress.trajectory
         bench.step(round(first.duration / 0.01) - 10)
-        assert (bench.core.activities.follower.trajectory is not first) == starts_again
+        assert (bench.follower.progress.trajectory is not first) == starts_again
 
 
 @pytest.fixture(scope='module')

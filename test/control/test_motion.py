@@ -16,10 +16,10 @@ from nominal_body import nominal_arm
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.follower import SHARE, slowness
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.slowness import SHARE, slowness
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.control.winches import Winches
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -38,8 +38,8 @@ def moved(bench, count):
     sent = []
     for _ in range(count):
         sent += bench.step()
-        if bench.core.activities.follower.trajectory is not None:
-            bench.theta = bench.core.activities.follower.desired.theta
+        if bench.follower.progress.trajectory is not None:
+            bench.theta = bench.follower.progress.desired.theta
     return sent
 
 
@@ -57,7 +57,7 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     sent += moved(bench, 400)
     assert {command.kind for command in sent} == {LENGTH}
     assert bench.report().message == 'holding'
-    held = bench.core.activities.follower.tension
+    held = bench.follower.plan.tension.bone
     torque = ROBOT.kinematics.holding_torque(OTHER)
     np.testing.assert_allclose(-ROBOT.routes.muscle_jacobian(OTHER).T @ held, torque, atol=0.3)
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
@@ -66,41 +66,41 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
 def test_a_trajectory_too_fast_for_the_winches_is_slowed_as_a_whole_and_reported(bench):
     bench.configure(rate_limit=0.05)
     bench.core.trajectory(points(OTHER, 0.5))
-    trajectory = bench.core.activities.follower.trajectory
+    trajectory = bench.follower.progress.trajectory
     assert trajectory.slowed > 1.2
     assert slowness(ROBOT, bench.mae, trajectory, bench.core.settings) == pytest.approx(1.0)
     sent = values(moved(bench, 20))
     assert 'slowed to' in bench.report().message
     sent = np.vstack([sent, values(moved(bench, 600))])
     assert np.abs(np.diff(sent, axis=0)).max() <= 0.05 * DT + 1e-9
-    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
 
 
 def test_a_trajectory_of_zero_duration_takes_as_long_as_the_winches_need(bench):
     bench.core.trajectory(points(OTHER, 0.0))
     sent = values(moved(bench, 300))
     assert np.abs(np.diff(sent, axis=0)).max() <= 0.3 * DT + 1e-9
-    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
-    assert not bench.core.activities.follower.is_moving
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
+    assert not bench.follower.progress.is_moving
 
 
 def test_a_new_trajectory_replaces_the_old_from_its_start_time_and_an_empty_one_holds(bench):
     bench.core.trajectory(points(OTHER, 2.0))
     moved(bench, 100)
     bench.core.trajectory(points(REST, 2.0), delay=0.5)
-    first = bench.core.activities.follower.trajectory
+    first = bench.follower.progress.trajectory
     moved(bench, 45)
-    assert bench.core.activities.follower.trajectory is first
-    before = bench.core.activities.follower.desired
+    assert bench.follower.progress.trajectory is first
+    before = bench.follower.progress.desired
     moved(bench, 10)
-    after = bench.core.activities.follower.desired
-    assert bench.core.activities.follower.trajectory is not first
+    after = bench.follower.progress.desired
+    assert bench.follower.progress.trajectory is not first
     assert np.abs(after.theta - before.theta).max() < 0.2
-    np.testing.assert_allclose(bench.core.activities.follower.trajectory.end, REST)
+    np.testing.assert_allclose(bench.follower.progress.trajectory.end, REST)
     bench.core.trajectory(None)
     moved(bench, 40)
-    assert not bench.core.activities.follower.desired.velocity.any()
-    assert np.abs(bench.core.activities.follower.desired.theta - REST).max() > 0.1
+    assert not bench.follower.progress.desired.velocity.any()
+    assert np.abs(bench.follower.progress.desired.theta - REST).max() > 0.1
 
 
 def test_a_point_that_exceeds_a_joint_limit_by_the_error_of_an_estimate_is_moved_to_the_limit(
@@ -108,7 +108,7 @@ def test_a_point_that_exceeds_a_joint_limit_by_the_error_of_an_estimate_is_moved
 ):
     """A posture taught against a joint stop is estimated a little beyond it."""
     bench.core.trajectory(points(ROBOT.lower + [0.5, -0.005]))
-    end = bench.core.activities.follower.trajectory.end
+    end = bench.follower.progress.trajectory.end
     np.testing.assert_allclose(end, ROBOT.lower + [0.5, 0.0])
 
 
@@ -120,7 +120,7 @@ def test_a_refused_trajectory_changes_nothing(bench):
     bench.stop()
     with pytest.raises(MessageError, match='stopped'):
         bench.core.trajectory(points(OTHER))
-    assert bench.core.activities.follower.trajectory is None
+    assert bench.follower.progress.trajectory is None
     assert bench.step(3)[-1] is None
 
 
@@ -131,7 +131,7 @@ def test_a_stop_ends_a_trajectory_and_its_end_is_resumed_slowly(bench):
     bench.step(100)
     assert not bench.core.reset(bench.now)
     bench.step(5)
-    resumed = bench.core.activities.follower.trajectory
+    resumed = bench.follower.progress.trajectory
     np.testing.assert_array_equal(resumed.end, OTHER)
     assert resumed.duration >= bench.core.settings.first_duration
 
@@ -142,7 +142,7 @@ def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
     bench.now += 2.0
     sent += moved(bench, 200)
     assert bench.core.is_following
-    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * 0.1 + 1e-9
 
 
@@ -150,13 +150,13 @@ def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(
     bench.configure(target_duration=0.5)
     bench.target(OTHER, (2.0, 0.0))
     moved(bench, 500)
-    held = bench.core.activities.follower.tension
+    held = bench.follower.plan.tension.bone
     assert held.max() > 1.5 * ROBOT.tension.bias[0]
     bench.now += 2.0
     moved(bench, 200)
     # The arm has come to rest. Its tensions may differ by the tendon friction, whose direction is
     # unknown at rest.
-    np.testing.assert_allclose(bench.core.activities.follower.tension, held, rtol=0.25)
+    np.testing.assert_allclose(bench.follower.plan.tension.bone, held, rtol=0.25)
 
 
 @pytest.mark.parametrize('duration', [1.2, 5.0, 30.0])
@@ -164,11 +164,11 @@ def test_a_slow_target_does_not_carry_a_moving_arm_beyond_its_limits(bench, dura
     bench.configure(target_duration=duration)
     bench.core.trajectory(points(OTHER, 0.6))
     moved(bench, 15)
-    assert np.abs(bench.core.activities.follower.desired.velocity).max() > 0.3
+    assert np.abs(bench.follower.progress.desired.velocity).max() > 0.3
     bench.target(REST + 0.1)
-    bench.core.activities.follower.trajectory.check(ROBOT)
-    np.testing.assert_allclose(bench.core.activities.follower.trajectory.end, REST + 0.1)
-    assert bench.core.activities.follower.trajectory.duration < duration + 1.0
+    bench.follower.progress.trajectory.check(ROBOT)
+    np.testing.assert_allclose(bench.follower.progress.trajectory.end, REST + 0.1)
+    assert bench.follower.progress.trajectory.duration < duration + 1.0
 
 
 def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
@@ -178,10 +178,10 @@ def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
         bench.target(ROBOT.random_postures(1, rng)[0])
         moved(bench, 40)
         hand(bench, theta)
-        bench.core.activities.follower.trajectory.check(ROBOT)
+        bench.follower.progress.trajectory.check(ROBOT)
         moved(bench, 30)
         bench.core.twist(np.array([0.1, 0.0, 0.1, 0.0, 0.0, 0.0]))
-        bench.core.activities.follower.trajectory.check(ROBOT)
+        bench.follower.progress.trajectory.check(ROBOT)
 
 
 def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
@@ -197,12 +197,12 @@ def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effor
     bench.configure(target_duration=1.0)
     bench.target(OTHER)
     moved(bench, 400)
-    plain = bench.core.activities.follower.tension
+    plain = bench.follower.plan.tension.bone
     assert bench.core.is_following
     bench.target(OTHER, (1.0, 0.0))
     moved(bench, 400)
-    np.testing.assert_allclose(bench.core.activities.follower.desired.theta, OTHER)
-    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.core.activities.follower.tension)
+    np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
+    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.follower.plan.tension.bone)
     np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
     bench.target(ROBOT.upper + 1.0)
     bench.step()
@@ -237,18 +237,18 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
     core.use(ExactMae(ROBOT))
     arm.reset(REST)
     now, off = 0.0, []
-    while not off or core.activities.follower.is_moving:
+    while not off or core.activities.follower.progress.is_moving:
         theta, *read = arm.sense()
         core.muscles(np.array([*read]), now)
         core.estimated(theta, now)
-        if core.activities.follower.trajectory is None:
+        if core.activities.follower.progress.trajectory is None:
             core.trajectory(points(REST, 0.5))
         elif now > 0.6 and not off:
             core.trajectory(points(OTHER))
             arm.set_wrench(np.array([push, 0.0, 0.0, 0.0, 0.0, 0.0]))
         arm.command_length(core.step(now).value)
         if now > 0.6:
-            off.append(core.activities.follower.desired.theta - arm.theta)
+            off.append(core.activities.follower.progress.desired.theta - arm.theta)
         interval = 0.001 * rng.choice(intervals)
         arm.step(interval)
         now += interval
@@ -277,15 +277,16 @@ def test_with_method_stiffness_a_moving_arm_yields_to_a_push_and_still_follows()
 
 
 def test_a_desired_stiffness_is_kept_during_a_trajectory_and_at_its_end(bench):
-    follower, sent = bench.core.activities.follower, []
+    follower, sent = bench.follower, []
     bench.configure(method='stiffness', joint_stiffness=(1000.0, 0.0))
     bench.core.trajectory(points(OTHER))
     for steps, desired in ((50, 1000.0), (40, 1000.0), (200, 1000.0), (100, 1.0)):
         bench.configure(joint_stiffness=(desired, 0.0))
         sent += moved(bench, steps)
-        model = StiffnessModel.read(ROBOT, bench.mae, follower.desired.theta, follower.tension)
-        planned = model.joint_stiffness(follower.tension)[0, 0]
-        _, lowest, highest = follower.solution.stiffness
+        tension = follower.plan.tension.bone
+        model = StiffnessModel.read(ROBOT, bench.mae, follower.progress.desired.theta, tension)
+        planned = model.joint_stiffness(tension)[0, 0]
+        _, lowest, highest = follower.plan.solution.stiffness
         end = (highest if desired > 1.0 else lowest)[0]
         assert abs(planned - end) < 0.3 * (highest - lowest)[0]
     assert 'desired 1.00 clamped' in bench.report().values['joint stiffness shoulder']
@@ -365,14 +366,14 @@ def hand(bench, theta, whole=False):
 def test_a_hand_pose_is_reached_and_one_out_of_reach_is_refused_or_approached(bench):
     hand(bench, OTHER)
     moved(bench, 300)
-    at = ROBOT.kinematics.end_effector_pose(bench.core.activities.follower.desired.theta)
+    at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta)
     wanted = ROBOT.kinematics.end_effector_pose(OTHER)
     np.testing.assert_allclose(at.translation, wanted.translation, atol=5e-3)
     far = pin.SE3(wanted.rotation, 3.0 * wanted.translation)
-    before = bench.core.activities.follower.trajectory
+    before = bench.follower.progress.trajectory
     with pytest.raises(MessageError, match='out of reach'):
         bench.core.pose(far, False, bench.now)
-    assert bench.core.activities.follower.trajectory is before
+    assert bench.follower.progress.trajectory is before
     bench.configure(unreachable='nearest')
     bench.core.pose(far, False, bench.now)
     bench.step()
@@ -404,16 +405,12 @@ def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
         hand(bench, start + 0.01 * n * speed)
         moved(bench, 1)
     wanted = ROBOT.kinematics.end_effector_pose(start + 0.6 * speed).translation
-    at = ROBOT.kinematics.end_effector_pose(
-        bench.core.activities.follower.desired.theta
-    ).translation
+    at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation
     assert np.linalg.norm(at - wanted) < 0.006
     moved(bench, 150)  # no other twist arrives, so the last one times out
-    assert not bench.core.activities.follower.is_moving
+    assert not bench.follower.progress.is_moving
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
-    at = ROBOT.kinematics.end_effector_pose(
-        bench.core.activities.follower.desired.theta
-    ).translation
+    at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation
     assert np.linalg.norm(at - last) < 1e-3
 
 
@@ -425,7 +422,7 @@ def test_a_repeated_hand_pose_is_approached_at_hand_speed(bench, every):
         if n % every == 0:
             hand(bench, OTHER)
         moved(bench, 1)
-        before, where = where, place(bench.core.activities.follower.desired.theta).translation
+        before, where = where, place(bench.follower.progress.desired.theta).translation
         if before is not None:
             fastest = max(fastest, float(np.linalg.norm(where - before)) / DT)
     assert fastest < 0.15
@@ -437,7 +434,7 @@ def test_the_duration_to_the_nearest_posture_does_not_grow_with_an_unreachable_d
     at, taken = ROBOT.kinematics.end_effector_pose(REST), []
     for far in (3.0, 1e3, 1e9):
         bench.core.pose(pin.SE3(at.rotation, at.translation + [far, 0.0, 0.0]), False, bench.now)
-        taken.append(bench.core.activities.follower.latest.duration)
+        taken.append(bench.follower.progress.latest.duration)
     assert max(taken) < 5.0
     bench.step(3)
     assert bench.cause == ''
@@ -462,14 +459,14 @@ def test_a_twist_moves_the_hand_until_it_times_out(bench):
     for _ in range(20):
         bench.core.twist(twist)
         moved(bench, 5)
-    rate = ROBOT.kinematics.end_effector_jacobian(bench.core.activities.follower.desired.theta)[:3]
+    rate = ROBOT.kinematics.end_effector_jacobian(bench.follower.progress.desired.theta)[:3]
     np.testing.assert_allclose(
-        rate @ bench.core.activities.follower.desired.velocity, twist[:3], atol=0.02
+        rate @ bench.follower.progress.desired.velocity, twist[:3], atol=0.02
     )
     moved(bench, 80)
-    assert not bench.core.activities.follower.is_moving
+    assert not bench.follower.progress.is_moving
     gone = (
-        ROBOT.kinematics.end_effector_pose(bench.core.activities.follower.desired.theta).translation
+        ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation
         - begun
     )
     assert gone @ twist[:3] / 0.1 > 0.08
@@ -479,9 +476,9 @@ def test_a_twist_moves_the_hand_until_it_times_out(bench):
 def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apart):
     goals = np.stack([np.array(REST), np.array(OTHER)])
     bench.core.trajectory(Points(np.arange(2), np.array([1.0, 1.0 + apart]), goals, None, None))
-    follower = bench.core.activities.follower
+    follower = bench.follower
     text = status.slowed(follower)
-    assert f'takes {follower.latest.duration:.3g} s' in text, text
+    assert f'takes {follower.progress.latest.duration:.3g} s' in text, text
 
 
 def test_a_point_just_beyond_the_tolerance_of_a_limit_is_refused_in_numbers_that_differ(bench):

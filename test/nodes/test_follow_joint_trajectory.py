@@ -85,10 +85,10 @@ def test_goals_are_followed_replaced_cancelled_aborted_and_refused(arm):
     assert status == GoalStatus.STATUS_ABORTED
     assert result.error_code == kind.Result.PATH_TOLERANCE_VIOLATED
     arm.says('holding')
-    before = arm.controller.core.activities.follower.trajectory
+    before = arm.controller.core.activities.follower.progress.trajectory
     assert not send(trajectory(arm, arm.robot.upper + 0.5)).is_accepted
     assert not send(JointTrajectory()).is_accepted
-    assert arm.controller.core.activities.follower.trajectory is before
+    assert arm.controller.core.activities.follower.progress.trajectory is before
     rejected = arm.controller.rejected
     assert rejected['follow_joint_trajectory: beyond the joint limits'] == 1
     assert rejected['follow_joint_trajectory: empty'] == 1

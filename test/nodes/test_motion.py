@@ -53,7 +53,7 @@ def test_a_trajectory_is_followed_and_its_state_published_and_a_wrong_one_moves_
     arm.says('following a trajectory')
     publisher.publish(JointTrajectory())
     arm.says('holding')
-    stopped = arm.controller.core.activities.follower.desired.theta
+    stopped = arm.controller.core.activities.follower.progress.desired.theta
     assert stopped[0] == pytest.approx(THERE[0])
     assert stopped[1] - HERE[1] > 0.2
 
@@ -84,9 +84,8 @@ def test_a_hand_pose_is_reached_and_one_in_another_frame_refused(arm):
     twists = graph.publisher(TwistStamped, 'target_twist')
     twist = TwistStamped()
     twist.header.frame_id, twist.twist.linear.x = robot.root_link, 0.05
-    before = arm.controller.core.activities.follower.trajectory
+    progress = arm.controller.core.activities.follower.progress
+    before = progress.trajectory
     twists.publish(twist)
-    graph.wait(
-        lambda: arm.controller.core.activities.follower.trajectory is not before, 'the motion'
-    )
+    graph.wait(lambda: progress.trajectory is not before, 'the motion')
     arm.says('holding')  # the twist has timed out

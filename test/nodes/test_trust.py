@@ -200,14 +200,14 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         if node.core.target_state.theta is None and now > 101.0:
             targets.publish(JointState(name=arm26.joints, position=[-0.2, -0.8]))
             begun = now
-        if follower.trajectory is not None and not follower.is_moving:
+        if follower.progress.trajectory is not None and not follower.progress.is_moving:
             done_at = now
         graph.spin(0.01)
         assert time.monotonic() - started < DEADLINE
     assert node.core.supervisor.is_running
     # If the trajectory followed the steady clock, it would end after 0.6 s of simulated time.
-    assert follower.trajectory.duration >= 2.0
-    assert done_at - begun >= 0.9 * follower.trajectory.duration
+    assert follower.progress.trajectory.duration >= 2.0
+    assert done_at - begun >= 0.9 * follower.progress.trajectory.duration
     assert len(sent) > 0
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects lengths that jumped to new values and kept them, as when modules lose their offsets.
 
-`signals/muscle_stream.py` rejects messages with a jump. If the new lengths persist, it accepts them
+`signals/length_jumps.py` rejects messages with a jump. If the new lengths persist, it accepts them
 and names the muscles in the sample.
 """
 

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans the tensions along a trajectory, and the lengths that muscle stiffness control needs.
+
+`follower` contains the equations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.control.feedback import depends_on_limit
+from musculoskeletal_ae.control.friction import FRICTION, tendon_friction
+from musculoskeletal_ae.control.methods import Solution, stiffness_command
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.slowness import SHARE
+from musculoskeletal_ae.control.trajectory import Trajectory
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.signals.friction import slid
+
+TURNING = 0.005  # speed of a tendon above which its sliding direction is certain [m/s]
+AHEAD = 0.2  # T_K is computed for this time ahead, and at this interval [s]
+
+
+class Stiffening:
+    """Computes the tensions T_K that method `stiffness` approaches, AHEAD seconds in advance."""
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self.use(robot, settings)
+        self.reset()
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings."""
+        self._robot, self._settings = robot, settings
+
+    def reset(self) -> None:
+        """Discard the present solution."""
+        self.solution: Solution | None = None  # the solution that T_K approaches
+        self._near: Array = self._robot.tension.bias  # T_K [N], (M,)
+        self._solved = 0.0  # age of the solution [s]
+
+    def step(
+        self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
+    ) -> Array:
+        """Return T_K [N], (M,).
+
+        Its change per step is limited: the lengths of trajectories may use the fraction SHARE of
+        the rate limit, so only the rest is left for T_K.
+        """
+        robot, settings, solution = self._robot, self._settings, self.solution
+        self._solved += dt
+        if solution is None or self._solved >= AHEAD:
+            at, self._solved = trajectory.sample(time + AHEAD), 0.0
+            torque = robot.kinematics.inverse_dynamics(*at) + effort
+            desired = np.array(settings.desired_stiffness(robot.kinematics.radian))
+            near = None if solution is None else self._near
+            solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
+            self._near = solution.tension if near is None else near
+            self.solution = solution
+        # Use half of that rest, because the series elastic elements stretch as well.
+        actuation = robot.actuation
+        rates = actuation.fastest(settings.rate_limit) * actuation.tension_per_length(self._near)
+        largest = 0.5 * (1.0 - SHARE) * rates * dt
+        self._near = self._near + np.clip(solution.tension - self._near, -largest, largest)
+        return self._near
+
+
+class PlannedTension(NamedTuple):
+    """The tensions of one setpoint.
+
+    Attributes:
+        bone: Bone-side tension T [N], (M,).
+        motor: Motor-side tension T e^{μ s} [N], (M,).
+        missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
+    """
+
+    bone: Array
+    motor: Array
+    missing_torque: Array
+
+    @classmethod
+    def at_bias(cls, robot: Robot) -> PlannedTension:
+        """Return T_bias, before the first setpoint."""
+        bias = robot.tension.bias.copy()
+        return cls(bias, bias, np.zeros(robot.joint_count))
+
+
+class TensionPlan:
+    """Computes tensions and lengths for the setpoints of a trajectory, in their order.
+
+    Attributes:
+        effort: Torque in addition to inverse dynamics [N·m], (D,).
+        tension: The tensions of the last setpoint.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self._robot, self._settings = robot, settings
+        self.effort: Array = np.zeros(robot.joint_count)
+        self.tension = PlannedTension.at_bias(robot)
+        self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
+        self._friction: Array = np.full(robot.muscle_count, FRICTION)  # μ, (M,)
+        #: sliding direction s of each tendon, (M,)
+        self._sliding: Array = np.zeros(robot.muscle_count)
+        self._stiffening = Stiffening(robot, settings)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings."""
+        self._robot, self._settings = robot, settings
+        self._stiffening.use(robot, settings)
+
+    def use_network(self, mae: Mae) -> None:
+        """Use the tendon friction that a network has learned."""
+        self._friction = tendon_friction(self._robot, mae)
+
+    def reset(self) -> None:
+        """Start from T_bias, with unknown sliding directions."""
+        self.tension = PlannedTension.at_bias(self._robot)
+        self._sliding = np.zeros(self._robot.muscle_count)
+        self._stiffening.reset()
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether the method is `stiffness`, which uses no feedback."""
+        return self._settings.method == 'stiffness'
+
+    @property
+    def solution(self) -> Solution | None:
+        """The last solution of method `stiffness`."""
+        return self._stiffening.solution
+
+    def adopt_limit(self, limit: Array) -> bool:
+        """Return whether a tension limit [N] (M,) requires a new plan, and use it if so."""
+        is_other = depends_on_limit(self.tension.motor, self._limit, limit)
+        if is_other:
+            self._limit = limit
+        return is_other
+
+    def step(
+        self, trajectory: Trajectory, time: float, shift: Array, lag: float, inputs: Inputs
+    ) -> Array:
+        """Plan the next setpoint of a trajectory, and return its l_target [m], (M,).
+
+        Args:
+            trajectory: The trajectory.
+            time: Time since its start [s].
+            shift: Shift of θ by the feedback [rad], (D,).
+            lag: λ of the muscle modules [s].
+            inputs: The present inputs.
+        """
+        robot, mae, dt = self._robot, inputs.mae, inputs.dt
+        at = trajectory.sample(time + 0.5 * dt)
+        jacobian = mae.muscle_jacobian(at.theta, self.tension.bone)
+        speed = jacobian @ at.velocity
+        self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
+        torque = robot.kinematics.inverse_dynamics(*at) + self.effort
+        actuation, low = robot.actuation, robot.tension.bias
+        low = low + actuation.tension_of_lag(lag, np.maximum(speed, 0.0))
+        loss = np.exp(self._friction * self._sliding)
+        near: Array | float = 0.0
+        if self.is_stiff:
+            limit = inputs.limit
+            near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
+        if actuation.knows_tension:
+            tension, missing_torque = least_tension(
+                jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
+            )
+            self.tension = PlannedTension(tension, tension * loss, missing_torque)
+        else:
+            assumed = actuation.assumed_tension
+            self.tension = PlannedTension(assumed, assumed, self.tension.missing_torque)
+        return self.length(mae, at.theta + shift) + lag * speed
+
+    def length(self, mae: Mae, theta: Array) -> Array:
+        """Return l_target [m] (M,) for θ [rad] (D,) at rest, with the planned tensions."""
+        length = mae.lengths(theta, self.tension.bone)
+        return length + msc_compensation(self._robot, self.tension.motor)
