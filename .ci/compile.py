@@ -5,7 +5,7 @@ A node that compiles at run time cannot keep its rate, and cannot be stopped mea
 """
 
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 

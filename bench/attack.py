@@ -32,7 +32,7 @@ from bench import attack_files, kills
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, names, numbers, whole
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -147,7 +147,7 @@ class Reader:
         from musculoskeletal_ae.learning.samples import Sample, SampleStore
         from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
-        from musculoskeletal_ae.mae.training import initial_mae
+        from musculoskeletal_ae.mae.initial_training import initial_mae
         from musculoskeletal_ae.robot.robot import Robot
 
         self.folder, self.robot = folder, Robot.load('arm26')

@@ -30,8 +30,9 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.sensors import ellipsoid_share
 from musculoskeletal_ae.learning.collector import NONE, SENSOR
+from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.trainer import Job, Trainer
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, names

@@ -190,7 +190,7 @@ def main(argv: list[str]) -> int:
     with tempfile.TemporaryDirectory() as folder:
         initial = args.initial
         if initial is None:
-            from musculoskeletal_ae.mae.training import initial_mae
+            from musculoskeletal_ae.mae.initial_training import initial_mae
 
             initial = Path(folder) / 'initial.safetensors'
             checkpoint.save(initial_mae(robot).mae, initial)

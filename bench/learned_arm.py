@@ -17,8 +17,8 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 #: time between two updates [s], and training steps of each. The learned network is as accurate as

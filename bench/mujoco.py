@@ -42,7 +42,7 @@ import numpy as np
 
 from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import holdable_postures
+from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -54,7 +54,7 @@ from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser, number, seeds
-from musculoskeletal_ae.presets.registry import PAPER_PRESET
+from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 ALL_NODES = 'with learner'  # the kind of `bench wire` that runs all nodes

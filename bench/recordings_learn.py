@@ -16,10 +16,10 @@ from scipy.optimize import least_squares
 from bench.recordings_read import Run, SoftLink
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.trainer import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load

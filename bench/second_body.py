@@ -49,8 +49,8 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.experiments.roles import shoulder
 from musculoskeletal_ae.experiments.simulation import simulate
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.robot.robot import Robot
 

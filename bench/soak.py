@@ -33,12 +33,13 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
     record,
 )
+from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
-from musculoskeletal_ae.learning.trainer import Job, Trainer
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 

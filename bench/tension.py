@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
+from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import KIN, make_arm
@@ -40,8 +40,8 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -35,7 +35,7 @@ import numpy as np
 from bench.processes import cpu, end_processes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, names, number, numbers, whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.stop_signals import STOP, Reaction

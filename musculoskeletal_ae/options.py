@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.presets.registry import PRESETS
+from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.stop_signals import INTERRUPTED
 
@@ -123,7 +123,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_preset(self, text: str = 'network, learning and solver') -> None:
         """Add `--preset`."""
-        self.add_argument('--preset', choices=tuple(PRESETS), default='default', help=text)
+        self.add_argument('--preset', choices=PRESET_NAMES, default=DEFAULT, help=text)
 
     def add_seed(self, text: str) -> None:
         """Add `--seed`; the text completes "random seed …" in the help."""

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
-from musculoskeletal_ae.presets.registry import DEFAULT, PRESETS
+from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 
 #: torch devices on which networks can be trained
 DEVICES = 'cpu', 'cuda'
@@ -108,7 +108,7 @@ CHECKPOINT = Parameter(
 PRESET = Parameter(
     DEFAULT,
     'default: the most accurate methods; paper: exactly the methods of the paper',
-    legal=tuple(PRESETS),
+    legal=PRESET_NAMES,
 )
 SEED = Parameter(
     0, 'random seed of the emulated individual, exploration and learning', '', (0, UNBOUNDED)

@@ -73,7 +73,7 @@ def trained_files(alone) -> dict[str, Path]:
     """Return the files of briefly trained networks of arm26 by preset, trained once per run."""
     # These imports load torch, which only tests with a network need.
     from musculoskeletal_ae.mae import checkpoint
-    from musculoskeletal_ae.mae.training import initial_mae
+    from musculoskeletal_ae.mae.initial_training import initial_mae
     from musculoskeletal_ae.presets.registry import PRESETS
     from musculoskeletal_ae.robot.robot import Robot
 

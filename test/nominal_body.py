@@ -11,7 +11,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods
-from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
+from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.control.methods import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual

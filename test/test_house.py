@@ -4,6 +4,7 @@
 import ast
 import re
 import subprocess
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -28,11 +29,34 @@ def imported(file: Path) -> set[str]:
     return names
 
 
+def runtime_imports(file: Path) -> set[str]:
+    """Return all modules that a file may import when it runs; names within them, too."""
+    names = set()
+    open_nodes = [ast.parse(file.read_text(encoding='utf-8'))]
+    while open_nodes:
+        node = open_nodes.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING':
+            continue
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f'{node.module}.{alias.name}' for alias in node.names}
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        open_nodes += ast.iter_child_nodes(node)
+    return names
+
+
 def test_only_nodes_imports_ros() -> None:
     outside = [file for file in sources(PACKAGE) if PACKAGE / 'nodes' not in file.parents]
     assert len(outside) > 40
     speaking = {str(file): sorted(filter(ROS.match, imported(file))) for file in outside}
     assert not {file: names for file, names in speaking.items() if names}
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    # Also imports within functions count, but not those for annotations alone.
+    modules = {'.'.join(f.relative_to(ROOT).with_suffix('').parts): f for f in sources(PACKAGE)}
+    graph = {name: runtime_imports(file) & set(modules) for name, file in modules.items()}
+    tuple(TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
 
 
 def test_only_the_presets_import_the_paper() -> None:

@@ -34,10 +34,10 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.methods import check_method
+from musculoskeletal_ae.control.method_choice import by_follower, check_method
 from musculoskeletal_ae.control.planner import Plan, Planner
-from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget, length_methods
-from musculoskeletal_ae.control.settings import BY_TENSION, Settings
+from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stopping import SafeStop
 from musculoskeletal_ae.control.stops import Action, Condition, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
@@ -164,14 +164,6 @@ class Suspicion:
             return None
         muscle, at = self._isolated
         return muscle if muscle in isolated and at > self._anomaly_at - REACTION_TIME else None
-
-
-def by_follower(settings: Settings) -> bool:
-    """Return whether the method reaches targets with the follower, rather than in another way.
-
-    The other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
-    """
-    return settings.method not in (*BY_TENSION, *length_methods(settings))
 
 
 class Controller:

@@ -23,10 +23,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
-from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
@@ -52,29 +50,6 @@ LEVELS = 8  # number of tensions between T_bias and limit at which the elongatio
 # Step of the finite difference of G [rad]: small relative to changes along a route, large relative
 # to errors of the MAE.
 STEP = 0.05
-
-
-def check_method(robot: Robot, settings: Settings) -> None:
-    """Check that the robot's muscle modules measure the tensions that the method needs.
-
-    Raises:
-        MusculoskeletalError: If they do not; the text names the reason and the legal methods.
-    """
-    if robot.tension_source.is_current and settings.method in BY_TENSION:
-        legal = tuple(method for method in METHODS if method not in BY_TENSION)
-        raise MusculoskeletalError(
-            f'method {settings.method!r} requires measured tensions, but tension_source in '
-            'muscles.yaml is current: the friction of a resting drive hides the force of a hand; '
-            f'legal: {", ".join(legal)}'
-        )
-    if robot.tension_source.is_known:
-        return
-    legal = preset_named(settings.preset).methods_without_tension
-    if settings.method not in legal:
-        raise MusculoskeletalError(
-            f'method {settings.method!r} requires tensions, but tension_source in muscles.yaml is '
-            f'none; legal with preset {settings.preset!r}: {", ".join(legal)}'
-        )
 
 
 class JointStiffness(NamedTuple):

@@ -14,7 +14,6 @@ start of a method: with repeated measurements, `second` would raise the tension 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +22,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.feedback import depends_on_limit
-from musculoskeletal_ae.control.methods import LengthMethod, Solution
+from musculoskeletal_ae.control.method_choice import length_methods
+from musculoskeletal_ae.control.methods import Solution
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 # Fraction of a movement's duration in which the command changes. In the remaining time, the arm
@@ -170,11 +169,6 @@ class LengthRamps:
             tension = np.minimum(tension, self._limit)
         torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
         return method.command(robot, mae, goal.theta, torque, tension)
-
-
-def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
-    """Return the length methods of the preset in the settings."""
-    return preset_named(settings.preset).length_methods()
 
 
 class RampedTarget(ActivityControl):

@@ -34,7 +34,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import TRIES, holdable_postures
+from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.control.hand import POSITION
 from musculoskeletal_ae.control.ramps import RAMP_SHARE
 from musculoskeletal_ae.control.reach import lacking

@@ -52,11 +52,13 @@ from musculoskeletal_ae.learning.collector import SENSOR
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
-from musculoskeletal_ae.mae.training import OUTPUTS, initial_mae, pair_errors
+from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.presets.registry import PAPER_PRESET, PRESETS, preset_named
+from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update

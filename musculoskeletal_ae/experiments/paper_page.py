@@ -21,7 +21,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import PAPER
 from musculoskeletal_ae.experiments.results import NOTHING, Results, Row, flat, individuals, read
 from musculoskeletal_ae.files import read_table, write_whole
-from musculoskeletal_ae.presets.registry import PAPER_PRESET
+from musculoskeletal_ae.presets.names import PAPER_PRESET
 
 TEMPLATE = 'paper.md.jinja'  # a file in the folder of this module
 #: rows of the tables, by the name of the table in the template

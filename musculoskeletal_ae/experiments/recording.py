@@ -12,7 +12,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.exploration import Exploration, Step
+from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.exploration_steps import Step
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.control.ramps import RAMP_SHARE
 from musculoskeletal_ae.control.settings import Settings
@@ -20,7 +21,7 @@ from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import PAPER_PRESET
+from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions
 
 #: length that makes a switched-off muscle slack in any posture when added to its command [m]

@@ -30,7 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import Command
-from musculoskeletal_ae.control.exploration import TRIES
+from musculoskeletal_ae.control.exploration_steps import TRIES
 from musculoskeletal_ae.control.progress import FALLEN
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings

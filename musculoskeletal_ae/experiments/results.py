@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run of `experiment`, and its output folder: result.json, plots, report and results table.
+"""Output folder of `experiment`: result.json, plots, report and results table.
 
     python -m musculoskeletal_ae.experiments.results doc/results.md
 
@@ -11,11 +11,7 @@ import base64
 import json
 import shutil
 import sys
-import tempfile
-import time
-from argparse import Namespace
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,15 +19,13 @@ import msgspec
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, UndefinedError
 from msgspec import MsgspecError, Struct
-from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.plots import DPI
-from musculoskeletal_ae.experiments.runner import EXPERIMENTS, run
+from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, round_numbers
 from musculoskeletal_ae.files import read_table, write_whole
-from musculoskeletal_ae.presets.registry import PAPER_PRESET
-from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.schema import Strict, convert
 
 #: result.json of every experiment that was run, by its name
@@ -44,69 +38,8 @@ ISOLATIONS = ('wrong_isolations', 'acquittals')
 TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
 BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers around the results table
 KEPT = Path('doc/results')
-BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 TEMPLATE = 'report.html.jinja'  # a file in the folder of this module
 NOTHING = '–'
-
-
-def measure(args: Namespace) -> None:
-    """Run the experiments as the options specify; write results, plots and report."""
-    start = time.perf_counter()
-    names, robot = args.names, Robot.load(args.robot)
-    if args.readme:  # check the file before hours of work
-        _around_table(args.readme)
-    args.out.mkdir(parents=True, exist_ok=True)
-    with _work_folder(args) as folder:
-        study = Study(
-            robot, args.preset, args.seeds, args.minutes, args.quick, folder, args.reality
-        )
-        with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
-
-            def report(share: float, running: str) -> None:
-                bar.n = share
-                bar.set_description_str(running)
-
-            parts = run(study, names, args.jobs, report)
-        files = [*write(study, parts, args.out), write_report(args.out)]
-    if args.readme:
-        files += update_readme(args.readme, args.out)
-    if args.page:
-        from musculoskeletal_ae.experiments.paper_page import update_page  # imports this module
-
-        files += update_page(args.page, args.out)
-    print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
-    measured = read(args.out)
-    if failed := failures({name: measured[name] for name in names}):
-        problem = f'some experiments failed: {"; ".join(failed)}'
-        raise MusculoskeletalError(f'{problem}; the results of all others are written')
-
-
-@contextmanager
-def _work_folder(args: Namespace) -> Iterator[Path]:
-    """Yield the folder of networks and recordings: that of `--keep`, or a temporary one.
-
-    Raises:
-        MusculoskeletalError: If the kept folder belongs to a run with other options.
-    """
-    if args.keep is None:
-        with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
-            yield Path(folder)
-        return
-    args.keep.mkdir(parents=True, exist_ok=True)
-    options = {
-        key: str(getattr(args, key)) for key in ('robot', 'preset', 'minutes', 'quick', 'reality')
-    }
-    file = args.keep / 'options.json'
-    if file.is_file():
-        before = json.loads(file.read_text(encoding='utf-8'))
-        if before != options:
-            changed = ', '.join(f'{key} {before.get(key)}' for key in options)
-            problem = f'--keep {args.keep} holds parts of a run with other options ({changed})'
-            raise MusculoskeletalError(f'{problem}; repeat them, or name an empty folder')
-    elif any(args.keep.iterdir()):
-        raise MusculoskeletalError(f'--keep {args.keep}: expected an empty or new folder')
-    file.write_text(json.dumps(options), encoding='utf-8')
-    yield args.keep
 
 
 def write(
@@ -333,7 +266,7 @@ def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
         OSError: If the page cannot be read or written.
         MusculoskeletalError: If the page does not have the two markers.
     """
-    (head, rest), files = _around_table(readme), list[Path]()
+    (head, rest), files = text_around_table(readme), list[Path]()
     kept = readme.parent / (KEPT.name if readme.parent.resolve().name == 'doc' else KEPT)
     if measured is not None and measured.resolve() != kept.resolve():
         for name in read(measured):
@@ -345,7 +278,12 @@ def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
     return [*files, readme]
 
 
-def _around_table(readme: Path) -> tuple[str, str]:
+def text_around_table(readme: Path) -> tuple[str, str]:
+    """Return the text of a page before and after the results table.
+
+    Raises:
+        MusculoskeletalError: If the page does not have the two markers.
+    """
     text = readme.read_text(encoding='utf-8')
     head, _, rest = text.partition(BEGIN)
     rest = rest.partition(END)[2]

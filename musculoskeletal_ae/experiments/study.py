@@ -27,7 +27,7 @@ from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.files import write_whole
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import PAPER_PRESET
+from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 DIGITS = 6  # significant digits of results; further digits are noise

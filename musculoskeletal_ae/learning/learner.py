@@ -27,6 +27,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
+from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_check import OffsetCheck
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
@@ -34,7 +35,7 @@ from musculoskeletal_ae.learning.report import learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, UpdateScheduler
 from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
-from musculoskeletal_ae.learning.trainer import Trainer, Update
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot

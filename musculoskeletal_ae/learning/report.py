@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
-from musculoskeletal_ae.learning.trainer import Update
+from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, Report
 from musculoskeletal_ae.robot.robot import Robot
 

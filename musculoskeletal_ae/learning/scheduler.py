@@ -8,8 +8,8 @@ An update begins when there are new data and enough samples, and the last update
 import math
 
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
+from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.trainer import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 
 #: shortest time between the starts of two updates, and between two checkpoints [s]

@@ -23,14 +23,10 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
@@ -39,33 +35,6 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
     from musculoskeletal_ae.learning.updater import Updater
-
-
-class Job(NamedTuple):
-    """Inputs of an update."""
-
-    observed: Observations  # the samples, oldest first
-    healthy: Healthy  # messages of the healthy arm
-    statistics_hold: bool  # whether the statistics so far are valid for the present arm
-    steps: int  # number of training steps
-    isolated: tuple[int, ...] = ()  # muscles that the messages do not describe
-
-
-class Update(NamedTuple):
-    """Result of an update."""
-
-    mae: Mae  # the trained network
-    loss: float  # training loss
-    #: σ of the part of each length that the body does not explain [m], (M,)
-    noise: Array = np.empty(0)
-    #: index of a muscle whose newest samples contradict all older ones, and the number of these
-    #: newest samples; at most one entry
-    changed: tuple[tuple[int, int], ...] = ()
-    #: several muscles that the newest samples contradict at once, which indicates a wrong θ
-    contradicted: tuple[int, ...] = ()
-    error: float = 0.0  # mean ‖θ_est − θ‖₂ over the newest samples before they were learned [rad]
-    seconds: float = 0.0  # duration of the update [s]
-    device: str = 'cpu'  # device of the training
 
 
 class Trainer:

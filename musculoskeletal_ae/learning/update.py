@@ -30,10 +30,10 @@ from musculoskeletal_ae.learning.body_fit import (
 )
 from musculoskeletal_ae.learning.covariance import MANY_MESSAGES, observed_theta
 from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.synthetic import TrainingData, synthetic_samples
-from musculoskeletal_ae.learning.trainer import Job, Update
 from musculoskeletal_ae.learning.updater import LEARNED, Updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae

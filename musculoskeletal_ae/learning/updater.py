@@ -23,7 +23,7 @@ from musculoskeletal_ae.learning.covariance import (
     observed_theta,
 )
 from musculoskeletal_ae.learning.fit import Fit
-from musculoskeletal_ae.learning.trainer import Job, Update
+from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.residuals import TouchStatistics

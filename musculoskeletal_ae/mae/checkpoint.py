@@ -24,7 +24,7 @@ from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
-from musculoskeletal_ae.presets.registry import PRESETS
+from musculoskeletal_ae.presets.names import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
@@ -87,7 +87,8 @@ class Metadata(Strict, frozen=True):
         for key, names in (('joints', self.joints), ('muscles', self.muscles)):
             if len(set(names)) < len(names) or not all(n and n.isprintable() for n in names):
                 raise ValueError(f'{key} {names}; legal: different printable names')
-        for key, word, legal in (('units', self.units, [UNITS]), ('preset', self.preset, PRESETS)):
+        words = ('units', self.units, [UNITS]), ('preset', self.preset, PRESET_NAMES)
+        for key, word, legal in words:
             if word not in legal:
                 raise ValueError(f'{key} {word!r}; legal: {", ".join(legal)}')
         for names, places in zip((self.joints, self.muscles), zip(*self.groups), strict=True):

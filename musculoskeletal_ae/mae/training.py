@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial training of the Musculoskeletal AutoEncoder on the geometric model of a robot.
+"""Common parts of the training of all presets, on the geometric model of a robot.
 
-Each preset has its own training; `default_training.py` contains the training of preset `default`.
-This module contains the parts that all presets share: random states of the geometric model,
-mini-batches, the choice of the torch device, the resulting checkpoint, and the errors on held-out
-states.
+They are random states of the geometric model, mini-batches, the choice of the torch device, and the
+errors on held-out states. `default_training.py` contains the training of preset `default`, and
+`initial_training.py` applies the training of the chosen preset.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +16,11 @@ import torch
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.network import Network, to_mae
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.units import Mask, State
-from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 TINY = 1e-12  # keeps the gradient of a norm finite at zero
-HELD_OUT_STATES = 5000  # held-out states of the geometric model for the first anomaly statistics
 
 #: called with (step, loss, network, mini-batch) after every mini-batch
 Progress = Callable[[int, float, Network, Array], None]
@@ -109,60 +104,6 @@ class TrainedNetwork(NamedTuple):
     network: Network
     losses: list[float]  # loss of every mini-batch
     by: str  # size of the mini-batches and name of the optimiser, for people
-
-
-class Trained(NamedTuple):
-    """Result of `initial_mae`."""
-
-    mae: Mae  # ready for a checkpoint
-    losses: list[float]  # loss of every mini-batch
-
-
-def initial_mae(
-    robot: Robot,
-    preset: str = 'default',
-    seed: int = 0,
-    progress: Progress | None = None,
-    steps: int | None = None,
-) -> Trained:
-    """Train a network on the geometric model, and add anomaly statistics of the model.
-
-    Args:
-        robot: The geometric model.
-        preset: Name of the preset.
-        seed: Random seed; on the same machine, the same seed gives the same network.
-        progress: Called after every mini-batch.
-        steps: Number of mini-batches; None for the preset's number.
-    """
-    chosen = preset_named(preset)
-    steps = chosen.initial_steps(robot.groups) if steps is None else steps
-    trained = chosen.train_initial(robot, seed, steps, progress)
-    return completed(robot, trained, preset, seed)
-
-
-def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
-    """Return a trained network as a `Mae` with its history and anomaly statistics.
-
-    The statistics are those of held-out states of the geometric model.
-
-    Args:
-        robot: The geometric model.
-        trained: The network of the initial training.
-        preset: Name of the preset that trained it.
-        seed: Random seed of the training.
-    """
-    network, losses, by = trained
-    history = (
-        f'initial training on the geometric model of {robot.description.directory.name}: '
-        f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {by}'
-    )
-    mae = to_mae(network, robot.joints, robot.muscles, preset, history)
-    rng = np.random.default_rng([seed, 1])
-    _, tension, length = random_states(robot, HELD_OUT_STATES, rng, robot.tension.limit)
-    error = residuals(mae.estimate(tension, length), tension, length)
-    statistics = AnomalyStatistics.of(error, calibrated=False)
-    statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})
-    return Trained(replace(mae, anomaly=statistics), losses)
 
 
 # -- errors ------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.methods import check_method
+from musculoskeletal_ae.control.method_choice import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.control.stops import StopCause

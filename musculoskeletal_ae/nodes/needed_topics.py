@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+
+from rclpy.node import Node
 
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.report import Report
-
-if TYPE_CHECKING:
-    from musculoskeletal_ae.nodes.shell import Shell
 
 #: topics that are published continually, so that silence is an error, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
@@ -25,9 +23,15 @@ SLOW_REPORTS = 3  # number of successive reports with too low a rate before the 
 class NeededTopics:
     """Reports missing, silent and slow topics of one node."""
 
-    def __init__(self, node: Shell, reception: Reception) -> None:
-        """Start without needed topics."""
-        self._node, self._reception = node, reception
+    def __init__(self, node: Node, full_name: Callable[[str], str], reception: Reception) -> None:
+        """Start without needed topics.
+
+        Args:
+            node: The node.
+            full_name: Returns the full name of a topic in the graph.
+            reception: The messages that the node has received.
+        """
+        self._node, self._full_name, self._reception = node, full_name, reception
         self._topics: list[str] = []
         self._expected_rates = dict[str, float]()  # [Hz], by topic
         self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
@@ -91,7 +95,7 @@ class NeededTopics:
         for topic in self._topics:
             if self._reception.was_used(topic):
                 continue
-            name = self._node.full_name(topic)
+            name = self._full_name(topic)
             has_publisher = self._node.count_publishers(name) > 0
             reasons.append(
                 f'{name}, on which no usable message has arrived'
@@ -111,5 +115,5 @@ class NeededTopics:
         """
         if topic not in STREAMS or self._reception.silence(topic) <= SILENCE:
             return False
-        is_published = self._node.count_publishers(self._node.full_name(topic)) > 0
+        is_published = self._node.count_publishers(self._full_name(topic)) > 0
         return self._reception.was_used(topic) or is_published

@@ -148,7 +148,7 @@ class Shell(Node):
         self.create_timer(PERIOD, self._report, clock=STEADY)
         self._fault = ''
         self.checkpoint_version: int | None = None  # version of the network in use
-        self.needed = NeededTopics(self, self._reception)
+        self.needed = NeededTopics(self, self.full_name, self._reception)
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
         )

@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import TRIES, Step, holdable_postures
+from musculoskeletal_ae.control.exploration_steps import TRIES, Step, holdable_postures
 from musculoskeletal_ae.paper.constants import DURATIONS
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
+from musculoskeletal_ae.presets.names import DEFAULT
+
 if TYPE_CHECKING:
     import numpy as np
 
-    from musculoskeletal_ae.control.exploration import Step
+    from musculoskeletal_ae.control.exploration_steps import Step
     from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
@@ -21,13 +23,13 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
 
 
 class DefaultPreset:
     """The methods of this project; see `Preset` for the meaning of each part."""
 
-    name = 'default'
+    name = DEFAULT
     least_samples = 2
     validates_updates = True
     simulates_on_devices = True
@@ -85,7 +87,7 @@ class DefaultPreset:
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
         """Return the paper's three steps, with targets at which some joints are at their limits."""
-        from musculoskeletal_ae.control.exploration import posture_at_limits, pressing_tension
+        from musculoskeletal_ae.control.exploration_steps import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps
 
         return partial(three_steps, posture=posture_at_limits, constant_tension=pressing_tension)

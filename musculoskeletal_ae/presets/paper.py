@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.paper.constants import HIDDEN, INITIAL_STEPS, THRESHOLD
+from musculoskeletal_ae.presets.names import PAPER_PRESET
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from musculoskeletal_ae.control.exploration import Step
+    from musculoskeletal_ae.control.exploration_steps import Step
     from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
 
 
 class PaperPreset:
@@ -32,7 +33,7 @@ class PaperPreset:
     choice; `experiments/layers.py` varies it.
     """
 
-    name = 'paper'
+    name = PAPER_PRESET
     least_samples = THRESHOLD + 1
     validates_updates = False
     simulates_on_devices = False

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     import numpy as np
 
-    from musculoskeletal_ae.control.exploration import Step
+    from musculoskeletal_ae.control.exploration_steps import Step
     from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
 
 
 class Preset(Protocol):

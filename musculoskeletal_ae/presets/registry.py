@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """All presets by name.
 
-To add a preset, implement the methods of `Preset` in a class and add an instance to `PRESETS`.
+To add a preset, name it in `names.py`, implement the methods of `Preset` in a class, and add an
+instance to `PRESETS`.
 """
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets.default import DefaultPreset
+from musculoskeletal_ae.presets.names import PRESET_NAMES
 from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.preset import Preset
 
-DEFAULT = DefaultPreset.name
-#: name of the preset that follows the paper exactly, with which experiments compare other presets
-PAPER_PRESET = PaperPreset.name
-
-PRESETS: dict[str, Preset] = {preset.name: preset for preset in (DefaultPreset(), PaperPreset())}
+#: in the order of `PRESET_NAMES`
+PRESETS: dict[str, Preset] = dict(zip(PRESET_NAMES, (DefaultPreset(), PaperPreset()), strict=True))
 
 
 def preset_named(name: str) -> Preset:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.robot.muscle_file import POSITION, STIFFNESS
 from musculoskeletal_ae.robot.tension_source import TensionSource
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ Choice = TypeVar('Choice')
 Kinded = tuple[str, Array]  # kind and value of a command
 
 LENGTH, TENSION = 'length', 'tension'  # kinds of commands
-STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
 
 DESIRED_SHARE = 0.3  # tension of a well-tensed arm, relative to T_limit
 #: largest length by which rest feedback pays out a needlessly tense muscle under stiffness control

@@ -22,12 +22,12 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_text, read_yaml
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot import series_elastic
-from musculoskeletal_ae.robot.actuation import POSITION
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, resolved
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.muscle_file import (
+    POSITION,
     MuscleEntry,
     MuscleFile,
     RouteEntry,
@@ -136,7 +136,7 @@ class RobotDescription:
     #: K_stiff of muscle stiffness control [N/m], (M,); infinite for position-controlled modules
     stiffness: Array
     tension: TensionRange
-    actuation: str  # STIFFNESS or POSITION of `robot.actuation`
+    actuation: str  # STIFFNESS or POSITION
     tension_source: TensionSource
     speed: Array  # speed of position-controlled modules [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,); NaN for the default

@@ -16,6 +16,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
+STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
 LARGEST = 1e8  # largest absolute value of any number [SI units]
 LONGEST_LIST = 1000  # largest number of entries of a list: muscles, points of a route, joints
 SHORTEST_AXIS = 1e-6  # length below which a vector defines no direction

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import compress
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -35,26 +35,6 @@ SETTLED = 1e-6  # motion in a step below which the arms have settled [rad]
 
 STOP_TORQUE = 0.1  # torque of a stop above which `limits` names the joint [N·m]
 TENSION_MARGIN = 1.0  # distance from T_max below which `limits` names the muscle [N]
-
-
-class SimulatedBody(Protocol):
-    """Steps N simulated arms of one robot."""
-
-    def use(self, mae: Any, robot: Robot) -> None:
-        """Set the network, and the robot with the currently isolated muscles."""
-
-    def step(
-        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
-    ) -> ArmState:
-        """Return the state of the arms after a step.
-
-        Args:
-            state: The arms now.
-            command: l_target [m], (N, M); PAID_OUT for muscles without a command.
-            h: Duration of the step [s].
-            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).
-            fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
-        """
 
 
 class Simulation:

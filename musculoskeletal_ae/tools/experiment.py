@@ -48,7 +48,9 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     args.seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
-    return exit_status(lambda: import_heavy('musculoskeletal_ae.experiments.results').measure(args))
+    return exit_status(
+        lambda: import_heavy('musculoskeletal_ae.experiments.measurement').measure(args)
+    )
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -23,16 +23,9 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import Trained, initial_mae
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.training import (
-    OUTPUTS,
-    PairError,
-    Trained,
-    initial_mae,
-    pair_errors,
-    random_states,
-    train_on,
-)
+from musculoskeletal_ae.mae.training import OUTPUTS, PairError, pair_errors, random_states, train_on
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.options import save_plot

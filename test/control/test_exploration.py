@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.control.exploration import Exploration, holdable_postures
+from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.presets.registry import PRESETS

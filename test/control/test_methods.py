@@ -11,7 +11,7 @@ from nominal_body import posture_table
 from bench.timings import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.control import methods
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.control.exploration import holdable_postures
+from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual

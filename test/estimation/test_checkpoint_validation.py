@@ -22,9 +22,10 @@ from musculoskeletal_ae.estimation.validation.message_errors import FLOOR
 from musculoskeletal_ae.estimation.validation.postures import LIMITS
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
+from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.trainer import Trainer, Update
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -12,7 +12,7 @@ import pytest
 
 from musculoskeletal_ae.emulator.reality import FOREIGN
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
-from musculoskeletal_ae.experiments import online_learning, results, robustness, runner
+from musculoskeletal_ae.experiments import measurement, online_learning, robustness, runner
 from musculoskeletal_ae.experiments.results import (
     KEPT,
     combine,
@@ -85,7 +85,7 @@ def test_a_result_without_a_number_that_the_report_shows_is_an_error_with_the_re
 def test_a_page_without_a_place_for_the_table_is_refused_before_the_work(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(results, 'run', lambda *_: pytest.fail('measured first'))
+    monkeypatch.setattr(measurement, 'run', lambda *_: pytest.fail('measured first'))
     readme = tmp_path / 'README.md'
     options = f'body_change --robot arm26 --quick --readme {readme} --out {tmp_path}'.split()
     assert experiment.main(options) == 1

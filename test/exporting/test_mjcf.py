@@ -11,7 +11,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.tools.export_mjcf import main
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.priors import PRIOR
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.trainer import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -12,7 +12,7 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import initial_training
 from musculoskeletal_ae.tools.initial_training import anomaly_in, error, learn, read

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from robots import write_robot
 
+from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.margin import MARGIN
-from musculoskeletal_ae.learning.trainer import Trainer, Update
+from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets

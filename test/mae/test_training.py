@@ -6,7 +6,8 @@ import torch
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.mae.default_training import POSTURE_MARGIN, annealing, overload_states
-from musculoskeletal_ae.mae.training import initial_mae, pair_errors, random_states, shuffled
+from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.mae.training import pair_errors, random_states, shuffled
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot

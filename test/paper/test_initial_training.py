@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.paper import constants
 from musculoskeletal_ae.paper.initial_training import loss, random_states
 from musculoskeletal_ae.paper.network import new_network

@@ -24,12 +24,12 @@ from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.fit import fit_body
+from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.trainer import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.training import initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity

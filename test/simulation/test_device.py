@@ -11,9 +11,9 @@ from torch.overrides import TorchFunctionMode
 
 from bench.eager_simulation import EagerSimulation
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.network import TorchLengths
 from musculoskeletal_ae.mae.residuals import TouchStatistics
-from musculoskeletal_ae.mae.training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the settings choose: which methods are legal for a robot, and how each reaches a target."""
+
+from collections.abc import Mapping
+
+from musculoskeletal_ae.control.methods import LengthMethod
+from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.presets.registry import preset_named
+from musculoskeletal_ae.robot.robot import Robot
+
+
+def check_method(robot: Robot, settings: Settings) -> None:
+    """Check that the robot's muscle modules measure the tensions that the method needs.
+
+    Raises:
+        MusculoskeletalError: If they do not; the text names the reason and the legal methods.
+    """
+    if robot.tension_source.is_current and settings.method in BY_TENSION:
+        legal = tuple(method for method in METHODS if method not in BY_TENSION)
+        raise MusculoskeletalError(
+            f'method {settings.method!r} requires measured tensions, but tension_source in '
+            'muscles.yaml is current: the friction of a resting drive hides the force of a hand; '
+            f'legal: {", ".join(legal)}'
+        )
+    if robot.tension_source.is_known:
+        return
+    legal = preset_named(settings.preset).methods_without_tension
+    if settings.method not in legal:
+        raise MusculoskeletalError(
+            f'method {settings.method!r} requires tensions, but tension_source in muscles.yaml is '
+            f'none; legal with preset {settings.preset!r}: {", ".join(legal)}'
+        )
+
+
+def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
+    """Return the length methods of the preset in the settings."""
+    return preset_named(settings.preset).length_methods()
+
+
+def by_follower(settings: Settings) -> bool:
+    """Return whether the method reaches targets with the follower, rather than in another way.
+
+    The other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
+    """
+    return settings.method not in (*BY_TENSION, *length_methods(settings))

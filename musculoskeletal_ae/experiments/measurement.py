@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run of `experiment`: measures, and writes results, plots, report and pages."""
+
+import json
+import tempfile
+import time
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tqdm import tqdm
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.paper_page import update_page
+from musculoskeletal_ae.experiments.results import (
+    failures,
+    read,
+    text_around_table,
+    update_readme,
+    write,
+    write_report,
+)
+from musculoskeletal_ae.experiments.runner import run
+from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.robot.robot import Robot
+
+BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
+
+
+def measure(args: Namespace) -> None:
+    """Run the experiments as the options specify; write results, plots and report."""
+    start = time.perf_counter()
+    names, robot = args.names, Robot.load(args.robot)
+    if args.readme:  # check the file before hours of work
+        text_around_table(args.readme)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with _work_folder(args) as folder:
+        study = Study(
+            robot, args.preset, args.seeds, args.minutes, args.quick, folder, args.reality
+        )
+        with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
+
+            def report(share: float, running: str) -> None:
+                bar.n = share
+                bar.set_description_str(running)
+
+            parts = run(study, names, args.jobs, report)
+        files = [*write(study, parts, args.out), write_report(args.out)]
+    if args.readme:
+        files += update_readme(args.readme, args.out)
+    if args.page:
+        files += update_page(args.page, args.out)
+    print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
+    measured = read(args.out)
+    if failed := failures({name: measured[name] for name in names}):
+        problem = f'some experiments failed: {"; ".join(failed)}'
+        raise MusculoskeletalError(f'{problem}; the results of all others are written')
+
+
+@contextmanager
+def _work_folder(args: Namespace) -> Iterator[Path]:
+    """Yield the folder of networks and recordings: that of `--keep`, or a temporary one.
+
+    Raises:
+        MusculoskeletalError: If the kept folder belongs to a run with other options.
+    """
+    if args.keep is None:
+        with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
+            yield Path(folder)
+        return
+    args.keep.mkdir(parents=True, exist_ok=True)
+    options = {
+        key: str(getattr(args, key)) for key in ('robot', 'preset', 'minutes', 'quick', 'reality')
+    }
+    file = args.keep / 'options.json'
+    if file.is_file():
+        before = json.loads(file.read_text(encoding='utf-8'))
+        if before != options:
+            changed = ', '.join(f'{key} {before.get(key)}' for key in options)
+            problem = f'--keep {args.keep} holds parts of a run with other options ({changed})'
+            raise MusculoskeletalError(f'{problem}; repeat them, or name an empty folder')
+    elif any(args.keep.iterdir()):
+        raise MusculoskeletalError(f'--keep {args.keep}: expected an empty or new folder')
+    file.write_text(json.dumps(options), encoding='utf-8')
+    yield args.keep

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains the first network of a robot on its geometric model, as the chosen preset does it."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.network import to_mae
+from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, random_states
+from musculoskeletal_ae.presets.registry import preset_named
+from musculoskeletal_ae.robot.robot import Robot
+
+HELD_OUT_STATES = 5000  # held-out states of the geometric model for the first anomaly statistics
+
+
+class Trained(NamedTuple):
+    """Result of `initial_mae`."""
+
+    mae: Mae  # ready for a checkpoint
+    losses: list[float]  # loss of every mini-batch
+
+
+def initial_mae(
+    robot: Robot,
+    preset: str = 'default',
+    seed: int = 0,
+    progress: Progress | None = None,
+    steps: int | None = None,
+) -> Trained:
+    """Train a network on the geometric model, and add anomaly statistics of the model.
+
+    Args:
+        robot: The geometric model.
+        preset: Name of the preset.
+        seed: Random seed; on the same machine, the same seed gives the same network.
+        progress: Called after every mini-batch.
+        steps: Number of mini-batches; None for the preset's number.
+    """
+    chosen = preset_named(preset)
+    steps = chosen.initial_steps(robot.groups) if steps is None else steps
+    trained = chosen.train_initial(robot, seed, steps, progress)
+    return completed(robot, trained, preset, seed)
+
+
+def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
+    """Return a trained network as a `Mae` with its history and anomaly statistics.
+
+    The statistics are those of held-out states of the geometric model.
+
+    Args:
+        robot: The geometric model.
+        trained: The network of the initial training.
+        preset: Name of the preset that trained it.
+        seed: Random seed of the training.
+    """
+    network, losses, by = trained
+    history = (
+        f'initial training on the geometric model of {robot.description.directory.name}: '
+        f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {by}'
+    )
+    mae = to_mae(network, robot.joints, robot.muscles, preset, history)
+    rng = np.random.default_rng([seed, 1])
+    _, tension, length = random_states(robot, HELD_OUT_STATES, rng, robot.tension.limit)
+    error = residuals(mae.estimate(tension, length), tension, length)
+    statistics = AnomalyStatistics.of(error, calibrated=False)
+    statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})
+    return Trained(replace(mae, anomaly=statistics), losses)

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The interface of the equations that a preset simulates (`Preset.make_simulator`)."""
+
+from typing import Any, Protocol
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.simulation.equilibrium import ArmState
+
+
+class SimulatedBody(Protocol):
+    """Steps N simulated arms of one robot."""
+
+    def use(self, mae: Any, robot: Robot) -> None:
+        """Set the network, and the robot with the currently isolated muscles."""
+
+    def step(
+        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
+    ) -> ArmState:
+        """Return the state of the arms after a step.
+
+        Args:
+            state: The arms now.
+            command: l_target [m], (N, M); PAID_OUT for muscles without a command.
+            h: Duration of the step [s].
+            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).
+            fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
+        """
