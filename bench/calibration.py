@@ -7,7 +7,7 @@ The constants of `emulator.individual.Spread` were set once, with seeds 0–9 of
 are never changed to improve a result. They meet two targets on the held-out motion (5 minutes at
 100 Hz; mean of ‖θ_est − θ_true‖ over all samples):
 
-- Preset `paper` before learning has an error of 0.32–0.42 rad, as at the beginning in the paper.
+- Before learning, preset `paper` has an error of 0.32–0.42 rad, as in the paper.
 - The oracle, least squares on the true body, has an error of 0.04–0.06 rad in motion.
 
 Joint friction is a share of each joint's own load. Its sum over the joints of this arm is 0.586 N·m

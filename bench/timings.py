@@ -81,13 +81,17 @@ def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
 
 
 def gemm_rate(rows: int) -> float:
-    """Return the multiply-adds per microsecond of products of (rows, 200) with (200, 100)."""
+    """Return the multiply-adds per µs of this machine in products of (rows, 200) and (200, 100)."""
     left, right = np.ones((rows, 200), np.float32), np.ones((200, 100), np.float32)
     return rows * right.size / microseconds(lambda: left @ right)
 
 
 def microseconds(function: Callable[[], object], calls: int = 100, rounds: int = 20) -> float:
-    """Return the CPU time of one call [µs], as the median of rounds; slow functions have fewer."""
+    """Return the CPU time of one call [µs], as the median over `rounds` rounds of `calls` calls.
+
+    If a function is slow, a round has fewer than `calls` calls, so that it takes about LONGEST
+    seconds.
+    """
     function()
     start = time.process_time()
     function()
@@ -241,7 +245,7 @@ def eager_proposed_paper(
 
 
 def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
-    """Return rows for a simulator step (preset default), one arm and many, and a new network."""
+    """Return rows for a simulator step of one arm and of many, and for loading a network."""
     mae = initial_mae(robot, preset, steps=200).mae
     rng = np.random.default_rng(0)
 
@@ -295,7 +299,7 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
 
 
 def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]:
-    """Return the times of all steps."""
+    """Return the times of all rows, on one thread."""
     torch.set_num_threads(1)
     one, many = gemm_rate(1), gemm_rate(256)
     every = mae_rows(robot, preset) + simulation_rows(robot, preset, device)

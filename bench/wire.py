@@ -226,7 +226,7 @@ class System:
 
 
 class Wire(NamedTuple):
-    """Results of a system of nodes."""
+    """What was measured of a running system of nodes."""
 
     latency: tuple[float, ...]  # median, 99th percentile and maximum [ms]
     late: float  # messages of the emulator without a command within two periods [%]
@@ -244,7 +244,7 @@ class Wire(NamedTuple):
 
 
 def measure(system: System, rate: float, seconds: float) -> Wire:
-    """Measure a system of nodes after its start.
+    """Return latency, losses and CPU times of a started system, measured over some seconds.
 
     Raises:
         MusculoskeletalError: If the nodes exchange no messages.

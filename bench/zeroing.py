@@ -61,7 +61,7 @@ class Loop:
         self._zeros = self.estimator.body.offsets
 
     def step(self, joints: bool) -> MuscleSample | None:
-        """Simulate 10 ms; return the readings of the muscle modules."""
+        """Simulate 10 ms, with joint sensors if `joints`; return the estimator's muscle sample."""
         self.time += SAMPLE_TIME
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
@@ -86,7 +86,7 @@ class Loop:
 
 
 def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[str, Any]:
-    """Calibrate one individual; return the results."""
+    """Calibrate the lengths of one individual in the way `how`; return the results by name."""
     rng = np.random.default_rng([seed, 0x0F])
     offset = rng.uniform(LEAST, MOST, robot.muscle_count)
     offset *= rng.choice([-1.0, 1.0], robot.muscle_count)

@@ -69,7 +69,7 @@ class Driver(Node):
         self.create_timer(1.0 / RATE, self.tick)
 
     def command(self, message: Float64MultiArray, by_tension: bool) -> None:
-        """Take a command of either kind; ignore one that is malformed."""
+        """Receive a command: lengths, or tensions if `by_tension`; ignore a malformed one."""
         target = np.array(message.data)
         if len(target) == self.robot.muscle_count and np.isfinite(target).all():
             self.target, self.by_tension, self.commanded_at = target, by_tension, time.monotonic()

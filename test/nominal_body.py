@@ -26,7 +26,7 @@ PUSH = 1.0  # torque of the push at the joint [N·m]
 
 
 def nominal_arm(robot: Robot) -> EmulatedArm:
-    """Return the geometric model as a body."""
+    """Return an emulated arm that behaves exactly as the geometric model."""
     return EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
 
 

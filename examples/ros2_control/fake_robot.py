@@ -30,7 +30,7 @@ SPOOL_RADIUS = 0.012  # radius of the spools [m]
 
 
 class Hardware:
-    """The hardware component: motors with encoders and torque sensors, and joint sensors."""
+    """An emulated hardware component: motors with encoders and torque sensors; joint sensors."""
 
     def __init__(self, robot: str) -> None:
         self.robot = Robot.load(robot)

@@ -43,7 +43,7 @@ class Tool:
         )
 
     def wait_for(self, text: str) -> str:
-        """Read lines until one contains the text."""
+        """Read lines until one contains the text, and return this line."""
         for line in self.process.stdout:
             if text in line:
                 return line

@@ -74,7 +74,7 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     arm.add('/muscle_states', ARRAY, 0.0051, array(bad))
     arm.add('/muscle_states', ARRAY, 0.0052, array(bad[1:]))
     arm.add('/joint_states', JOINTS, 0.0053, joints(['other'], [0.0]))
-    # A message may also name joints of another arm, and its joints may have any order.
+    # A message may also name joints of another arm. The order of the names does not matter.
     names = ['other', *reversed(robot.joints)]
     arm.add('/joint_states', JOINTS, 0.0054, joints(names, [9.0, *arm.theta[0, ::-1]]))
     result = streams(arm, robot, tmp_path)
