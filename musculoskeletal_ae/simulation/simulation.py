@@ -4,9 +4,10 @@
 (Paper, §III-F.) The simulated arms follow the same length commands as the robot, because the
 simulation includes muscle stiffness control. A length command l_target, which includes the
 compensation l_comp(T) (paper, §III-E, eq. 6), causes the same tensions at rest as on the robot. An
-arm without a command rests at T_bias. The same compiled code simulates one arm or thousands, on all
-cores; the network may run on a GPU. The preset selects the equations (`Preset.make_simulator`). The
-module `equilibrium` contains the equations of preset `default`.
+arm without a command rests at T_bias, or holds its lengths if its modules follow positions. The
+same compiled code simulates one arm or thousands, on all cores; the network may run on a GPU. The
+preset selects the equations (`Preset.make_simulator`). The module `equilibrium` contains the
+equations of preset `default`.
 """
 
 import os

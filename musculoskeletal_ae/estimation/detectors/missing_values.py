@@ -22,7 +22,8 @@ class MissingValues(Detector):
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._muscle: int | None = None
-        #: times of the first and the last message in which only `_muscle` had NaN [s]
+        #: time since which `_muscle` has been the only muscle with NaN, and time of the last
+        #: message [s]
         self._since = self._last = -math.inf
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:

@@ -138,8 +138,9 @@ class ResidualDistance(Detector):
         evidence = ''
         if observation.lengths_known:
             evidence = self._evidence(observation, distance, slack_count > 0, waits)
-        # A tendon that alone is slack stays the suspect. If several are slack, some of them may be
-        # healthy tendons that a rupture has made slack for a moment, so likelihood decides.
+        # If exactly one tendon is slack, it stays the suspect. If several are slack, some may be
+        # healthy tendons that a rupture has made slack for a moment. Likelihood then decides among
+        # the slack tendons. If none is slack, it decides among all muscles in use.
         is_first = evidence and self._beyond == IN_A_ROW
         if is_first and self.is_calibrated and slack_count != 1:
             candidates = is_slack if slack_count else self._robot.used
