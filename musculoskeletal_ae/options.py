@@ -122,7 +122,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def add_preset(self, text: str = 'network, learning and solver') -> None:
-        """Add `--preset`."""
+        """Add `--preset`; the text says what the preset determines."""
         self.add_argument('--preset', choices=PRESET_NAMES, default=DEFAULT, help=text)
 
     def add_seed(self, text: str) -> None:
@@ -162,7 +162,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def add_plot(self, text: str) -> None:
-        """Add `--plot`, the file of a picture that `save_plot` saves."""
+        """Add `--plot`, the file of a picture for `save_plot`; the text says what it shows."""
         self.add_argument('--plot', type=picture, metavar='FILE.png', help=f'draw {text}')
 
 

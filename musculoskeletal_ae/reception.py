@@ -155,7 +155,7 @@ class Stamps:
         self._last: int | None = None  # [ns]
 
     def is_new(self, stamp: Any) -> bool:
-        """Whether a stamp is later than the previous one, or the clock was set back meanwhile."""
+        """Whether a stamp is later than the previous stamp, or the clock was set back meanwhile."""
         time, last = stamp.sec * 1_000_000_000 + stamp.nanosec, self._last
         if last is not None and last - REORDERING < time <= last:
             return False

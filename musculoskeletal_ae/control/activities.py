@@ -38,7 +38,7 @@ class ActivityControl(ABC):
 
     @abstractmethod
     def step(self, inputs: Inputs, /) -> Command | None:
-        """Return the desired command; None keeps the last one."""
+        """Return the desired command; None keeps the last command."""
 
     @abstractmethod
     def leave(self) -> None:

@@ -66,7 +66,7 @@ class Exploring(ActivityControl):
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """End the exploration; the next one starts with another posture."""
+        """End the exploration; the next exploration starts with another posture."""
         self._steps = self._theta = None
 
     @property

@@ -194,7 +194,7 @@ def stiffness_command(
     limit: Array | float,
     near: Array | None = None,
 ) -> Solution:
-    """Return the command of `stiffness`: the joint stiffness nearest to the desired one.
+    """Return the command of `stiffness`, with the joint stiffness nearest to the desired stiffness.
 
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 

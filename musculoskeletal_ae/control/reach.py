@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Holdability: whether a posture is holdable, the nearest holdable one, and a holdable path.
+"""Holdability: whether a posture is holdable, the nearest holdable posture, and a holdable path.
 
 All functions use the learned G and the least tensions within the limits. An arm with isolated
 muscles falls where the remaining muscles cannot hold it, until a joint's stop supports it. From
@@ -84,7 +84,7 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
-    """Return the postures of a path from `start` to θ [rad], (K, D); the last one is θ."""
+    """Return the postures of a path from `start` to θ [rad], (K, D); the last posture is θ."""
     if robot.used.all():
         return theta[None]
     cost = PathCost(robot, mae)
@@ -258,7 +258,7 @@ class Roadmap:
         self._set_price(0, 1, direct)
 
     def cheapest_path(self) -> Array:
-        """Return the postures of the cheapest path [rad], (K, D)."""
+        """Return the cheapest path as postures θ [rad], (K, D)."""
         path = [0, 1]
         for _ in range(LOOKS):
             path = self._apparently_cheapest()

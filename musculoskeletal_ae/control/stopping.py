@@ -123,7 +123,7 @@ class SafeStop:
         return Command(LENGTH, value)
 
     def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:
-        """Return the next length command [m] of the suspect; `command` is the last one [m]."""
+        """Return the suspect's next length command [m]; `command` is its last command [m]."""
         if self._wound_from is None:
             self._wound_from = command
         length, tension, _ = sample.newest[:, muscle]

@@ -85,7 +85,7 @@ class Trajectory:
 
     start: Setpoint
     points: Points  # the remaining points
-    time: Array  # times of the knots, the first one 0 [s], (K,)
+    time: Array  # times of the knots [s], (K,); the first time is 0
     coefficients: Array  # coefficients of each piece, (K−1, 6, D)
     end: Array  # posture that is held after the last point [rad], (D,)
     slowed: float = 1.0  # factor by which the trajectory was slowed

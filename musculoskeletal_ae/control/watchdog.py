@@ -158,7 +158,7 @@ class HeatLimit:
         self.momentary = self.planned
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
-        """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
+        """Update the thermal model from muscle states; `elapsed` [s] have passed since the last."""
         # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because the
         # module is commanded to exert T_bias.
         bias = robot.description.tension.bias

@@ -95,7 +95,7 @@ class Record(Node):
             self._subscribe(name, qos)
 
     def count_losses(self) -> None:
-        """Count the messages lost since the last call; warn when the first ones are lost."""
+        """Count the messages lost since the last call; warn when the first messages are lost."""
         had_lost = self.losses.lost.total()
         self.losses.settle(self.count_publishers)
         if self.losses.lost and not had_lost:

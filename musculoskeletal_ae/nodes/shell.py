@@ -306,11 +306,12 @@ class Shell(Node):
     ) -> None:
         """Use each network that the estimator accepts.
 
-        Until the first one arrives, use the network of the parameter `checkpoint`, if it is set.
+        Until the first network arrives, use that of the parameter `checkpoint`, if it is set.
 
         Args:
             use: Called with each network that this node is to use from now on.
-            unfit: Called with the reason if a network is unusable; the previous one stays in use.
+            unfit: Called with the reason if a network is unusable; the previous network stays in
+                use.
         """
         has_accepted = False
 

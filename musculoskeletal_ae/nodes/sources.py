@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects several publishers of a topic that should have exactly one.
+"""Detects several publishers of a topic that should have exactly one publisher.
 
 A message does not name its sender, so this module looks at the ROS graph. While several nodes
 publish a topic of `AUTHORS`, its messages are rejected, every node that uses it reports an ERROR,

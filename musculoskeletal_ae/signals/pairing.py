@@ -26,7 +26,7 @@ class Paired(Generic[Message]):
         time: Time of reception of the message [s].
         message: The message as the caller passed it.
         dt: Time since the previous message [s]; 0 for the first.
-        theta: θ [rad], (D,), NaN for joints without a matching value; None if no joint has one.
+        theta: θ [rad], (D,), NaN for joints without a matching value; None if no joint has a match.
     """
 
     time: float
@@ -36,7 +36,7 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Pairs messages of muscles with θ; a message is returned when the next one has arrived."""
+    """Pairs messages of muscles with θ; returns a message when the next message has arrived."""
 
     def __init__(self, period: float) -> None:
         """Start; `period` is the period of the muscle messages [s]."""
@@ -63,7 +63,7 @@ class Pairing(Generic[Message]):
         self._next = np.where(np.isnan(self._next), new, self._next)
 
     def muscles(self, time: float, message: Message | None) -> Paired[Message] | None:
-        """Record a muscle message received at `time` [s]; return the previous one with its θ.
+        """Record a muscle message received at `time` [s]; return the previous message with its θ.
 
         At the end of a recording, pass None at time ∞ to get the last message.
         """
