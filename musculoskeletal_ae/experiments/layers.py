@@ -70,8 +70,12 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the mean of each number over trainings, and the ranges of the numbers in ERRORS."""
-    summary = dict[str, float | None]()
+    """Return the mean of each number over trainings, and the ranges of the numbers in ERRORS.
+
+    `learned` is the number of trainings after which learning started.
+    """
+    learned = [row for row in rows if row['after_rad'] is not None]
+    summary: dict[str, float | None] = {'learned': len(learned)}
     for key in rows[0]:
         known = [row[key] for row in rows if row[key] is not None]
         summary[key] = float(np.mean(known)) if known else None
@@ -125,7 +129,8 @@ def layers(_: Study, rows: Rows) -> Plot:
     count = row.numbers['trainings']
     return figure, (
         'Error of the estimate on the held-out motion with other hidden layers of the encoder, '
-        f'mean of {count} trainings, and a dot for each.'
+        f'mean of {count} trainings, and a dot for each. In brackets: after how many of them '
+        'learning started.'
     )
 
 

@@ -66,17 +66,22 @@ def bars(
 ) -> None:
     """Draw means over N individuals as bars with their values, and a dot for each individual.
 
-    `groups` maps labels to a colour and values (N, K) of the K names; NaN stands for no value.
+    `groups` maps labels to a colour and values (N, K) of the K names. NaN stands for no value: the
+    mean is that of the others, and its label states how many there are.
     """
     place, height = np.arange(len(names)), 0.8 / len(groups)
     for g, (label, (colour, values)) in enumerate(groups.items()):
-        at, means = place + (g - 0.5 * (len(groups) - 1)) * height, np.mean(values, axis=0)
+        at = place + (g - 0.5 * (len(groups) - 1)) * height
+        known = [column[np.isfinite(column)] for column in np.transpose(values)]
+        means = [column.mean() if len(column) else 0.0 for column in known]
         panel.barh(at, means, 0.95 * height, color=colour, label=label)
         panel.plot(np.transpose(values), at, '.', color=TRUE, ms=4)
-        for y, mean, furthest in zip(at, means, np.nan_to_num(np.max(values, axis=0))):
-            text = 'none' if np.isnan(mean) else f'{mean:.3f}'
+        for y, mean, column in zip(at, means, known):
+            text = f'{mean:.3f}' if len(column) else 'none'
+            if 0 < len(column) < len(values):
+                text += f' ({len(column)} of {len(values)})'
             style = {'textcoords': 'offset points', 'va': 'center', 'fontsize': 9}
-            panel.annotate(text, (furthest, y), (6, 0), **style)
+            panel.annotate(text, (column.max(initial=0.0), y), (6, 0), **style)
     panel.set_yticks(place, names)
     panel.invert_yaxis()
     panel.margins(x=0.12)
