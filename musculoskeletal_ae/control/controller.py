@@ -9,9 +9,10 @@ The supervisor decides what the arm does (`supervisor`, `stops`). One object for
 computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibrating`). Every command
 passes the limiter before it is published.
 
-Plans assume no tension in isolated muscles, and their modules are commanded to keep them slack. A
-muscle that is isolated during an anomaly is the suspect. While the arm is stopped, the suspect is
-wound in slightly to verify the fault; the arm resumes when the anomaly is over.
+Plans assume that isolated muscles have no tension, and the modules of isolated muscles are
+commanded to keep the tendons slack. A muscle that is isolated during an anomaly is the suspect.
+While the arm is stopped, the suspect is wound in slightly to verify the fault; the arm resumes when
+the anomaly is over.
 
 `now` is the time of a steady clock [s], and `time` is the time of the messages' clock [s].
 """
@@ -56,7 +57,8 @@ RESTORE = 'call estimator/restore to use isolated muscles again'
 #: longest time in which the estimator isolates the suspect of an anomaly, or reacts to a length
 #: jump [s]
 REACTION_TIME = 1.0
-#: time in which a length calibration provides its first estimate [s]; at 10 Hz it takes 3.5 s
+#: time in which a length calibration provides its first estimate [s]; this takes 3.5 s if messages
+#: arrive at 10 Hz
 FIRST_ESTIMATE = 5.0
 APPROACHES = 3  # number of further attempts to reach a target if an arm with isolated muscles falls
 
@@ -92,7 +94,7 @@ class Activities:
         self.calibrating = Calibrating(robot, settings, seed)
         self.torque = TorqueControl(robot, settings)
         self.gravity_compensation = GravityCompensation(robot, settings)
-        #: the activity that issued the last command, unless it was interrupted since
+        #: the activity that issued the last command; None if it was interrupted since then
         self.entered: ActivityControl | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
@@ -159,7 +161,12 @@ class Suspicion:
         self._isolated = muscle, now
 
     def suspect(self, has_anomaly: bool, isolated: tuple[int, ...]) -> int | None:
-        """Return the suspect, or None if there is none."""
+        """Return the suspect, or None if no muscle is suspected.
+
+        Args:
+            has_anomaly: Whether an anomaly is present.
+            isolated: Indices of all isolated muscles.
+        """
         if not has_anomaly or self._isolated is None:
             return None
         muscle, at = self._isolated
@@ -180,9 +187,11 @@ class Controller:
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
-        self.rejected_pull: Array | None = None  # `RejectionError.pull` since the last sample
-        #: θ [rad] (D,) under the present length offsets; None until the first such estimate, for
-        #: example from the start of a length calibration. Without it, the arm does not move.
+        #: `RejectionError.pull` of the newest message if it was rejected, else None
+        self.rejected_pull: Array | None = None
+        #: Estimated θ [rad], (D,), computed with the present length offsets. None while there is no
+        #: such estimate, for example after the start of a length calibration; the arm then does not
+        #: move.
         self.estimate: Array | None = None
         self.target_state = Target(np.zeros(robot.joint_count))
         self.supervisor = Supervisor()
@@ -267,7 +276,7 @@ class Controller:
         self.watchdog.take_sample(sample, now)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
-        """Check the estimated posture θ [rad] (D,) and control the arm by it from now on.
+        """Check the estimated posture θ [rad], (D,), and control the arm by it from now on.
 
         A repeated estimate, with `is_new` false, does not count as new data for the watchdog.
 
@@ -313,7 +322,8 @@ class Controller:
         if is_known != before.known or (body.offsets.offset != before.offset).any():
             self.activities.leave()
         if not is_known and not body.offsets.is_suspect:
-            # A length calibration begins or continues. An estimate from other offsets is wrong.
+            # A length calibration begins or continues. The estimate is discarded, because it was
+            # computed with other offsets.
             age = self.watchdog.age
             age.expect_later(StopCause.STALE_ESTIMATE, age.stepped_at, FIRST_ESTIMATE)
             self.estimate = None
@@ -326,7 +336,10 @@ class Controller:
             part.use(self.robot, self.settings)
 
     def anomaly(self, detected: bool) -> None:
-        """Set whether an anomaly is present; the end of a verification may resume the arm."""
+        """Record whether an anomaly is present.
+
+        The arm may resume if a verification has ended the anomaly.
+        """
         if detected and not self.watchdog.has_anomaly:
             self._suspicion.note_anomaly(self.watchdog.age.stepped_at)
         self.watchdog.has_anomaly = detected
@@ -482,7 +495,7 @@ class Controller:
         """Return why the lengths are unreliable, or ''.
 
         Normally the estimator revokes the offsets. The controller does so only if the estimator
-        does not react to a jump, for example because it was restarted meanwhile.
+        does not react to a jump, for example because the estimator was just restarting.
         """
         stream = self.stream
         if stream.body.offsets.is_suspect:
@@ -505,7 +518,7 @@ class Controller:
         computing = max(self.sent_at - self.watchdog.age.stepped_at, 0.0)
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
-        if step.has_paused:  # the arm may have moved: restart the activity from its posture
+        if step.has_paused:  # the arm may have moved: restart the activity from the new posture
             self.activities.entered = None
         present = self.conditions(now)
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
@@ -529,7 +542,7 @@ class Controller:
 
     def _desired(self, dt: float) -> Command | None:
         """Return the activity's command; any exception stops the arm."""
-        if self.estimate is None:  # a length calibration provides the next one
+        if self.estimate is None:  # wait for the next estimate, which a length calibration provides
             self.activities.leave()
             return self.limiter.command
         control = self.activities.of(self.supervisor.activity, self.settings)
@@ -553,7 +566,7 @@ class Controller:
         self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
 
     def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        """Step an activity, and apply what follows from it for target and supervisor."""
+        """Step an activity; update the target and the supervisor from its properties."""
         if control.needs_trajectory:
             self._approach_again()
         command = self.activities.step(control, inputs)
@@ -565,10 +578,10 @@ class Controller:
         return command
 
     def _approach_again(self) -> None:
-        """Start another trajectory to the target from the present posture, if there may be one.
+        """Start a trajectory from the present posture to the target, if there is a target.
 
-        After a stop or a change of method, there is no trajectory. If the arm has fallen, the
-        number of attempts is limited.
+        This is needed after a stop, after a change of method, and if the arm has fallen. After a
+        fall, the number of attempts is limited.
         """
         state, follower = self.target_state, self.activities.follower
         if follower.progress.trajectory is None and state.theta is not None:

@@ -130,7 +130,7 @@ class RestFeedback:
 class MotionFeedback:
     """Shifts the posture along a trajectory by k_p e + c, with dc/dt = k_i e.
 
-    c is the correction of the rest feedback, so that it continues from one motion to the next.
+    c is the correction of the rest feedback. It is thus kept from one motion to the next.
     """
 
     def __init__(self, rest: RestFeedback) -> None:
@@ -138,7 +138,7 @@ class MotionFeedback:
         self._shift: Array = np.zeros_like(rest.correction)  # shift of θ [rad], (D,)
 
     def step(self, error: Array, dt: float) -> Array:
-        """Return the shift of θ [rad] (D,) after an error [rad] (D,) over dt [s]."""
+        """Return the shift of θ [rad], (D,), for an error [rad], (D,), that lasted for dt [s]."""
         rest = self._rest
         correction = rest.correction + INTEGRAL * dt * error
         rest.correction = np.clip(correction, -rest.largest, rest.largest)

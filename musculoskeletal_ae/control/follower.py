@@ -13,8 +13,8 @@ slides, and μ is learned or a typical value (`control/friction.py`).
 
 Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
 dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is
-drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This is
-T_low. λ is measured while the arm moves (`winches`).
+drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This
+tension is T_low. λ is measured while the arm moves (`winches`).
 
 Position-controlled modules resist no motion beyond their lag λ; l_comp and K_stiff λ dl/dt are 0.
 
@@ -26,8 +26,8 @@ Where no tension is known, T is `Actuation.assumed_tension` in every posture, as
 which the network was learned (doc/explanation/method.md).
 
 Method `stiffness` minimises ‖T − T_K‖² instead, where `methods.stiffness_command` computes T_K for
-a setpoint that is AHEAD seconds ahead. It uses no feedback, which would change the chosen
-stiffness.
+a setpoint that is AHEAD seconds ahead. This method uses no feedback, because feedback would change
+the chosen stiffness.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ class HeldPosture(NamedTuple):
 
 
 class Follower(ActivityControl):
-    """Follows trajectories, and holds where the last one ended.
+    """Follows trajectories, and holds the end of the last trajectory.
 
     Attributes:
-        progress: Where the arm is and should be on its trajectory.
+        progress: Time, setpoint and error along the trajectories.
         plan: The planned tensions.
         winches: Measures the lag λ of the muscle modules.
         feedback: The feedback at rest.
@@ -76,7 +76,8 @@ class Follower(ActivityControl):
         self.winches, self.feedback = Winches(robot), RestFeedback(robot)
         self._motion_feedback = MotionFeedback(self.feedback)
         self._held: HeldPosture | None = None  # None while the arm moves or settles
-        self._blend: Ramp | None = None  # from the command before the present plan
+        #: ramp that reduces the difference between the last command and the present plan to 0
+        self._blend: Ramp | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.
@@ -97,7 +98,7 @@ class Follower(ActivityControl):
     # -- requests -------------------------------------------------------------------------------
 
     def follow(self, trajectory: Trajectory, delay: float = 0.0) -> None:
-        """Follow a trajectory that starts in `delay` [s] and replaces everything after that."""
+        """Follow a trajectory that starts in `delay` [s] and then replaces the present one."""
         if delay > 0.0:
             self.progress.next = trajectory, delay
         else:
@@ -105,7 +106,7 @@ class Follower(ActivityControl):
             self._leave_rest()
 
     def exert(self, effort: Array) -> None:
-        """Exert a torque in addition to inverse dynamics [N·m] (D,), until it is changed."""
+        """Exert a torque [N·m], (D,), in addition to inverse dynamics, until it is changed."""
         if (effort != self.plan.effort).any():
             self.plan.effort = effort
             self.plan_anew()
@@ -123,7 +124,7 @@ class Follower(ActivityControl):
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether it has no trajectory, as after a stop, or the arm has fallen."""
+        """Whether there is no trajectory, for example after a stop, or the arm has fallen."""
         return self.progress.trajectory is None or self.progress.has_lost_path
 
     @property
@@ -177,14 +178,14 @@ class Follower(ActivityControl):
         return Command(LENGTH, length + self._blend.step(dt))
 
     def _moving(self, trajectory: Trajectory, inputs: Inputs) -> Array:
-        """Return l_target [m] (M,) during the motion and while the arm settles."""
+        """Return l_target [m], (M,), during the motion and while the arm settles."""
         error = self.progress.error
         error = np.zeros_like(error) if self.plan.is_stiff else error
         shift = self._motion_feedback.step(error, inputs.dt)
         return self.plan.step(trajectory, self.progress.time, shift, self.winches.lag, inputs)
 
     def _resting(self, inputs: Inputs) -> Array:
-        """Return l_target [m] (M,) at rest."""
+        """Return l_target [m], (M,), at rest."""
         feedback, mae, plan = self.feedback, inputs.mae, self.plan
         if self._held is None:
             self._motion_feedback.continue_at_rest()

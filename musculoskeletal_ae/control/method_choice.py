@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the settings choose: which methods are legal for a robot, and how each reaches a target."""
+"""Checks which control methods are legal for a robot, and tells how a method reaches a target."""
 
 from collections.abc import Mapping
 
@@ -39,8 +39,8 @@ def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
 
 
 def by_follower(settings: Settings) -> bool:
-    """Return whether the method reaches targets with the follower, rather than in another way.
+    """Return whether the control method moves to targets by the `Follower`.
 
-    The other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
+    All other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
     """
     return settings.method not in (*BY_TENSION, *length_methods(settings))

@@ -13,8 +13,8 @@ from musculoskeletal_ae.robot.robot import Robot
 #: divided by RACK counts
 FALLEN = 0.2
 FALLING = 2.0  # time after the end of a trajectory from which on the arm can count as fallen [s]
-#: error on the way above which, for the time FALLING, an arm with isolated muscles no longer
-#: follows its trajectory [rad]; for prismatic joints, the error divided by RACK counts
+#: An arm with isolated muscles has lost its trajectory if the error exceeds this for the time
+#: FALLING [rad]. For prismatic joints, the error divided by RACK counts.
 LOST = 0.4
 
 
@@ -22,9 +22,10 @@ class Progress:
     """Follows the time along a trajectory, and compares the arm with it.
 
     Attributes:
-        trajectory: The present or last trajectory; None before the first and after a stop.
-        next: The trajectory that will replace it, and the time until then [s]; None if there is
-            none.
+        trajectory: The present or last trajectory; None before the first trajectory and after a
+            stop.
+        next: The trajectory that will replace the present one, and the time until then [s]; None if
+            no other trajectory is due.
         time: Time since the start of the trajectory [s].
         over: Time since the end of the trajectory [s].
         lost_time: Time for which the error has exceeded LOST [s].
@@ -41,11 +42,11 @@ class Progress:
         self.error: Array = np.zeros(robot.joint_count)
 
     def use(self, robot: Robot) -> None:
-        """Use another robot description, which says which muscles are isolated."""
+        """Use another robot description, which also states the isolated muscles."""
         self._robot = robot
 
     def begin(self, trajectory: Trajectory, time: float = 0.0) -> None:
-        """Replace all trajectories by one that began `time` [s] ago."""
+        """Replace all trajectories by a trajectory that began `time` [s] ago."""
         self.trajectory, self.time, self.next = trajectory, time, None
         self.over = self.lost_time = 0.0
 
@@ -54,7 +55,7 @@ class Progress:
         self.trajectory = self.next = None
 
     def return_to_end(self) -> None:
-        """Return to the end of the trajectory, from which the arm settles again."""
+        """Set the time back to the end of the trajectory, so that the arm settles again."""
         if self.trajectory is not None:
             self.time = min(self.time, self.trajectory.duration)
 
@@ -73,11 +74,11 @@ class Progress:
         return True
 
     def update_desired(self) -> None:
-        """Set the setpoint to the present one of the trajectory."""
+        """Set `desired` to the present setpoint of the trajectory."""
         self.desired = self.ahead(0.0)
 
     def compare(self, theta: Array, dt: float) -> None:
-        """Compare the setpoint with the estimated θ [rad] (D,), dt [s] after the last time."""
+        """Compare `desired` with the estimated θ [rad], (D,), dt [s] after the last comparison."""
         self.error = self.desired.theta - theta
         self.lost_time = self.lost_time + dt if self._largest_error > LOST else 0.0
 

@@ -8,21 +8,22 @@ from musculoskeletal_ae.control.trajectory import Trajectory
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: fraction of the rate limit for a trajectory's lengths; the rest is for tensions and feedback
+#: fraction of the rate limit that the lengths of a trajectory may use; the remaining fraction is
+#: for tensions and feedback
 SHARE = 0.7
-#: largest number of moments of a trajectory at which the network is evaluated; even with 10 000
-#: points, each piece of the trajectory has at least one
+#: largest number of moments of a trajectory at which the network is evaluated; even if a trajectory
+#: has 10 000 points, each piece between two points contains at least one moment
 MOST_MOMENTS = 12_500
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
-    """Return the factor by which a trajectory has to be slowed for the muscle modules.
+    """Return the factor by which to slow a trajectory so that the muscle modules can follow it.
 
-    Only the lengths at T_bias count. Tensions are ignored, because near postures that are hard to
-    hold they change suddenly at any speed; `SHARE` reserves speed for them. A trajectory that
-    starts in motion keeps its initial speed, so it can need more than this factor.
+    Only the lengths at T_bias count. Tensions are ignored, because they change suddenly, at any
+    speed, near postures that are hard to hold; `SHARE` reserves speed for tensions. A trajectory
+    that starts in motion keeps its initial speed. It may therefore have to be slowed by more.
     """
-    # Evaluate fewer moments of very long trajectories, so that no command is delayed by 0.1 s.
+    # Skip moments of very long trajectories, which would otherwise delay a command by 0.1 s.
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]

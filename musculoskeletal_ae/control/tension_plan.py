@@ -25,7 +25,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
 TURNING = 0.005  # speed of a tendon above which its sliding direction is certain [m/s]
-AHEAD = 0.2  # T_K is computed for this time ahead, and at this interval [s]
+AHEAD = 0.2  # T_K is computed at this interval, for a setpoint that is the same time ahead [s]
 
 
 class Stiffening:
@@ -50,8 +50,8 @@ class Stiffening:
     ) -> Array:
         """Return T_K [N], (M,).
 
-        Its change per step is limited: the lengths of trajectories may use the fraction SHARE of
-        the rate limit, so only the rest is left for T_K.
+        The change of T_K per step is limited: the lengths of trajectories may use the fraction
+        SHARE of the rate limit, so only the remaining fraction is left for T_K.
         """
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt
@@ -63,7 +63,7 @@ class Stiffening:
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near
             self.solution = solution
-        # Use half of that rest, because the series elastic elements stretch as well.
+        # Use half of the remaining rate, because the series elastic elements stretch as well.
         actuation = robot.actuation
         rates = actuation.fastest(settings.rate_limit) * actuation.tension_per_length(self._near)
         largest = 0.5 * (1.0 - SHARE) * rates * dt
@@ -86,13 +86,13 @@ class PlannedTension(NamedTuple):
 
     @classmethod
     def at_bias(cls, robot: Robot) -> PlannedTension:
-        """Return T_bias, before the first setpoint."""
+        """Return tensions of T_bias, which apply before the first setpoint."""
         bias = robot.tension.bias.copy()
         return cls(bias, bias, np.zeros(robot.joint_count))
 
 
 class TensionPlan:
-    """Computes tensions and lengths for the setpoints of a trajectory, in their order.
+    """Computes tensions and lengths for the successive setpoints of a trajectory.
 
     Attributes:
         effort: Torque in addition to inverse dynamics [N·m], (D,).
@@ -135,7 +135,7 @@ class TensionPlan:
         return self._stiffening.solution
 
     def adopt_limit(self, limit: Array) -> bool:
-        """Return whether a tension limit [N] (M,) requires a new plan, and use it if so."""
+        """Return whether a tension limit [N], (M,), requires a new plan; adopt the limit if so."""
         is_other = depends_on_limit(self.tension.motor, self._limit, limit)
         if is_other:
             self._limit = limit
@@ -148,7 +148,7 @@ class TensionPlan:
 
         Args:
             trajectory: The trajectory.
-            time: Time since its start [s].
+            time: Time since the start of the trajectory [s].
             shift: Shift of θ by the feedback [rad], (D,).
             lag: λ of the muscle modules [s].
             inputs: The present inputs.
@@ -177,6 +177,6 @@ class TensionPlan:
         return self.length(mae, at.theta + shift) + lag * speed
 
     def length(self, mae: Mae, theta: Array) -> Array:
-        """Return l_target [m] (M,) for θ [rad] (D,) at rest, with the planned tensions."""
+        """Return l_target [m], (M,), that exerts the planned tensions at rest at θ [rad], (D,)."""
         length = mae.lengths(theta, self.tension.bone)
         return length + msc_compensation(self._robot, self.tension.motor)

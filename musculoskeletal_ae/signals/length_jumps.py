@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rejects messages after a length has jumped, until its new level has lasted.
+"""Rejects messages after a length has jumped, until the new level of the length has lasted.
 
 A length jumps if it changes faster than a muscle can, for example because a module has lost its
 length offset. `LengthJumps.step` receives every message and decides:
@@ -32,8 +32,8 @@ class Verdict(NamedTuple):
     Attributes:
         problem: Reason and detail if the message is rejected, or None.
         displaced: Muscles that are displaced from now on; usually none.
-        is_unseen: Whether these jumped during a pause of the messages, in which the arm may have
-            moved.
+        is_unseen: Whether the displaced muscles jumped during a pause of the messages, in which the
+            arm may have moved.
     """
 
     problem: tuple[str, str] | None = None
@@ -45,14 +45,14 @@ class Verdict(NamedTuple):
 class Jump:
     """A jump whose new level is not accepted yet; arrays have the shape (M,).
 
-    The changes that were too large are added up for each muscle. The sum shows whether a length is
-    still at another level. Its present value does not: a module whose length jumped winds in or
-    pays out, which can bring the length back to the previous value.
+    The changes that were too large are added up for each muscle. The sum shows whether the length
+    is still at another level. The length itself does not show this: a module whose length jumped
+    winds in or pays out, which can bring the length back to the previous value.
 
     Attributes:
         change: Sum of the changes that were too large [m].
-        allowed: The largest change that was legal at any of them [m].
-        winding: What motors can have wound in meanwhile [m].
+        allowed: The largest change that was legal at any of these changes [m].
+        winding: Length that the motors can have wound in during these changes [m].
         is_unseen: Whether the first change followed a pause of the messages.
         last_at: Time of the last change that was too large [s].
     """
@@ -70,7 +70,15 @@ class Jump:
         return cls(nothing, nothing.copy(), nothing.copy(), pause > LIMITS.pause)
 
     def add(self, jumps: Bools, change: Array, allowed: float, pause: float, now: float) -> None:
-        """Add the changes [m] (M,) of the muscles `jumps` (M,), after a `pause` [s]."""
+        """Add the changes of some muscles.
+
+        Args:
+            jumps: Which muscles have changed by too much, (M,).
+            change: Changes of all lengths since the previous message [m], (M,).
+            allowed: Largest change that was legal [m].
+            pause: Time since the previous message [s].
+            now: Time of reception by a steady clock [s].
+        """
         self.last_at = now
         self.change[jumps] += change[jumps]
         self.allowed[jumps] = np.maximum(self.allowed[jumps], allowed)
@@ -85,21 +93,25 @@ class Jump:
 class PresumedRupture:
     """Recognizes a jump that the rupture of a tendon explains.
 
-    A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, its length
-    appears to jump as well. One slack tendon that has become shorter while the others pull is
-    therefore not counted as displaced, and left to the detectors of ruptures. This requires that
-    the motor can have wound in so much since the last message. If the tendon pulls again, it has
-    not ruptured: its module may have lost its length offset, so the muscle is displaced then.
+    A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, the length
+    of this tendon appears to jump as well. If a single tendon is slack and has become shorter, the
+    muscle is therefore not counted as displaced, and the detectors of ruptures decide. This
+    requires that the motor can have wound in so much since the last message. If the tendon pulls
+    again, it has not ruptured. Its module may then have lost its length offset, so the muscle is
+    displaced.
     """
 
     def __init__(self, robot: Robot) -> None:
         self._slack = LIMITS.slack_share * robot.description.tension.bias
-        self._presumed: Bools = np.zeros(robot.muscle_count, dtype=bool)  # (M,)
-        #: time since when each of these pulls again [s]; ∞ if it does not, (M,)
+        #: for which muscles a rupture is presumed, (M,)
+        self._presumed: Bools = np.zeros(robot.muscle_count, dtype=bool)
+        #: time since when each of these muscles pulls again [s], (M,); ∞ if it does not pull
         self._taut_since: Array = np.full(robot.muscle_count, math.inf)
 
     def explains(self, jump: Jump, tension: Array, used: Bools) -> bool:
-        """Return whether one tendon alone is slack and wound in, and remember it if so.
+        """Return whether a rupture explains a jump; if so, remember the muscle.
+
+        A rupture explains it if a single tendon has jumped, is slack and was wound in.
 
         Args:
             jump: The jump.
@@ -134,7 +146,7 @@ class PresumedRupture:
 class LengthJumps:
     """Detects jumps between successive messages, and waits for the new level to last.
 
-    It uses lengths as measured, so that new length offsets do not look like jumps.
+    The lengths are those measured, so that new length offsets do not look like jumps.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -193,7 +205,7 @@ class DisplacedMuscles:
     """Records muscles whose lengths have jumped since their last length calibration.
 
     Attributes:
-        muscles: These muscles; their lengths are not reliable.
+        muscles: Indices of the muscles, whose lengths are not reliable.
         jumps: Number of accepted jumps since the start.
         is_unseen: Whether the last jump was during a pause of the messages, in which the arm may
             have moved.

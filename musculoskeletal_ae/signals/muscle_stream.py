@@ -7,8 +7,8 @@
 A message that fails a check raises a `RejectionError`, which names the reason, the value and the
 legal range. Nodes, bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits.
 Values of isolated muscles are not checked. A rejected message may contain valid tensions, for
-example if only a length jumped. `RejectionError.pull` contains them, for the limiter. After a jump,
-messages are rejected until the new level has lasted (`length_jumps`).
+example if only a length jumped. `RejectionError.pull` contains these tensions for the limiter.
+After a jump, messages are rejected until the new level has lasted (`length_jumps`).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class MuscleSample:
 
     @property
     def model_tension(self) -> Array:
-        """T [N] (M,) as measured, or as models assume it where it is not known."""
+        """T [N], (M,), as measured; where T is not known, the tension that models assume."""
         tension: Array = np.where(
             np.isnan(self.motor_tension), self.bone_tension, self.motor_tension
         )
@@ -95,7 +95,7 @@ class MuscleSample:
 
     @property
     def learned_tension(self) -> Array:
-        """T_read [N] (M,), or the tension that models assume where it is not known."""
+        """T_read [N], (M,); where it is not known, the tension that models assume."""
         tension: Array = np.where(np.isnan(self.tension_read), self.bone_tension, self.tension_read)
         return tension
 
@@ -107,7 +107,7 @@ class MuscleSample:
 
 
 class MedianFilter:
-    """Median of each value over the last messages, which removes outliers."""
+    """Computes the median of each value over the last messages, to remove outliers."""
 
     def __init__(self, window: int) -> None:
         self._last: deque[Array] = deque(maxlen=window)  # states as measured, (3, M) each
@@ -125,7 +125,7 @@ class MedianFilter:
 class PlausiblePull:
     """Filtered lengths and tensions of the last messages, accepted or not.
 
-    With them, the limiter can relieve a muscle while messages are rejected.
+    With these values, the limiter can relieve a muscle while messages are rejected.
     """
 
     def __init__(self, levels: LevelCheck, window: int) -> None:
@@ -186,7 +186,7 @@ class MuscleStream:
         self._time = math.inf
 
     def use_transmission(self, transmission: Transmission) -> None:
-        """Remove friction and errors of the readings of tension from now on; at first, none."""
+        """Convert readings of tension to T and T_end by this transmission from now on."""
         if self._robot.tension_source.is_current and transmission.drive is None:
             unknown = Transmission.unknown(self._robot.description.tension.limit)
             transmission = replace(unknown, friction=transmission.friction)
@@ -241,7 +241,7 @@ class MuscleStream:
         `take` describes the times.
 
         Raises:
-            RejectionError: If they are implausible.
+            RejectionError: If the values are implausible.
         """
         now = time if now is None else now
         offsets = self.body.offsets
@@ -279,11 +279,11 @@ class MuscleStream:
         )
 
     def _judge(self, read: Array, states: Array, now: float) -> Verdict:
-        """Check the levels of all values, and the lengths for jumps.
+        """Check all values for plausible levels, and the lengths for jumps.
 
         Args:
             read: l, T_read and temperature as measured, (3, M).
-            states: The same, with the length offset removed, (3, M).
+            states: The same values with the length offset removed from l, (3, M).
             now: Time of reception by a steady clock [s].
         """
         known, used = self.body.offsets.known, self.body.used
@@ -292,5 +292,6 @@ class MuscleStream:
             return Verdict(problem)
         verdict = self._jumps.step(read[0], read[1], used, now)
         self.displaced.note(verdict)
-        # While the offsets are unknown, a jump does not make the lengths less reliable.
+        # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
+        # is no reason to reject the message.
         return verdict if known else verdict._replace(problem=None)

@@ -33,9 +33,10 @@ class LevelCheck:
         self._slack = LIMITS.slack_share * robot.description.tension.bias
 
     def plausible_pull(self, states: Array, offset: Array) -> Array:
-        """Return l [m] with `offset` [m] (M,) removed and T [N], (2, M); −∞ where implausible.
+        """Return l [m], with `offset` [m] removed, and T [N], together (2, M); −∞ if implausible.
 
-        A length may be as far beyond any posture as that of a module that lost its length offset.
+        A length may exceed its range by `slack_length_margin`, because the module may have lost its
+        length offset.
         """
         pull = states[:2].copy()
         pull[0] -= offset
@@ -48,7 +49,7 @@ class LevelCheck:
         """Return reason and detail of the first implausible value, or None.
 
         Args:
-            states: l [m], T [N] and temperature [°C] (3, M); NaN is ignored.
+            states: l [m], T [N] and temperature [°C], (3, M); NaN is ignored.
             used: Which muscles to check, (M,).
             lengths_known: Whether to check l, which requires known length offsets.
         """
@@ -68,22 +69,23 @@ class LevelCheck:
 
 
 class TemperatureCheck:
-    """Accepts a temperature only if the housing can have reached it since the last accepted one.
+    """Accepts a temperature that the housing can have reached since the last accepted temperature.
 
-    A few messages with 199 °C have no effect. A sensor that continues to read 199 °C is accepted
-    some seconds later, because a hot module must stop the arm.
+    A few messages with 199 °C have no effect. If a sensor continues to read 199 °C, the reading is
+    accepted some seconds later, because a hot module must stop the arm.
     """
 
     def __init__(self, muscle_count: int) -> None:
-        self._believed: Array = np.full(muscle_count, math.nan)  # last accepted [°C], (M,)
+        #: last accepted temperature [°C], (M,); NaN before the first
+        self._believed: Array = np.full(muscle_count, math.nan)
         self._age: Array = np.zeros(muscle_count)  # age of the last accepted temperature [s]
         self._first: Array = self._believed.copy()  # candidate for the first temperature [°C]
-        #: time for which readings have agreed with it [s]
+        #: time for which readings have agreed with `_first` [s]
         self._first_age: Array = np.zeros(muscle_count)
         self._last_at = math.nan
 
     def step(self, read: Array, now: float) -> Array:
-        """Return the accepted temperatures [°C] (M,), or NaN, after readings at `now` [s]."""
+        """Process readings at `now` [s]; return the accepted temperatures [°C], (M,), or NaN."""
         elapsed = max(now - self._last_at, 0.0) if math.isfinite(self._last_at) else 0.0
         self._last_at = now
         possible = (read >= LIMITS.lowest_temperature) & (read <= LIMITS.highest_temperature)
