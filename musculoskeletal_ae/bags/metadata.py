@@ -136,7 +136,7 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
 
 
 def read_metadata(directory: Path) -> Contents:
-    """Return the storage files that metadata.yaml names, or all files if it cannot be used."""
+    """Return the storage files that metadata.yaml names, or all if metadata.yaml is unusable."""
     try:
         metadata = convert(read_yaml(directory / FILE, _unusable), _Document)
     except ValueError as error:

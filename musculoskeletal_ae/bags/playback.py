@@ -54,7 +54,7 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 
 
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
-    """Yield the messages to publish from start to stop [ns, recorded].
+    """Yield the messages to publish between two recorded times [ns].
 
     The last latched messages before `start` come first, because a late joiner would receive them.
 
@@ -74,7 +74,7 @@ class Timeline:
     """Recorded time, which advances by `rate` seconds per second unless it is paused."""
 
     def __init__(self, start: int, rate: float, now: float) -> None:
-        """Begin at `start` [ns, recorded] when the steady clock reads `now` [s]."""
+        """Begin at the recorded time `start` [ns] when the steady clock reads `now` [s]."""
         self.paused = False
         self._rate, self._recorded, self._steady = rate, start, now
 
@@ -118,7 +118,7 @@ class TaughtMotion(NamedTuple):
 
 
 def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
-    """Return the motion on a recorded JointState topic from start to stop [ns, recorded].
+    """Return the motion on a recorded JointState topic between two recorded times [ns].
 
     Messages may name different joints; the motion is that of the most frequent set of joints.
 

@@ -132,7 +132,7 @@ class MotionTest(ABC):
             return
         theta, states, tested = map(np.array, zip(*self._history, strict=True))
         if not np.isfinite(theta).all(axis=1).any():
-            verdict.notes.append('signs of joint sensors are not checked without θ of all joints')
+            verdict.notes.append('θ of some joints is unknown, so signs of θ were not checked')
             return
         judgement = judge(robot, theta, states[:, 0], states[:, 1], segments=tested)
         for fault in judgement.faults:

@@ -96,7 +96,7 @@ class Positioning(MotionTest):
         self._target[m] += self._robot.actuation.release[m]
 
     def _mean(self) -> Array:
-        """Return mean l [m], T [N] and temperature [°C], (3, M)."""
+        """Return the mean of the last readings: l [m], T [N] and temperature [°C], (3, M)."""
         mean: Array = self._readings().mean(axis=0)
         return mean
 
@@ -138,7 +138,7 @@ class Positioning(MotionTest):
             verdict.passed('unit', m)
         if np.isnan(pulled):
             verdict.notes.append(
-                f'{self.trying}: its tension is unknown, so its sign was not checked'
+                f'{self.trying}: the tension is unknown, so the sign of l was not checked'
             )
         elif pulled < -RESPONSE[0]:
             detail = f'T fell by {-pulled:.0f} N as l fell by {1e3 * moved[m]:.1f} mm'

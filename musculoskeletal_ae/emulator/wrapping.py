@@ -38,7 +38,7 @@ class Tree(NamedTuple):
 
 
 class WrappedRoutes(NamedTuple):
-    """True routes: points on joints of the tree, and segments between them."""
+    """True routes: points, each fixed to a joint of the tree, and segments between points."""
 
     tree: Tree
     point_joint: Ints  # tree joint that carries each point, (P,)

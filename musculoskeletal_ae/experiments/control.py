@@ -128,7 +128,7 @@ def measure(study: Study, seed: int) -> Measured:
         common, held = offset.mean(axis=1, keepdims=True), np.isfinite(there)
         numbers[name] = {
             'error_rad': float(errors[name].mean()),
-            # Distance from the mean of each θ_eval: the scatter by hysteresis (paper, §IV-C).
+            # Variance over the starts at each θ_eval: the scatter by hysteresis (paper, §IV-C).
             'error_var': float(errors[name].var(axis=1).mean()),
             # The mean offset of all starts is the model's error; the scatter is hysteresis.
             'common_rad': float(np.linalg.norm(common, axis=-1).mean()),

@@ -79,7 +79,7 @@ def read_source(file: Path) -> Source:
         root = ET.Element('mujoco')
     if root.tag not in READERS:
         problem = f'the root element {root.tag[:60]!r} is unknown; legal: {", ".join(READERS)}'
-        raise refuse(file, f'{problem}; an SDF is read beside its cardsflow.xml')
+        raise refuse(file, f'{problem}; for an SDF, name the cardsflow.xml in its directory')
     if any('/xacro}' in element.tag for element in root.iter()):
         raise refuse(file, 'this is a xacro, not a URDF; expand it first:  xacro FILE > arm.urdf')
     try:

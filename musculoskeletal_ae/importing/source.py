@@ -342,7 +342,7 @@ def cut(
         source.note('chosen', STRENGTH)
     if count := sum(not source.strength.get(name) for name in source.routes):
         source.note(
-            'chosen', f'tension of {count} muscles: the defaults, because the source has none'
+            'chosen', f'tension of {count} muscles: the defaults, because the source states none'
         )
     if is_chosen:
         _choose_end(source)

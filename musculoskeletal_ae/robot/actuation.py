@@ -314,7 +314,7 @@ class StiffnessControl(Actuation):
         return depth
 
     def usable_lead(self, lead: Array | float) -> Array | float:
-        """Return the whole lead, because the motor needs K_stiff λ dl/dt of the demand to turn."""
+        """Return the whole lead, because a module winds in only while its demand exceeds T."""
         return lead
 
     def recovered(self, shortest: Array, dt: float) -> Array:  # noqa: ARG002

@@ -367,7 +367,7 @@ def _read_joint_elasticity(
         for other, value in entry.coupled.items():
             j = index(f'{place}.coupled', other)
             if i == j:
-                problem = f'{other!r} is the joint itself; give its own stiffness as stiffness'
+                problem = f'{other!r} is the joint itself; state its own stiffness as `stiffness`'
                 raise fail(f'{place}.coupled: {problem}')
             if stiffness[i, j]:
                 problem = f'{entry.joint!r} and {other!r} are coupled twice; remove one entry'

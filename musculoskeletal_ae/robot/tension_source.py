@@ -58,7 +58,7 @@ class TensionSource:
         return tension if self.is_known else np.full_like(tension, np.nan)
 
     def measured(self, rows: Array) -> Array:
-        """Return the measured rows of (l, T_read), (2, ...): both, or only l if T is unknown."""
+        """Return both `rows` (2, ...), l and T_read, or only the row l if T is unknown."""
         return rows if self.is_known else rows[:1]
 
     def to_message(self, tension: Array) -> Array:

@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     text = (
         f'{", ".join(NAMES)}; several, separated by commas; all; '
-        'or paper, for all that repeat the paper'
+        'or paper, for all experiments that repeat the paper'
     )
     parser.add_argument('names', metavar='NAME', type=_names, help=text)
     parser.add_robot()
