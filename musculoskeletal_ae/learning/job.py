@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The job and the result of an update, which also pass between processes."""
+"""The inputs and the result of an update; the node exchanges them with its training process."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ class Job(NamedTuple):
 
     observed: Observations  # the samples, oldest first
     healthy: Healthy  # messages of the healthy arm
-    statistics_hold: bool  # whether the statistics so far are valid for the present arm
+    statistics_hold: bool  # whether the detector's statistics are valid for the present arm
     steps: int  # number of training steps
     isolated: tuple[int, ...] = ()  # muscles that the messages do not describe
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common parts of the training of all presets, on the geometric model of a robot.
 
-They are random states of the geometric model, mini-batches, the choice of the torch device, and the
-errors on held-out states. `default_training.py` contains the training of preset `default`, and
-`initial_training.py` applies the training of the chosen preset.
+The parts are random states of the geometric model, mini-batches, the choice of the torch device,
+and the errors on held-out states. `default_training.py` contains the training of preset `default`,
+and `initial_training.py` runs the training of the chosen preset.
 """
 
 from collections.abc import Callable, Iterator

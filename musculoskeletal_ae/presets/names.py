@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The names of all presets, for options, parameters and files that only name one.
 
-`registry.py` has the presets themselves.
+`registry.py` contains the presets themselves.
 """
 
 DEFAULT = 'default'

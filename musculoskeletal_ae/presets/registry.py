@@ -11,7 +11,7 @@ from musculoskeletal_ae.presets.names import PRESET_NAMES
 from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.preset import Preset
 
-#: in the order of `PRESET_NAMES`
+#: presets by name; the instances are in the order of `PRESET_NAMES`
 PRESETS: dict[str, Preset] = dict(zip(PRESET_NAMES, (DefaultPreset(), PaperPreset()), strict=True))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of the equations that a preset simulates (`Preset.make_simulator`)."""
+"""The interface of a simulator, which contains the equations of a preset."""
 
 from typing import Any, Protocol
 
@@ -9,7 +9,7 @@ from musculoskeletal_ae.simulation.equilibrium import ArmState
 
 
 class SimulatedBody(Protocol):
-    """Steps N simulated arms of one robot."""
+    """Steps N simulated arms of one robot; `Preset.make_simulator` returns an instance."""
 
     def use(self, mae: Any, robot: Robot) -> None:
         """Set the network, and the robot with the currently isolated muscles."""
