@@ -50,7 +50,7 @@ class BodyFit:
     def is_of_another_arm(self, observed: Observations) -> bool:
         """Return whether samples contradict the body that was fitted to the network.
 
-        The check runs once, as soon as there are enough samples; otherwise this returns False.
+        The check runs once, as soon as there are enough samples. All other calls return False.
         """
         observed = observed.with_all_angles()
         if self._prior_mean is None or self._is_prior_confirmed or len(observed) < LEAST_NEWEST:

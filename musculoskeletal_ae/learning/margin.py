@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excludes messages shortly before and after an anomaly from learning.
 
-An anomaly is detected late, so messages within `MARGIN` before the detection may already be wrong.
-Every message is therefore held back for that time. After the reset of an anomaly, messages are
-ignored for another `MARGIN`.
+An anomaly is detected late, so messages of the last `MARGIN` seconds before the detection may
+already be wrong. Every message is therefore held back for `MARGIN` seconds. After the reset of an
+anomaly, messages are ignored for the same time.
 """
 
 from collections import deque

@@ -19,7 +19,7 @@ HELD_OUT_STATES = 5000  # held-out states of the geometric model for the first a
 class Trained(NamedTuple):
     """Result of `initial_mae`."""
 
-    mae: Mae  # ready for a checkpoint
+    mae: Mae  # the network with its history and anomaly statistics
     losses: list[float]  # loss of every mini-batch
 
 

@@ -80,7 +80,10 @@ class DefaultPreset:
         return ResidualDistance(robot, settings, slack), [slack, jammed]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return the paper's methods except `proposed`, which follows trajectories here."""
+        """Return the paper's methods except `proposed`.
+
+        In this preset, `proposed` is not a length method, because it follows trajectories.
+        """
         from musculoskeletal_ae.paper.control import METHODS
 
         return {name: method for name, method in METHODS.items() if name != 'proposed'}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The names of all presets, for options, parameters and files that only name one.
+"""The names of all presets, for options, parameters and checks of files.
 
-`registry.py` contains the presets themselves.
+These need no preset itself. `registry.py` contains the presets.
 """
 
 DEFAULT = 'default'
