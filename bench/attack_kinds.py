@@ -29,7 +29,7 @@ from musculoskeletal_ae.remedy import STEPS, Step
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # duration of an attack [s]
-REPORT_TIME = 2.0  # time from the begin of a problem until the status line must report it [s]
+REPORT_TIME = 2.0  # longest time from the start of a problem to its report in the status line [s]
 OFFSET = 0.08  # absolute value of false length offsets [m]
 
 

@@ -41,7 +41,7 @@ BACKGROUND = 'Ctrl-C ends it'
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
 START_PATIENCE = 1800  # longest wait for the first status line, installation included [s]
 COMMAND_PATIENCE = 900  # longest duration of all commands of a page after that [s]
-#: longest duration of a `ros2` command [s]; it would wait for a system that has ended forever
+#: longest duration of a `ros2` command [s]; if the system has ended, the command would never end
 ANSWER_PATIENCE = 300
 NAME = 'musculoskeletal_ae'
 INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'

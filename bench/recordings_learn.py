@@ -197,7 +197,7 @@ def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float
 
 
 def bend_gain(run: Run, azimuths: Array) -> float:
-    """Return the slope of the bend at rest over the commanded bend, a tendon length [rad/m]."""
+    """Return how far the link bends at rest [rad] per tendon length commanded to bend it [m]."""
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound = -rest.length @ out
@@ -206,7 +206,7 @@ def bend_gain(run: Run, azimuths: Array) -> float:
 
 
 def effort_slope(run: Run, azimuths: Array) -> float:
-    """Return the slope of efforts at rest over the commanded bend, a tendon length [effort/m]."""
+    """Return by how much the efforts at rest rise per tendon length commanded to bend it [m]."""
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound, effort = -rest.length @ out, rest.effort @ out
