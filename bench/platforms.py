@@ -4,6 +4,7 @@
 python -m bench platforms                          # all of them
 python -m bench platforms wheels-3.13 sourced      # some
 python -m bench platforms --node wheels-3.12       # without torch: the core and one node
+python -m bench platforms rclpy-7.1.11             # needs git access to GitHub, and a C++ compiler
 
 Each platform has a clean clone of the committed state in a separate folder, where ./bringup.sh
 installs the dependencies. The clone is deleted when its platform has passed.
@@ -53,6 +54,10 @@ TESTS = (
     'test/nodes/test_follow_joint_trajectory.py',
     'test/test_pinocchio_wheel.py',
 )
+#: tests of the platforms that differ in rclpy only
+NODE_TESTS = ('test/nodes',)
+#: commands that install the dependencies of the tests, as ./test.sh does
+SET_UP = ('repository=$PWD', '. .ci/environment.sh', 'environment_setup test')
 KEPT = ('LANG', 'PATH', 'ROS_DOMAIN_ID', 'TERM', 'TMPDIR')
 KEPT_PREFIXES = ('PIP_', 'SSL_', 'http', 'https', 'no_proxy', 'GIT_CONFIG')
 
@@ -234,19 +239,39 @@ def _debian_13(site: Site) -> None:
     site.setup = ['export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin']
 
 
+def _rclpy(version: str) -> Callable[[Site], None]:
+    """Return a function that replaces rclpy in the wheels, with Python 3.12 as on Ubuntu 24.04.
+
+    tf2_msgs and control_msgs, which the wheels lack, are built as well.
+    """
+
+    def make(site: Site) -> None:
+        _wheels('3.12')(site)
+        site.run('dependencies', *SET_UP, on_platform=True)
+        packages = f'rclpy=={version} tf2_msgs control_msgs'
+        site.run(
+            f'{packages} from source',
+            f'.venv/bin/python -m bench ros_sources {packages}',
+            on_platform=True,
+        )
+
+    return make
+
+
 PLATFORMS: dict[str, Callable[[Site], None]] = {
     **{f'wheels-{version}': _wheels(version) for version in ('3.10', '3.11', '3.12', '3.13')},
     'sourced': _sourced,
     'sourced-pinocchio': _sourced_with_pinocchio,
     'debian-13': _debian_13,
+    **{f'rclpy-{version}': _rclpy(version) for version in ('7.1.1', '7.1.11')},
 }
-CHROOTS = ('debian-13',)
+WITH_NODE = tuple(name for name in PLATFORMS if name.startswith(('wheels-', 'sourced')))
 
 
 # --- checks --------------------------------------------------------------------------------------
 
 
-def check_system(name: str, folder: Path, tests: tuple[str, ...] = TESTS) -> str:
+def check_system(name: str, folder: Path, tests: tuple[str, ...]) -> str:
     """Create a platform in an empty folder; return one line about bring-up and tests."""
     site = Site(folder)
     site.run('cloning', f'git clone -q {shlex.quote(str(ROOT))} clone')
@@ -257,9 +282,7 @@ def check_system(name: str, folder: Path, tests: tuple[str, ...] = TESTS) -> str
         raise MusculoskeletalError(f'bringup.sh printed no estimate; see {site.log}')
     output = site.run(
         'tests',
-        'repository=$PWD',
-        '. .ci/environment.sh',
-        'environment_setup test',
+        *SET_UP,
         'use_udp',
         'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST OMP_NUM_THREADS=1',
         f'"$python" -m pytest -q -p no:cacheprovider {" ".join(tests)}',
@@ -315,15 +338,16 @@ def _options(argv: list[str]) -> argparse.Namespace:
     )  # fmt: skip
     parser.add_argument('--folder', type=Path, help='working folder (default: a temporary one)')
     parser.add_argument(
-        '--tests', nargs='+', default=TESTS, metavar='TEST', help='tests for pytest'
-    )
+        '--tests', nargs='+', metavar='TEST',
+        help='tests for pytest (default: those that depend on the platform)',
+    )  # fmt: skip
     options = parser.parse_args(argv)
     for name in options.names:
         if name not in PLATFORMS:
             parser.error(f'unknown platform {name!r}; legal: {", ".join(PLATFORMS)}')
-        if options.node and name in CHROOTS:
+        if options.node and name not in WITH_NODE:
             parser.error(
-                f'platform {name!r} is a chroot, which --node does not support; remove --node'
+                f'--node does not support platform {name!r}; legal: {", ".join(WITH_NODE)}'
             )
     return options
 
@@ -331,7 +355,7 @@ def _options(argv: list[str]) -> argparse.Namespace:
 def main(argv: list[str]) -> int:
     """Check platforms one after another; exit status 1 if one fails."""
     options = _options(argv)
-    names = options.names or [n for n in PLATFORMS if not options.node or n not in CHROOTS]
+    names = options.names or (WITH_NODE if options.node else tuple(PLATFORMS))
     rows, failed = [], 0
     for name in names:
         print(f'-- {name}', flush=True)
@@ -341,7 +365,8 @@ def main(argv: list[str]) -> int:
             if options.node:
                 outcome = check_node(name, folder, options.node.resolve())
             else:
-                outcome = check_system(name, folder, tuple(options.tests))
+                tests = NODE_TESTS if name.startswith('rclpy-') else TESTS
+                outcome = check_system(name, folder, tuple(options.tests or tests))
         except MusculoskeletalError as error:
             print(error, file=sys.stderr)
             failed += 1

@@ -87,8 +87,8 @@ class Frames:
             from tf2_msgs.msg import TFMessage
         except ImportError as error:
             raise MusculoskeletalError(
-                'parameter publish_tf: tf2_msgs is not installed; source ROS 2 Jazzy, or set it to '
-                '"none"'
+                'parameter publish_tf: tf2_msgs is not installed; install it as described in '
+                'doc/howto/install.md, or set the parameter to "none"'
             ) from error
         self._node, self._message = node, TFMessage
         self._prefix: str = node.parameter('frame_prefix')

@@ -90,8 +90,8 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'publish_tf': Parameter(
             'none',
-            'source of the joint angles for link poses on /tf; requires tf2_msgs, which is part of '
-            'an installed ROS 2 Jazzy',
+            'source of the joint angles for link poses on /tf; requires tf2_msgs '
+            '(doc/howto/install.md)',
             legal=('none', 'estimate', 'sensor'),
         ),
     },
