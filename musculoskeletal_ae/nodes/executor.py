@@ -44,7 +44,7 @@ TESTED = (7, 1, 1), (7, 1, 11)
 EVENTS_SINCE = (7, 1, 11)
 #: undocumented attributes of SingleThreadedExecutor that LeanExecutor uses
 PRIVATE_NAMES = (
-    '_guard', '_is_shutdown', '_tasks',
+    '_guard', '_is_shutdown',
     '_take_client', '_take_service', '_take_subscription', '_take_timer',
 )  # fmt: skip
 FULL_ROUND_PERIOD = 1.0  # longest time between two full rounds (see `LeanExecutor`) [s]
@@ -75,6 +75,11 @@ class LeanExecutor(SingleThreadedExecutor):
         self._handles = ExitStack()  # keeps entities of the wait set alive
         self._next_full_round = 0.0  # time of the next full round on the monotonic clock [s]
 
+    def spin(self) -> None:
+        """Run callbacks until shutdown, with this class's `spin_once` in every version of rclpy."""
+        while self.context.ok() and not self._is_shutdown:
+            self.spin_once()
+
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Wait until a callback is ready, then run all ready callbacks.
 
@@ -103,7 +108,9 @@ class LeanExecutor(SingleThreadedExecutor):
                 if entity.handle.pointer in ready:
                     self._run(entity, group.take)
         is_due = time.monotonic() >= self._next_full_round
-        if (is_changed or has_action or is_due or self._tasks) and not self._is_shutdown:
+        # Up to rclpy 7.1.8, tasks that await a future must be polled.
+        is_awaiting = bool(getattr(self, '_tasks', ()))
+        if (is_changed or has_action or is_due or is_awaiting) and not self._is_shutdown:
             self._run_full_round()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:

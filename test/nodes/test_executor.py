@@ -119,6 +119,17 @@ def test_a_tested_rclpy_gets_ours(context, version, numbers):
     chosen.shutdown()
 
 
+def test_spin_runs_lean_rounds_with_every_rclpy(context, monkeypatch):
+    def raise_error(_self, _timeout_sec=None):
+        raise ValueError('lean round')
+
+    monkeypatch.setattr(executor.LeanExecutor, 'spin_once', raise_error)
+    lean = executor.LeanExecutor(context=context)
+    with pytest.raises(ValueError, match='lean round'):
+        lean.spin()
+    lean.shutdown()
+
+
 def test_an_rclpy_without_a_name_that_ours_needs_gets_its_own(context, version, monkeypatch):
     version(7, 1, 6)
     monkeypatch.setattr(executor, 'PRIVATE_NAMES', ('_take_nothing',))
