@@ -26,7 +26,11 @@ class AwakeClock:
     """
 
     def __init__(self, longest: float) -> None:
-        """Count at most `longest` [s] between two ticks, which must usually be less far apart."""
+        """Count at most `longest` [s] of the time between two ticks.
+
+        Args:
+            longest: Longer than the usual time between two ticks [s].
+        """
         self._longest = longest
         self._ticked_at = math.inf  # steady time of the last tick [s]
         self._paused = 0.0  # total duration of the pauses until the last tick [s]

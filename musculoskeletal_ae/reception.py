@@ -138,7 +138,7 @@ class Reception:
         return self.reject(source, kind, f'{kind}: {printable(error)}')
 
     def take_rates(self) -> dict[str, float]:
-        """Return the rate of used messages since the last call [Hz], by topic.
+        """Return the rate [Hz] of messages that were used since the last call, by topic.
 
         A topic of which a message was ever used stays in the result.
         """

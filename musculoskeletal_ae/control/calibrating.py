@@ -24,7 +24,7 @@ SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limi
 
 
 def gentle_limit(robot: Robot) -> Array:
-    """Return the tension limit while the length offsets are unknown [N], (M,)."""
+    """Return the tension limit [N], (M,), that applies while the length offsets are unknown."""
     return robot.tension.bias + SHARE * (robot.tension.limit - robot.tension.bias)
 
 

@@ -28,7 +28,7 @@ class Command(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """Tensions of the muscles [N], (M,) each."""
+    """Tensions [N] of the muscles, (M,) each."""
 
     motor: Array  # motor-side tension T, as measured
     bone: Array  # bone-side tension T_end, after tendon friction

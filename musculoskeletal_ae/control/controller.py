@@ -132,7 +132,7 @@ class Activities:
         self.entered = None
 
     def step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        """Switch to an activity if it is not the present one, and return its command."""
+        """Switch to an activity if it is not active yet, and return its command."""
         if control is not self.entered:
             if self.entered is not None:
                 self.entered.leave()
@@ -442,7 +442,7 @@ class Controller:
         self._follow(self.planner.by_twist(mae, start, twist))
 
     def explore(self, wanted: bool) -> str:
-        """Start or end the exploration; return why it is refused, or ''."""
+        """Start or end the exploration; return the reason if this is refused, else ''."""
         condition = self.supervisor.condition
         if wanted and condition is not None:
             return f'stopped: {condition}'

@@ -71,7 +71,7 @@ class Exploring(ActivityControl):
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque that the muscles cannot exert at the present goal [N·m], (D,)."""
+        """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
         return self.ramps.missing_torque
 
     @property

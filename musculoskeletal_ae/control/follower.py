@@ -134,7 +134,7 @@ class Follower(ActivityControl):
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque that no tensions within their limits provide [N·m], (D,)."""
+        """Torque [N·m], (D,), that no tensions within their limits provide."""
         return None if self.progress.trajectory is None else self.plan.tension.missing_torque
 
     # -- the activity ---------------------------------------------------------------------------

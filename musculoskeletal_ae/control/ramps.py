@@ -105,7 +105,7 @@ class LengthRamps:
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque that the muscles cannot exert at the present goal [N·m], (D,)."""
+        """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
         return None if self.solution is None else self.solution.missing_torque
 
     def is_over_after(self, dt: float) -> bool:
@@ -184,7 +184,7 @@ class RampedTarget(ActivityControl):
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the posture [rad], (D,), and the torque in addition to gravity compensation [N·m]."""
+        """Set the posture [rad], (D,), and a torque [N·m], (D,), added to gravity compensation."""
         self._target = theta, effort
         self.ramps.pursue(self._goals())
 
@@ -202,7 +202,7 @@ class RampedTarget(ActivityControl):
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque that the muscles cannot exert at the present goal [N·m], (D,)."""
+        """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
         return self.ramps.missing_torque
 
     def _goals(self) -> list[Goal]:

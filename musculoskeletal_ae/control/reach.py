@@ -163,11 +163,11 @@ class Limits:
         return np.minimum(self._low + resistance, self._high) / loss, self._high / loss
 
     def missing_in_motion(self, jacobian: Array, at: Setpoint, lag: float, slower: float) -> float:
-        """Return the largest missing torque of a motion [N·m].
+        """Return the largest missing torque [N·m] at one moment of a motion.
 
         Args:
             jacobian: G [m/rad], (M, D).
-            at: One moment of the motion.
+            at: The moment of the motion.
             lag: λ of the muscle modules [s].
             slower: Factor by which the motion is slowed; ∞ for a very slow motion.
         """
@@ -222,7 +222,7 @@ class PathCost:
         return np.vstack([-joints[is_low], joints[is_high]])
 
     def of_edge(self, one: Array, other: Array) -> float:
-        """Return the cost of the straight path from one posture to another [rad], (D,) each."""
+        """Return the cost of the straight path between two postures θ [rad], (D,) each."""
         length = float(np.linalg.norm((other - one) / self._radian))
         shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
         m = self.missing(one + shares * (other - one), other - one)

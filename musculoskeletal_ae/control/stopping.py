@@ -5,7 +5,7 @@ The last command is held for `hold_time`, except after an overload. Then lengths
 rate limit until muscle stiffness control demands only T_bias. Tension commands fall to T_bias at
 K_stiff times the rate limit.
 
-Position-controlled modules hold no tension of their own. Each is paid out until its measured
+Position-controlled modules hold no tension of their own. Each tendon is paid out until its measured
 tension is T_bias, and then stays: a tendon that no weight loads is not paid out further, and an arm
 that its muscles carry is let down slowly. A muscle whose tension is not known is paid out by
 `Actuation.release`, counted from the start of the release.

@@ -50,7 +50,7 @@ class TorqueControl(ActivityControl):
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the posture [rad], (D,), and the torque in addition to gravity compensation [N·m]."""
+        """Set the posture [rad], (D,), and a torque [N·m], (D,), added to gravity compensation."""
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:
@@ -69,7 +69,7 @@ class TorqueControl(ActivityControl):
 
     @property
     def missing_torque(self) -> Array:
-        """Torque that the tensions of the last step do not provide [N·m], (D,)."""
+        """Torque [N·m], (D,), that the tensions of the last step do not provide."""
         return self._missing_torque
 
     def _command_towards(self, target: Array, effort: Array, inputs: Inputs) -> Command:
@@ -94,7 +94,7 @@ class TorqueControl(ActivityControl):
         return Command(TENSION, self._command.copy())
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        """Return the feedback torque from posture and velocity [N·m], (D,)."""
+        """Return the feedback torque [N·m], (D,), from posture and velocity."""
         chosen, radian = self._settings, self._robot.kinematics.radian
         torque = chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
         return torque / radian**2
