@@ -56,7 +56,7 @@ class ActivityControl(ABC):
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque [N·m], (D,), that the muscles cannot exert at the target; None if it is unknown."""
+        """Torque [N·m], (D,), that the muscles cannot exert at the target; None if unknown."""
         return None
 
     @property
