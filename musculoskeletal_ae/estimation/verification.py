@@ -140,7 +140,7 @@ class ModuleLaw:
         return row.likely - row.length
 
     def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
-        """Return T_ref [N]; `is_reference` is true until the suspect is wound in."""
+        """Return T_ref [N]; `is_reference` states that the suspect has not been wound in yet."""
         return self.bias + max(0.0, self._stiffness * (row.length - row.command))
 
 
@@ -160,7 +160,7 @@ class PositionLaw(ModuleLaw):
         return row.likely - row.length + self._elongation(row.tension)
 
     def demand(self, row: _Reading, is_reference: bool) -> float:
-        """Return T_ref [N]; while `is_reference` is true, also store x_0 and T_0."""
+        """Return T_ref [N]; if `is_reference` is true, first store x and T as x_0 and T_0."""
         stretch = self.stretch(row)
         if is_reference:  # for a slack tendon, x_0 − L_e(T_0) is unknown and assumed to be 0
             is_slack = row.tension < LIMITS.slack_share * self.bias
