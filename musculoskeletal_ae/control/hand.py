@@ -7,7 +7,7 @@ and holdable with the learned G; otherwise the pose is refused. With `unreachabl
 moves as close to the pose as the joint limits and the muscles allow.
 
 The hand moves to a single pose at `hand_speed`. Poses in quick succession form a path, which the
-hand follows at the speed at which they arrive. Each pose is reached when the next one is due, and
+hand follows at the speed at which they arrive. A pose is reached when the next pose is due, and
 the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT.
 """
 

@@ -2,9 +2,9 @@
 """Ramps of muscle lengths, by which exploration and some control methods reach a posture.
 
 These methods have one length command for each posture; the preset lists them
-(`Preset.length_methods`). A target becomes one or two goals, because `second` runs `first` before
-it. Each goal is approached by a ramp and then held. A ramp starts from the present command, so that
-the command does not jump:
+(`Preset.length_methods`). A target becomes one goal, or two goals with the method `second`, which
+is preceded by `first`. Each goal is approached by a ramp and then held. A ramp starts from the
+present command, so that the command does not jump:
 
     c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
 

@@ -76,7 +76,7 @@ class StopMemory:
             self.found = Condition(self._written, BEFORE)
 
     def note(self, stop: Condition | None) -> None:
-        """Keep the present latched stop; None while the arm may move.
+        """Keep the present latched stop; `stop` is None while no stop is latched.
 
         If writing fails, `problem` says so, and a later call tries again.
         """

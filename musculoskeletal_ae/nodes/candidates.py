@@ -5,8 +5,8 @@
 
 Candidates arrive on the topic `mae_checkpoint`, or from the file that the parameter `checkpoint`
 names. The estimator uses an accepted network and publishes it latched. If an anomaly is detected
-soon after a network was accepted, the estimator returns to the previous network and publishes that
-again. No other node validates the candidates of the learner.
+soon after a network was accepted, the estimator returns to the previous network and publishes the
+previous network again. No other node validates the candidates of the learner.
 """
 
 import time
@@ -55,7 +55,7 @@ class Candidates:
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def on_anomaly(self, detected: bool) -> None:
-        """Handle the begin or the end of an anomaly.
+        """Handle the beginning or the end of an anomaly.
 
         A network that was accepted shortly before the anomaly may be its cause, and is replaced by
         the previous network.

@@ -228,7 +228,7 @@ def check_names(names: Iterable[str], node: str = '') -> None:
 
 
 def motor_settings(files: Iterable[Path]) -> MotorSettings:
-    """Return the motor parameters in ROS parameter files, which tools read without being nodes.
+    """Return the motor parameters in ROS parameter files, for tools that have no ROS parameters.
 
     Args:
         files: The files; values in later files replace those in earlier ones.

@@ -72,7 +72,7 @@ class Transmission:
     def unknown(cls, limit: Array) -> Transmission:
         """Return the transmission of motor currents before anything is learned.
 
-        F is assumed to be 0, and its prior mean is added to its uncertainty.
+        F is assumed to be 0, and the prior mean of F is added to the uncertainty of F.
 
         Args:
             limit: T_limit [N], (M,).

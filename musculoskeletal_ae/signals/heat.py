@@ -14,9 +14,9 @@ the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a. P
 change slowly. The ratio r = R₁/R₂ cannot be estimated (doc/explanation/control_and_safety.md).
 
 The highest permitted tension of a muscle is the tension that brings the winding to the temperature
-limit if it is held for a certain time. If an estimated constant departs from the value at which it
-was first known, the module has changed: its motor drags, its housing is covered, or its tension
-sensor is faulty.
+limit when this tension is held for a certain time. If an estimated constant departs from its first
+known value, the module has changed: its motor drags, its housing is covered, or its tension sensor
+is faulty.
 """
 
 import numpy as np
