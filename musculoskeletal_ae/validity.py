@@ -221,7 +221,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def _six(first: Any, second: Any, most: Array, what: str) -> Array:
-    """Return two vectors as one, (6,); check that all values are finite and within ±`most`, (6,)."""
+    """Return two vectors as one, (6,); check that it is finite and within ±`most`, (6,)."""
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
         raise MessageError('not finite', what)
