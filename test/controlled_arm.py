@@ -77,6 +77,10 @@ class ControlledArm:
             JointState(name=self.robot.joints, position=list(theta), effort=list(effort))
         )
 
+    def count(self, kind='length'):
+        """Return the number of commands of a kind so far."""
+        return len(self.graph.received[f'muscle_{kind}_command'])
+
     def sent(self, kind='length'):
         """Return all commands of a kind so far."""
         messages = self.graph.received[f'muscle_{kind}_command']

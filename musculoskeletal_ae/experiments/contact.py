@@ -29,6 +29,8 @@ PUSH = 1.5  # duration of a push at rest [s]
 EVALUATED = 0.5  # duration of the last part of a push, over which estimates are averaged [s]
 APART = 3.0  # longest time between collisions [s]
 FLOATING = 30.0  # duration of the drift test [s]
+QUICK_FLOATING = 5.0  # its duration in a shortened run [s]
+QUICK_SHARE = 0.001  # share of everything else that a shortened run measures; at least once
 MOVED = 1.0  # duration of a collision, and of guiding the hand [s]
 SOON = 0.1  # a collision should be detected within this time [s]
 INSIDE = 0.1  # distance of postures from the joint limits, relative to the joint ranges
@@ -72,7 +74,7 @@ class ContactLoop(ClosedLoop):
 def measure(study: Study, seed: int) -> Measured:
     """Push a learned individual at rest, in motion and under gravity compensation."""
     robot, rng = study.robot, np.random.default_rng([seed, CONTACT_STREAM])
-    settings, share = Settings(first_duration=2.0), 0.005 if study.quick else 1.0
+    settings, share = Settings(first_duration=2.0), QUICK_SHARE if study.quick else 1.0
     loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed)
 
     def count(whole: float) -> int:
@@ -200,7 +202,8 @@ def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[f
     loop.core.configure(replace(settings, method='float'))
     loop.wait(MOVED)
     start, drift = arm.theta, 0.0
-    for _ in range(round(FLOATING / SAMPLE_TIME)):
+    floating = QUICK_FLOATING if study.quick else FLOATING
+    for _ in range(round(floating / SAMPLE_TIME)):
         loop.step()
         drift = max(drift, float(np.abs(arm.theta - start).max()))
     before = arm.hand.translation.copy()

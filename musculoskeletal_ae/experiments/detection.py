@@ -38,34 +38,56 @@ LONGEST_WAIT = 5.0
 
 
 class GraspAndRupture:
-    """Script of the experiment (paper, §IV-B): grasp midway, then rupture every muscle in turn.
+    """Script of the experiment (paper, §IV-B): grasp midway, then rupture one muscle after another.
 
     A muscle ruptures as soon as it carries tension after a random wait. If it carries none until
     LATEST_RUPTURE, it ruptures then, and `carried` is False. With `switched_off`, the tendons stay
     intact, and the modules are commanded zero tension instead.
+
+    Attributes:
+        order: The muscles that rupture, in the order of their ruptures.
     """
 
     def __init__(
-        self, robot: Robot, duration: float, seed: int, switched_off: bool = False
+        self,
+        robot: Robot,
+        duration: float,
+        seed: int,
+        switched_off: bool = False,
+        most: int | None = None,
     ) -> None:
-        """Plan a motion of `duration` [s], and the ruptures that follow it."""
+        """Plan a motion, and the ruptures that follow it.
+
+        Args:
+            robot: The robot.
+            duration: Duration of the motion [s].
+            seed: Random seed of the waits before the ruptures.
+            switched_off: Whether muscles are switched off instead of ruptured.
+            most: Largest number of muscles to rupture; None for all of them.
+        """
         count, self._switched_off = robot.muscle_count, switched_off
         self.grasp, self._motion = 0.5 * duration, duration  # [s]
-        self.duration = duration + SLOT * count  # duration of the whole script [s]
         # Rows of the motion without the payload, and with the payload before the first rupture.
         self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
         # Start with the second muscle, which the paper deactivates.
-        self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))]
-        self.rupture = np.full(count, np.nan)  # time of each muscle's rupture [s], (M,)
+        self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))][:most]
+        self.duration = duration + SLOT * len(self.order)  # duration of the whole script [s]
+        #: time of each muscle's rupture [s], (M,); NaN for muscles that do not rupture
+        self.rupture = np.full(count, np.nan)
         #: whether each muscle carried tension when it ruptured, (M,)
         self.carried: Bools = np.zeros(count, dtype=bool)
         self._robot = robot
         self._wait = np.random.default_rng([seed, 0xC7]).uniform(0.0, LONGEST_WAIT, count)
 
     @property
-    def counted(self) -> Ints:
-        """The muscles that carried tension when they ruptured, or all muscles if none did."""
-        return np.flatnonzero(self.carried if self.carried.any() else ~self.carried)
+    def muscles(self) -> list[int]:
+        """The muscles that rupture, in the order of the robot."""
+        return sorted(self.order)
+
+    @property
+    def counted(self) -> list[int]:
+        """Those of `muscles` that carried tension when they ruptured, or all if none did."""
+        return [m for m in self.muscles if self.carried[m]] or self.muscles
 
     def while_ruptured(self, muscle: int) -> slice:
         """Return the messages during which a muscle was ruptured and had no tension left."""
@@ -75,7 +97,7 @@ class GraspAndRupture:
     def disturbed(self, count: int) -> Bools:
         """Return a mask of `count` messages: whether a muscle is ruptured or the arm recovers."""
         disturbed = np.zeros(count, dtype=bool)
-        for start in self.rupture.tolist():
+        for start in self.rupture[self.order].tolist():
             disturbed[rows_between(start, start + RUPTURE_TIME + RECOVERY)] = True
         return disturbed
 
@@ -162,7 +184,8 @@ def detection(
     named, detected = np.zeros((2, len(plan.rupture)), dtype=bool)
     starts = alarm_starts(faulty.alarm)
     false = alarm_starts(faulty.alarm & ~plan.disturbed(len(faulty.alarm)))
-    for muscle, rupture in enumerate(plan.rupture.tolist()):
+    for muscle in plan.muscles:
+        rupture = float(plan.rupture[muscle])
         rows = rows_between(rupture, rupture + RUPTURE_TIME)
         detected[muscle] = starts[rows].any()
         if detected[muscle]:
@@ -186,8 +209,8 @@ def detection(
         'named_share': float(named[counted].mean()),
         'counted_cuts': len(counted),
         'cuts': {
-            name: {key: values[m].item() for key, values in by_muscle.items()}
-            for m, name in enumerate(robot.muscles)
+            robot.muscles[m]: {key: values[m].item() for key, values in by_muscle.items()}
+            for m in plan.muscles
         },
         'false_alarms': int(alarm_starts(healthy.alarm).sum()),
         'false_alarms_beside_cuts': int(false.sum()),
@@ -203,8 +226,8 @@ def anomaly_levels(
 ) -> dict[str, Any]:
     """Return the largest A and d of healthy messages, and the smallest levels of ruptures.
 
-    The level of a rupture is the median over the messages from rupture to mending. `fault` is the
-    name of the fault in the keys.
+    The level of a rupture is the median over the messages from rupture to mending. The levels have
+    the order of `plan.muscles`. `fault` is the name of the fault in the keys.
     """
     numbers: dict[str, Any] = {}
     for when, prefix in (('before', '_before'), ('after', '')):
@@ -212,14 +235,14 @@ def anomaly_levels(
             values = getattr(faulty_outputs[when], name)
             before_faults = values[plan.free], values[plan.loaded]
             healthy = np.concatenate([*before_faults, getattr(healthy_outputs[when], name)])
-            ruptures = [values[plan.while_ruptured(m)] for m in range(len(plan.rupture))]
-            levels = [float(np.median(rupture)) for rupture in ruptures]
+            ruptures = {m: values[plan.while_ruptured(m)] for m in plan.muscles}
+            levels = {m: float(np.median(rupture)) for m, rupture in ruptures.items()}
             faulty = np.concatenate([ruptures[m] for m in plan.counted])
             results = {
                 'healthy_max': float(healthy.max()),
                 'healthy_median': float(np.median(healthy)),
                 f'{fault}_min': min(levels[m] for m in plan.counted),
-                fault: levels,
+                fault: list(levels.values()),
                 f'{fault}_auroc': auroc(healthy, faulty),
             }
             numbers |= {f'{letter}{prefix}_{key}': value for key, value in results.items()}

@@ -68,6 +68,7 @@ HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0
 PLOT_START = 60.0  # time that plots show before the grasp [s]
 PLOT_TAIL = 3.0  # time that plots show after the repair [s]
+QUICK_RUPTURES = 2  # number of muscles that rupture in a shortened run
 OFF_TIME = 40.0  # duration of the motion before muscles are switched off [s]
 #: times of the pictures [s], at ends of the motion's cycles without and with the payload
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
@@ -78,13 +79,14 @@ OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for s
 def measure(study: Study, seed: int) -> Measured:
     """Return the results and traces of one individual."""
     robot = study.robot
-    plan = GraspAndRupture(robot, study.held_out_time, seed)
+    most = QUICK_RUPTURES if study.quick else None
+    plan = GraspAndRupture(robot, study.held_out_time, seed, most=most)
     driven_by = study.network(None, 'default')
     faulty = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
     duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
     stream = HEALTHY_STREAM + seed
     healthy = record(study.arm(seed), driven_by, stream, duration, grasp_and_release)
-    plan_off = GraspAndRupture(robot, OFF_TIME, seed, switched_off=True)
+    plan_off = GraspAndRupture(robot, OFF_TIME, seed, switched_off=True, most=most)
     switched_off = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan_off.duration, plan_off)
     recordings = Recordings(plan, faulty, healthy, plan_off, switched_off)
     numbers, outputs, off_outputs = dict[str, Any](), dict[str, Any](), dict[str, Any]()
@@ -161,9 +163,9 @@ def _preset(
     numbers |= anomaly_levels(plan, outputs, healthy_outputs, 'ruptured')
     numbers['auroc'] = numbers['d_ruptured_auroc']
     for prefix in ('a_before', 'a'):  # the muscle that the paper deactivated
-        level, healthy_median = numbers[f'{prefix}_{OFF}'], numbers[f'{prefix}_healthy_median']
-        numbers[f'{prefix}_{OFF}_second'] = level[plan_off.order[0]]
-        numbers[f'{prefix}_{OFF}_second_ratio'] = level[plan_off.order[0]] / healthy_median
+        level = numbers[f'{prefix}_{OFF}'][plan_off.muscles.index(plan_off.order[0])]
+        numbers[f'{prefix}_{OFF}_second'] = level
+        numbers[f'{prefix}_{OFF}_second_ratio'] = level / numbers[f'{prefix}_healthy_median']
     mae, healthy_after = networks['after'], healthy_outputs['after']
     off_numbers = detection(robot, plan_off, off_outputs['after'], healthy_after, mae)
     numbers |= {f'{OFF}_{key}': off_numbers[key] for key in OFF_KEYS}
@@ -288,11 +290,12 @@ def tracking(study: Study, rows: Rows) -> Plot:
     )
 
 
-def cuts(study: Study, rows: Rows) -> Plot:
-    """Draw the level and the detection delay of the rupture of every muscle."""
-    robot, numbers = study.robot, [row.numbers for row in rows.values()]
-    figure, panels = plots.new_figure(12.0, 0.42 * robot.muscle_count + 1.9, 1, 3, sharey=True)
-    place = np.arange(robot.muscle_count)
+def cuts(_: Study, rows: Rows) -> Plot:
+    """Draw the level and the detection delay of every rupture."""
+    numbers = [row.numbers for row in rows.values()]
+    ruptured = list(numbers[0]['cuts'])
+    figure, panels = plots.new_figure(12.0, 0.42 * len(ruptured) + 1.9, 1, 3, sharey=True)
+    place = np.arange(len(ruptured))
     labels = 'A [scaled units]', 'd [healthy std. dev.]'
     for letter, panel, label in zip('ad', panels, labels):
         for when, prefix, shift in (('before', '_before', -0.18), ('after', '', 0.18)):
@@ -324,9 +327,9 @@ def cuts(study: Study, rows: Rows) -> Plot:
         panel.plot([], [], marker, color=colour, mfc='none', label=label)
     panel.set(xscale='log', xlim=(0.008, 1.3 * RUPTURE_TIME))
     plots.tidy(panel, 'time to detection [s]', legend='below')
-    panels[0].set_yticks(place, robot.muscles)
+    panels[0].set_yticks(place, ruptured)
     panels[0].invert_yaxis()
-    figure.suptitle('every muscle ruptured in turn, one point per individual')
+    figure.suptitle('one muscle ruptured after another, one point per individual')
     return figure, (
         'Left and middle: median of A and of d while each muscle is ruptured. Points to the right '
         'of the dashed line of their colour exceed every value of healthy motion. Right: the time '

@@ -47,6 +47,7 @@ from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # every tenth message of the held-out motion is evaluated
 TARGETS = 2  # number of targets that the arm approaches without each muscle
+QUICK_TARGETS = 1  # this number in a shortened run
 MOVING = 12.0  # duration of healthy motion before a fault [s]
 LATEST_VERDICT = 10  # longest time from a fault to its isolation [s]
 AFTERWARDS = 6.0  # duration of the motion after an isolation [s]
@@ -159,8 +160,10 @@ class Reach(NamedTuple):
     trapped: list[float]
 
 
-def measure_reach(loop: IsolatingLoop, muscle: int, rng: np.random.Generator) -> Reach:
-    """Measure which postures an arm can hold and approach without a muscle."""
+def measure_reach(
+    loop: IsolatingLoop, muscle: int, rng: np.random.Generator, targets: int
+) -> Reach:
+    """Measure which postures an arm can hold without a muscle, and approach some of them."""
     robot, held, count = loop.arm.robot, [], 0
     reduced_robot = robot.without([muscle])
     postures = robot.random_postures(TRIES, rng)
@@ -173,10 +176,10 @@ def measure_reach(loop: IsolatingLoop, muscle: int, rng: np.random.Generator) ->
             held.append(theta)
         except InfeasibleError:
             continue
-        if count >= 100 and len(held) >= TARGETS:
+        if count >= 100 and len(held) >= targets:
             break
     distances, trapped = list[float | None](), list[float]()
-    for theta in held[:TARGETS]:
+    for theta in held[:targets]:
         try:
             loop.target(theta)
             rest_time, before = 0, loop.arm.theta  # [s]
@@ -235,7 +238,7 @@ def measure(study: Study, seed: int) -> Measured:
         loop, _ = run_with_fault(study.arm(seed), mae, seed, m, '')
         isolated, reason = loop.verdicts[0] if loop.verdicts else ((), 'nothing')
         correct.append(isolated == (m,))
-        reach = measure_reach(loop, m, rng)
+        reach = measure_reach(loop, m, rng, QUICK_TARGETS if study.quick else TARGETS)
         shares.append(reach.share)
         distances += reach.distances
         trapped += reach.trapped

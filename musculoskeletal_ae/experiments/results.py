@@ -47,6 +47,8 @@ def write(
 ) -> list[Path]:
     """Write result.json and the plots of every experiment to a folder; return the files.
 
+    A shortened run writes its plots only as PNG.
+
     Raises:
         MusculoskeletalError: If a number is not finite.
     """
@@ -65,6 +67,8 @@ def write(
         write_whole(folder / 'result.json', f'{text}\n'.encode())
         for file, (figure, _) in drawn.items():
             figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
+            if study.quick:
+                continue
             figure.set_layout_engine('none')  # keep the layout of the PNG
             # Without a creation date, the same numbers give the same PDF.
             vector = (folder / file).with_suffix('.pdf')

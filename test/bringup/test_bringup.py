@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import bodies
@@ -32,18 +33,45 @@ STATUS = re.compile(
 
 
 @pytest.fixture(scope='module')
-def environment(tmp_path_factory, trained_file):
+def environment(tmp_path_factory):
     """Return an environment with a cache that only the runs of this module share."""
     cache = tmp_path_factory.mktemp('cache')
-    folders = {'XDG_CACHE_HOME': str(cache), 'XDG_STATE_HOME': str(cache / 'state')}
-    return {**os.environ, **folders, 'TRAINED': trained_file}
+    return os.environ | {'XDG_CACHE_HOME': str(cache), 'XDG_STATE_HOME': str(cache / 'state')}
 
 
-def bringup(environment, *arguments):
-    command = [str(REPOSITORY / 'bringup.sh'), *arguments]
-    if 'arm26' in arguments:  # the shared test network is one of arm26
-        command += ['--checkpoint', environment['TRAINED']]
-    return Process('bringup.sh', command, env=environment, start_new_session=True)
+@pytest.fixture
+def bringup(environment, trained_file):
+    """Return a function that starts a bring-up; those that still run at the end are ended."""
+    runs = []
+
+    def start(*arguments, **variables):
+        command = [str(REPOSITORY / 'bringup.sh'), *arguments]
+        if 'arm26' in arguments:  # the shared test network is one of arm26
+            command += ['--checkpoint', trained_file]
+        own = {'env': environment | variables, 'start_new_session': True}
+        runs.append(Process('bringup.sh', command, **own))
+        return runs[-1]
+
+    yield start
+    for run in runs:
+        run.end(signal.SIGINT)
+        for process in pids(run):  # if the shutdown failed, which the test has reported
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+
+
+@pytest.fixture
+def join():
+    """Return a function that joins a namespace; processes that the graphs own are ended."""
+    graphs = []
+
+    def graph_in(namespace=''):
+        graphs.append(Graph(namespace))
+        return graphs[-1]
+
+    yield graph_in
+    for graph in graphs:
+        graph.close()
 
 
 def running(run):
@@ -51,6 +79,11 @@ def running(run):
     command = ['ps', '-ww', '-s', str(run.process.pid), '-o', 'stat=,pid=,args=']
     lines = subprocess.run(command, capture_output=True, text=True).stdout.splitlines()
     return '\n'.join(line.split(maxsplit=1)[1] for line in lines if not line.startswith('Z'))
+
+
+def pids(run):
+    """Return the identifiers of the processes in the session of a bring-up."""
+    return [int(line.split()[0]) for line in running(run).splitlines()]
 
 
 def explore_fast(graph, controller):
@@ -74,8 +107,8 @@ def ports_in_shared_memory(run):
     """Return the threads that wait for messages in shared memory.
 
     A successor of a killed node may receive no messages there."""
-    pids = [line.split()[0] for line in running(run).splitlines()]
-    names = [file.read_text() for pid in pids for file in Path(f'/proc/{pid}/task').glob('*/comm')]
+    tasks = [Path(f'/proc/{pid}/task') for pid in pids(run)]
+    names = [file.read_text() for task in tasks for file in task.glob('*/comm')]
     assert any(name.startswith('dds.udp.') for name in names)
     return [name for name in names if re.match(r'dds\.shm\.\d', name)]
 
@@ -109,7 +142,7 @@ def reaches(run):
 
 
 def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_reported(
-    environment, tmp_path
+    bringup, tmp_path
 ):
     model = tmp_path / 'own.xml'
     model.write_text(bodies.MJCF, encoding='utf-8')
@@ -120,8 +153,8 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     chosen = ['--robot', str(robot), '--preset', 'paper', '--no-learner']
 
     # Option --network keeps the discovery range of the environment. SIGKILL leaves no process.
-    shown = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
-    run = bringup(shown, *chosen, '--reality', str(model), '--network')
+    options = ['--reality', str(model), '--network']
+    run = bringup(*chosen, *options, ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET')
     reported = f"-- reality {model}: joint 'elbow' moves from -1.5 to 0.2 there"
     assert 'training the initial network' in read_until(run, reported)
     assert set(reaches(run)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET'}
@@ -129,9 +162,7 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     assert left_behind(run) == ''
 
     recording = tmp_path / 'run'
-    run = bringup(
-        environment, *chosen, '--seed', '3', '--duration', '5', '--record', str(recording)
-    )
+    run = bringup(*chosen, '--seed', '3', '--duration', '5', '--record', str(recording))
     _, output = run.ended()
     assert run.process.returncode == 0 and 'from an earlier run' in output, output
     assert re.search(r'^-- record: \d+ messages recorded to .*, \d+ lost$', output, re.MULTILINE)
@@ -143,7 +174,7 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     assert all(0.0 < float(line['a']) < 2.0 for line in lines)
     assert left_behind(run) == ''
 
-    played = bringup(environment, *chosen, '--bag', str(recording))
+    played = bringup(*chosen, '--bag', str(recording))
     _, output = played.ended()
     assert played.process.returncode == 0, output
     assert statuses(output), output  # on a busy machine, the replay may end after the first line
@@ -151,48 +182,46 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
     assert left_behind(played) == ''
 
 
-def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(environment, tmp_path):
-    # A sourced ROS 2 Jazzy sets this variable to SUBNET.
-    environment = {**environment, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}
+def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(
+    bringup, join, tmp_path
+):
+    subnet = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}  # as a sourced ROS 2 Jazzy sets it
     file = tmp_path / 'my.yaml'
     # bringup.sh also sets max_age, but the value in this file has to take precedence.
     file.write_text('/**: {ros__parameters: {max_age: 3.0, hold_time: 3.0}}')
     options = ['--params-file', str(file), '-p', 'controller:hold_time:=4.0']
-    left = bringup(environment, '--robot', 'arm26', '--namespace', 'left_arm', *options)
+    left = bringup('--robot', 'arm26', '--namespace', 'left_arm', *options, **subnet)
     options = ['--namespace', 'right_arm', '--no-controller', '--no-learner']
-    right = bringup(environment, '--robot', 'arm26', *options)
-    graph = Graph()
+    right = bringup('--robot', 'arm26', *options, **subnet)
+    graph = join()
     graph.processes += [left, right]
-    try:
-        for side in ('left_arm', 'right_arm'):
-            graph.listen(JointState, f'/{side}/estimated_joint_states')
-        for side in ('left_arm', 'right_arm'):
-            graph.wait(
-                lambda side=side: graph.received[f'/{side}/estimated_joint_states'],
-                f'{side} to estimate',
-                deadline=5 * DEADLINE,
-            )
-        graph.wait(lambda: errors(left.output, INITIAL), 'a status line of the initial network')
-        assert '/estimator ' in running(right) and '/controller ' not in running(right)
-        status, output = graph.ended(right, signal.SIGINT)
-        assert status == 130 and 'Traceback' not in output, output
-        assert left_behind(right) == ''
-        # Without --network, the nodes of an emulated arm communicate on this machine only.
-        assert set(reaches(left)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'}
-        # Parameters in the user's file and on the command line take precedence over those that
-        # bringup.sh sets.
-        request = GetParameters.Request(names=['max_age', 'hold_time', 'explore'])
-        values = graph.call(GetParameters, '/left_arm/controller/get_parameters', request).values
-        assert (values[0].double_value, values[1].double_value) == (3.0, 4.0)
-        assert values[2].bool_value
-        explore_fast(graph, '/left_arm/controller')
-        learned = graph.listen(UInt8MultiArray, '/left_arm/mae_checkpoint', LATCHED)
-        graph.wait(lambda: len(learned) > 4, 'four updates of the network', 8 * DEADLINE)
-        assert ports_in_shared_memory(left) == []
-        graph.wait(lambda: len(errors(left.output, LEARNED)) >= 5, 'five status lines')
-    finally:
-        status, output = graph.ended(left, signal.SIGINT)
-        graph.close()
+    for side in ('left_arm', 'right_arm'):
+        graph.listen(JointState, f'/{side}/estimated_joint_states')
+    for side in ('left_arm', 'right_arm'):
+        graph.wait(
+            lambda side=side: graph.received[f'/{side}/estimated_joint_states'],
+            f'{side} to estimate',
+            deadline=5 * DEADLINE,
+        )
+    graph.wait(lambda: errors(left.output, INITIAL), 'a status line of the initial network')
+    assert '/estimator ' in running(right) and '/controller ' not in running(right)
+    status, output = graph.ended(right, signal.SIGINT)
+    assert status == 130 and 'Traceback' not in output, output
+    assert left_behind(right) == ''
+    # Without --network, the nodes of an emulated arm communicate on this machine only.
+    assert set(reaches(left)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST'}
+    # Parameters in the user's file and on the command line take precedence over those that
+    # bringup.sh sets.
+    request = GetParameters.Request(names=['max_age', 'hold_time', 'explore'])
+    values = graph.call(GetParameters, '/left_arm/controller/get_parameters', request).values
+    assert (values[0].double_value, values[1].double_value) == (3.0, 4.0)
+    assert values[2].bool_value
+    explore_fast(graph, '/left_arm/controller')
+    learned = graph.listen(UInt8MultiArray, '/left_arm/mae_checkpoint', LATCHED)
+    graph.wait(lambda: len(learned) > 4, 'four updates of the network', 8 * DEADLINE)
+    assert ports_in_shared_memory(left) == []
+    graph.wait(lambda: len(errors(left.output, LEARNED)) >= 5, 'five status lines')
+    status, output = graph.ended(left, signal.SIGINT)
     assert status == 130 and 'Traceback' not in output, output
     before, after = errors(output, INITIAL), errors(output, LEARNED)
     # Measured over seeds and runs: an error of 0.05 to 0.13 rad falls to between a tenth and a
@@ -201,36 +230,32 @@ def test_two_arms_share_a_graph_ctrl_c_ends_one_cleanly_and_the_other_learns(env
     assert left_behind(left) == ''
 
 
-def test_a_ruptured_muscle_is_detected_and_a_dead_node_named(environment):
-    run = bringup(environment, '--robot', 'arm26', '--namespace', 'cut', '--no-learner')
-    graph = Graph('/cut')
+def test_a_ruptured_muscle_is_detected_and_a_dead_node_named(bringup, join):
+    run = bringup('--robot', 'arm26', '--namespace', 'cut', '--no-learner')
+    graph = join('/cut')
     graph.processes.append(run)
-    try:
-        graph.listen(Bool, 'anomaly_detected', LATCHED)
-        graph.listen(JointState, 'estimated_joint_states')
-        graph.wait(lambda: graph.received['estimated_joint_states'], 'the arm', 5 * DEADLINE)
-        assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', ['brachialis'])[0]
-        detected = graph.received['anomaly_detected']
-        graph.wait(lambda: detected and detected[-1].data, 'the detection')
-        line = run.wait_for_output('ANOMALY: brachialis')
-        assert 'repair the muscle' in line and 'estimator/reset' in line
-        assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
-        graph.wait(
-            lambda: (
-                graph.call(Trigger, 'estimator/reset').success
-                and graph.spin(2.0) is None
-                and not detected[-1].data
-            ),
-            'the detection to stay cleared',
-        )
-    finally:
-        graph.processes.clear()
-        graph.close()
+    graph.listen(Bool, 'anomaly_detected', LATCHED)
+    graph.listen(JointState, 'estimated_joint_states')
+    graph.wait(lambda: graph.received['estimated_joint_states'], 'the arm', 5 * DEADLINE)
+    assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', ['brachialis'])[0]
+    detected = graph.received['anomaly_detected']
+    graph.wait(lambda: detected and detected[-1].data, 'the detection')
+    line = run.wait_for_output('ANOMALY: brachialis')
+    assert 'repair the muscle' in line and 'estimator/reset' in line
+    assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+    graph.wait(
+        lambda: (
+            graph.call(Trigger, 'estimator/reset').success
+            and graph.spin(2.0) is None
+            and not detected[-1].data
+        ),
+        'the detection to stay cleared',
+    )
     victim = next(line for line in running(run).splitlines() if '/estimator ' in line)
     os.kill(int(victim.split()[0]), signal.SIGKILL)
-    _, output = run.ended()
-    assert run.process.returncode == 1
-    # After the status, bringup.sh prints the end of the estimator's log.
+    status, output = graph.ended(run)
+    assert status == 1
+    # The end of the log of that node is printed.
     assert 'brachialis' in output.rpartition('estimator ended with status')[2], output
     assert left_behind(run) == ''
 
@@ -249,8 +274,8 @@ def test_a_ruptured_muscle_is_detected_and_a_dead_node_named(environment):
         (['--robot'], 'requires an argument'),
     ],
 )
-def test_a_wrong_option_is_refused_before_anything_starts(environment, arguments, expected):
-    run = bringup(environment, *arguments)
+def test_a_wrong_option_is_refused_before_anything_starts(bringup, arguments, expected):
+    run = bringup(*arguments)
     _, output = run.ended()
     assert run.process.returncode == 2
     assert expected in output
@@ -262,24 +287,22 @@ def driver(namespace):
     return Process('driver.py', [*command, '--ros-args', '-r', f'__ns:=/{namespace}'])
 
 
-def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_its_namespace_in_use(environment):
-    options = ['--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own']
-    run = bringup(environment, *options)
+def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_its_namespace_in_use(
+    bringup, environment, join
+):
+    run = bringup('--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own')
     transcript = read_until(run, 'waiting for /own/muscle_states')
     assert 'starting' not in transcript
-    second = bringup(environment, '--robot', 'arm26', '--namespace', 'own')
-    graph = Graph('/own')
+    second = bringup('--robot', 'arm26', '--namespace', 'own')
+    graph = join('/own')
     graph.processes += [run, driver('own')]
-    try:
-        transcript += read_until(run, 'starting controller')
-        explore_fast(graph, 'controller')
-        learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-        graph.wait(lambda: len(learned) > 1, 'an update of the network', 8 * DEADLINE)
-        status, output = second.ended()
-        assert status == 2 and "'/own' is in use" in output and '--namespace' in output
-    finally:
-        status, output = run.end(signal.SIGINT)
-        graph.close()
+    transcript += read_until(run, 'starting controller')
+    explore_fast(graph, 'controller')
+    learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+    graph.wait(lambda: len(learned) > 1, 'an update of the network', 8 * DEADLINE)
+    status, output = second.ended()
+    assert status == 2 and "'/own' is in use" in output and '--namespace' in output
+    status, output = graph.ended(run, signal.SIGINT)
     assert 'the driver keeps its contract' in transcript + output
     assert status == 130 and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'

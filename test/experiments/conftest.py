@@ -9,7 +9,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
 #: duration of the exploration [min], long enough for updates of both presets
-MINUTES = 0.35
+MINUTES = 0.25
 
 
 @pytest.fixture(scope='session')

@@ -27,7 +27,7 @@ def test_every_length_method_moves_the_arm_without_a_jump_and_a_wrong_one_is_ref
     done, reason = arm.graph.set_parameter('controller', 'method', 'magic')
     assert not done
     assert 'proposed' in reason
-    assert len(arm.sent('tension')) == 0
+    assert arm.count('tension') == 0
     arm.never_jumped()
 
 
@@ -35,16 +35,16 @@ def test_method_tension_sends_tensions_only_and_returns_to_lengths(arm):
     arm.target(HERE)
     arm.goes_to(HERE)
     assert arm.graph.set_parameter('controller', 'method', 'tension')[0]
-    arm.graph.wait(lambda: len(arm.sent('tension')) > 50, 'tension commands')
-    lengths = len(arm.sent())
+    arm.graph.wait(lambda: arm.count('tension') > 50, 'tension commands')
+    lengths = arm.count()
     arm.target(THERE)
     arm.goes_to(THERE, within=0.4)
-    assert len(arm.sent()) == lengths
+    assert arm.count() == lengths
     sent = arm.sent('tension')
     assert sent.min() >= arm.robot.tension.bias[0]
     assert sent.max() <= arm.robot.tension.limit[0]
     assert arm.graph.set_parameter('controller', 'method', 'proposed')[0]
-    arm.graph.wait(lambda: len(arm.sent()) > lengths + 50, 'length commands')
+    arm.graph.wait(lambda: arm.count() > lengths + 50, 'length commands')
     arm.goes_to(THERE)
 
 
@@ -72,8 +72,8 @@ def test_a_new_checkpoint_changes_no_command_by_a_jump(arm, trained_file):
     arm.target(HERE)
     arm.goes_to(HERE)
     arm.graph.send_network(Path(trained_file).read_bytes())
-    before = len(arm.sent())
-    arm.graph.wait(lambda: len(arm.sent()) > before + 100, 'commands')
+    before = arm.count()
+    arm.graph.wait(lambda: arm.count() > before + 100, 'commands')
     arm.never_jumped()
     assert 'stopped' not in arm.state().message
 

@@ -23,7 +23,7 @@ def moving(graph, arm26, trained_file):
     def start(*processes, **hardware):
         arm = ControlledArm(graph, arm26, trained_file, processes, **hardware)
         arm.target(HERE)
-        graph.wait(lambda: len(arm.sent()) > 30, 'commands')
+        graph.wait(lambda: arm.count() > 30, 'commands')
         return arm
 
     return start
@@ -36,9 +36,9 @@ def reset(arm):
 def test_a_stop_pays_out_keeps_commanding_and_ends_only_by_a_reset(moving):
     arm = moving()
     assert arm.graph.call(Trigger, 'controller/stop').success
-    before = len(arm.sent())
+    before = arm.count()
     arm.pays_out()
-    assert len(arm.sent()) > before
+    assert arm.count() > before
     request = SetBool.Request(data=True)
     refused = arm.graph.call(SetBool, 'controller/explore', request)
     assert not refused.success
@@ -106,8 +106,8 @@ def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     refused = reset(arm).message
     assert refused.startswith('refused: muscle_states are too old')
     assert 'call controller/reset again' in refused
-    before = len(arm.sent())
-    arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'commands to nobody')
+    before = arm.count()
+    arm.graph.wait(lambda: arm.count() > before + 20, 'commands to nobody')
     arm.start('hardware_emulator', seed=1)
     arm.graph.next('estimated_joint_states', 5)
     arm.set_max_age(PATIENT)
@@ -184,7 +184,7 @@ def test_an_unfit_accepted_checkpoint_stops_the_controller(graph, trained_file):
 
 def test_the_arm_moves_without_joint_sensors_and_learner(moving):
     arm = moving(joint_sensors=False)
-    arm.graph.wait(lambda: len(arm.sent()) > 200, 'commands')
+    arm.graph.wait(lambda: arm.count() > 200, 'commands')
     assert 'stopped' not in arm.state().message
     assert len(arm.graph.received['joint_states']) == 0
 
@@ -194,8 +194,8 @@ def test_a_killed_learner_does_not_disturb_a_motion(moving):
     learner = arm.start('learner', checkpoint=arm.checkpoint, state_directory='')
     arm.says('checkpoint version', 'learner')
     arm.target(THERE)
-    before = len(arm.sent())
-    arm.graph.wait(lambda: len(arm.sent()) > before + 20, 'a movement under way')
+    before = arm.count()
+    arm.graph.wait(lambda: arm.count() > before + 20, 'a movement under way')
     arm.kill(learner)
     arm.goes_to(THERE)
     # All remaining nodes report `ok` again.

@@ -30,7 +30,7 @@ def test_a_trajectory_is_followed_and_its_state_published_and_a_wrong_one_moves_
     rejected = arm.controller.rejected
     reason = 'joint_trajectory: beyond the joint limits'
     graph.wait(lambda: rejected[reason] == 1, 'the rejection')
-    assert len(arm.sent()) == 0
+    assert arm.count() == 0
     for goal in (HERE, THERE):
         publisher.publish(trajectory(arm, goal))
         arm.says('following a trajectory')

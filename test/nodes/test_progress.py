@@ -6,8 +6,9 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
+import pytest
 from graph import DEADLINE
 
 from musculoskeletal_ae.nodes.progress import STALLED, ProgressWatch
@@ -21,28 +22,39 @@ START = (
 )
 
 
-def run(code: str) -> subprocess.Popen[str]:
-    command = [sys.executable, '-X', 'faulthandler', '-c', START + code]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path.cwd()
-    )
+@pytest.fixture
+def run() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+    """Return a function that runs code in a process; those that still run at the end are killed."""
+    processes = list[subprocess.Popen[str]]()
+
+    def start(code: str) -> subprocess.Popen[str]:
+        command = [sys.executable, '-X', 'faulthandler', '-c', START + code]
+        pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
+        processes.append(subprocess.Popen(command, text=True, **pipes))
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
 
 
-def test_without_progress_the_process_ends_with_the_stacks_in_its_log():
+def test_without_progress_the_process_ends_with_the_stacks_in_its_log(run):
     process = run('time.sleep(60)')
     _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == STALLED
     assert 'no progress' in errors and 'most recent call first' in errors
 
 
-def test_a_native_call_that_keeps_the_lock_of_python_ends_the_process_too():
+def test_a_native_call_that_keeps_the_lock_of_python_ends_the_process_too(run):
     process = run('sum(range(10**12))')
     _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == -signal.SIGVTALRM
     assert 'most recent call first' in errors
 
 
-def test_a_suspended_process_is_no_process_that_hangs():
+def test_a_suspended_process_is_no_process_that_hangs(run):
     process = run('end = time.monotonic() + 2.5\nwhile time.monotonic() < end:\n'
                   '    watch.note(); time.sleep(0.05)\nwatch.stop()')  # fmt: skip
     assert process.stdout is not None and process.stdout.readline() == 'started\n'

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The status shows commands that are refused or that a node cannot receive."""
 
-import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
@@ -14,38 +13,27 @@ from musculoskeletal_ae import reception
 from musculoskeletal_ae.nodes.controller import Controller
 
 
-@pytest.mark.parametrize(
-    ('topic', 'message', 'reason'),
-    [
-        ('target_joint_states', JointState(name=['elbo'], position=[0.1]), "unknown joint: 'elbo'"),
-        (
-            'joint_trajectory',
-            JointTrajectory(
-                joint_names=['elbow'],
-                points=[JointTrajectoryPoint(positions=[-99.0], time_from_start=Duration(sec=1))],
-            ),
-            'no posture yet',
-        ),
-        ('target_pose', PoseStamped(), "wrong frame: '', expected"),
-        ('target_twist', TwistStamped(), "wrong frame: '', expected"),
-    ],
-)
-def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(
-    graph, topic, message, reason, monkeypatch
-):
+def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(graph, monkeypatch):
     monkeypatch.setattr(reception, 'SHOWN', 3.0)
     graph.host(Controller, robot='arm26')
     graph.listen(DiagnosticArray, '/diagnostics')
-    graph.publisher(type(message), topic).publish(message)
+    beyond = JointTrajectoryPoint(positions=[-99.0], time_from_start=Duration(sec=1))
+    unknown = JointState(name=['elbo'], position=[0.1])
+    for topic, message, reason in (
+        ('target_joint_states', unknown, "unknown joint: 'elbo'"),
+        ('joint_trajectory', JointTrajectory(joint_names=['elbow'], points=[beyond]), 'no posture'),
+        ('target_pose', PoseStamped(), "wrong frame: '', expected"),
+        ('target_twist', TwistStamped(), "wrong frame: '', expected"),
+    ):
+        graph.publisher(type(message), topic).publish(message)
+        texts = f'refused {topic}: ', reason
 
-    def shown():
-        report = graph.report('controller')
-        return 'refused' in report.values and report
+        def shown(texts=texts):
+            report = graph.report('controller')
+            return report if all(text in report.message for text in texts) else None
 
-    report = graph.wait(shown, 'the refusal')
-    assert report.level == 'warn'
-    assert f'refused {topic}: ' in report.message and reason in report.message
-    graph.wait(lambda: not shown(), 'its end')
+        assert graph.wait(shown, f'the refusal of {topic}').level == 'warn'
+    graph.wait(lambda: 'refused' not in graph.report('controller').values, 'its end')
 
 
 def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):

@@ -26,6 +26,7 @@ def test_ros2_run_starts_a_node_and_ros2_topic_echo_shows_the_anomaly(graph, arm
         topic = f'{graph.namespace}/anomaly', 'std_msgs/msg/Float64'
         echo = [ROS2, 'topic', 'echo', '--once', '--no-daemon', *topic]
         shown = Process('ros2_topic_echo', echo)
+        graph.tools.append(shown)
         muscles = graph.publisher(Float64MultiArray, 'muscle_states')
         theta, tension = 0.5 * (arm26.lower + arm26.upper), np.full(6, 60.0)
         rows = [arm26.muscle_lengths(theta, tension), tension, np.full(6, 25.0)]

@@ -117,7 +117,7 @@ def test_messages_in_the_name_of_the_estimator_stop_the_arm_and_change_nothing(
     arm = ControlledArm(graph, arm26, trained_file)
     core = arm.controller.core
     arm.target([-0.5, -1.2])
-    graph.wait(lambda: len(arm.sent()) > 30, 'commands')
+    graph.wait(lambda: arm.count() > 30, 'commands')
     before, network = core.stream.body, core.mae
     for topic, (kind, message) in STRANGE.items():
         stranger = graph.publisher(kind, topic, LATCHED)

@@ -32,7 +32,7 @@ REFUSED = 'mae_checkpoint: does not explain the arm'
 def arm(graph, arm26, trained_file):
     arm = ControlledArm(graph, arm26, trained_file)
     arm.target(HERE)
-    graph.wait(lambda: len(arm.sent()) > 30, 'commands')
+    graph.wait(lambda: arm.count() > 30, 'commands')
     return arm
 
 
