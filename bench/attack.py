@@ -63,7 +63,7 @@ class Size(NamedTuple):
 
 
 FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
-QUICK = Size(2, 8, messages=2000, node_kills=2, learner_kills=0, files=42, episodes=1)
+QUICK = Size(1, 4, messages=800, node_kills=1, learner_kills=0, files=21, episodes=1)
 SEEDS = 0, 1, 2, 3, 4
 EVENTS_IN_A_ROW = 50  # number of random events between two recoveries of the arm
 

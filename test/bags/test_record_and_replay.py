@@ -49,19 +49,17 @@ def messages(path, namespace):
 def test_a_replay_is_recorded_as_it_was(tool, graph, tmp_path):
     content = samples.samples(252, '/left_arm')
     samples.write_ours(tmp_path / 'first', content, 'zstd', finish=True)
-    for source, out in (('first', 'second'), ('second', 'third')):
-        recorder = record(tool, graph, tmp_path / out)
-        replay = tool('replay', tmp_path / source, '--topics', 'all', '--wait', '20', *ros(graph))
-        output = replay.output()
-        assert replay.process.returncode == 0, output
-        output = recorder.end(signal.SIGINT)
-        assert recorder.process.returncode == 0, output
-        assert 'Traceback' not in output
+    recorder = record(tool, graph, tmp_path / 'second')
+    replay = tool('replay', tmp_path / 'first', '--topics', 'all', '--wait', '20', *ros(graph))
+    output = replay.output()
+    assert replay.process.returncode == 0, output
+    output = recorder.end(signal.SIGINT)
+    assert recorder.process.returncode == 0, output
+    assert 'Traceback' not in output
     first = messages(tmp_path / 'first', '/left_arm')
     second = messages(tmp_path / 'second', graph.namespace)
     # DDS pads serialized messages with zeros to a multiple of four bytes.
     assert second == [(topic, data + bytes(-len(data) % 4)) for topic, data in first]
-    assert messages(tmp_path / 'third', graph.namespace) == second
 
 
 def test_a_killed_recorder_loses_at_most_the_last_second(tool, graph, tmp_path):

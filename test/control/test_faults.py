@@ -83,12 +83,12 @@ class Loop:
         """Repair the arm and call the services that a user would call."""
         self.arm.faults.set([])
         self.arm.reset(self.arm.theta)
-        self.run(3.0)
+        self.run(1.5)
         self.estimator.reset()
         self.controller.use_body(self.estimator.body)
         self.controller.anomaly(False)
         refused = self.controller.reset(self.now)
-        self.run(3.0)
+        self.run(2.0)
         return refused
 
 
@@ -133,7 +133,7 @@ PROMISES = {
 def test_under_each_fault_no_command_jumps_and_the_arm_resumes_after_the_repair(loop, fault):
     held = loop.arm.theta
     loop.arm.faults.set([fault])
-    loop.run(4.0)
+    loop.run(2.5)
     cause, expected = loop.cause, PROMISES[fault]
     steps = np.diff(loop.commands, axis=0)
     tick = loop.controller.settings.rate_limit * DT * (1.0 + 1e-9)
@@ -162,7 +162,7 @@ def longest_overload(loop):
 def test_modules_that_lose_their_length_offsets_do_not_overload_the_arm(loop, offset, muscles):
     lost = np.where(np.isin(range(6), muscles), offset, 0.0)
     loop.arm.set_length_offset(lost * np.where(np.arange(6) % 2, 1.0, -1.0))
-    loop.run(4.0)
+    loop.run(2.0)
     assert loop.cause
     assert longest_overload(loop) <= 0.1
 

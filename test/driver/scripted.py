@@ -64,7 +64,7 @@ class Driver:
         self._commands.append((self.now + self.late, self.take(target.copy())))
 
     def listen(
-        self, seconds: float = 5.0, moved: bool = False, joints: bool = True, zeroed: bool = True
+        self, seconds: float = 3.0, moved: bool = False, joints: bool = True, zeroed: bool = True
     ) -> Verdict:
         """Return the verdict of `Listening` after some seconds; `moved` pushes the hand about."""
         listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)

@@ -51,7 +51,7 @@ def test_individuals_keep_drums_drums_and_rings_rings(tmp_path):
         drum = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, -0.3], 'axis': [0, 1, 0]}
         document['muscles'][m]['route'][1:2] = [{**drum, 'radius': 0.03, **side}]
     robot = Robot.load(write_muscles(tmp_path, document))
-    for seed in range(6):
+    for seed in range(3):
         true, model = Individual(robot, seed).routes.objects, ForeignArm(robot, seed)._model
         away = [np.linalg.norm(true.side[s]) / true.radius[s] for s in robot.routes.wrapping]
         for name in robot.muscles[6:]:

@@ -2,6 +2,7 @@
 """Length calibration of a body that the network describes exactly."""
 
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ def states(tension, length):
 def swinging(robot, mae):
     """Return a function that computes θ, T and l by a network at time t [s] of a slow swing."""
 
+    @cache
     def at(t):
         middle, half = 0.5 * (robot.lower + robot.upper), 0.4 * (robot.upper - robot.lower)
         theta = middle + half * np.sin(np.array([0.11, 0.17])[: len(middle)] * t + 0.5)
@@ -47,9 +49,14 @@ def seldom(monkeypatch):
     monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 5.0)
 
 
-@pytest.fixture
-def moment(robot, mae):
+@pytest.fixture(scope='module')
+def swing(robot, mae):
     return swinging(robot, mae)
+
+
+@pytest.fixture
+def moment(swing):
+    return lambda t: [values.copy() for values in swing(t)]
 
 
 def run(calibration, moment, seconds, sees, begin=0.0):

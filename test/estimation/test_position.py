@@ -78,9 +78,12 @@ def verdict(tension, length, slack):
     raise AssertionError('no answer')
 
 
+PULLS = np.linspace(0.0, 500.0, 2001)
+STRETCHES = np.array([elongation(pull) for pull in PULLS])
+
+
 def pull_of(stretch):
-    grid = np.linspace(0.0, 500.0, 2001)
-    return float(np.interp(stretch, [elongation(t) for t in grid], grid))
+    return float(np.interp(stretch, STRETCHES, PULLS))
 
 
 def followed(command, stir):

@@ -62,7 +62,17 @@ def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(
     assert not plan.carried.any()
     np.testing.assert_allclose((plan.rupture - 4.0) % SLOT, LATEST_RUPTURE, atol=0.011)
     # If no muscle carried tension, all ruptures count instead of none.
-    assert plan.counted.tolist() == list(range(arm26.muscle_count))
+    assert plan.counted == list(range(arm26.muscle_count))
+
+
+def test_a_shortened_script_ruptures_only_the_first_muscles(arm26):
+    plan = GraspAndRupture(arm26, 4.0, seed=0, most=2)
+    arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
+    arm.follow(plan, plan.duration)
+    assert plan.order == plan.muscles == plan.counted == [1, 2]
+    ruptured = [what[0] for _, what in arm.done if isinstance(what, tuple) and what]
+    assert ruptured == [arm26.muscles[m] for m in plan.order]
+    assert plan.duration == 4.0 + 2 * SLOT
 
 
 def test_a_switched_off_muscle_is_not_ruptured_but_commanded_no_tension(arm26):

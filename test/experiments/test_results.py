@@ -12,7 +12,14 @@ import pytest
 
 from musculoskeletal_ae.emulator.reality import FOREIGN
 from musculoskeletal_ae.exceptions import InfeasibleError, MusculoskeletalError
-from musculoskeletal_ae.experiments import measurement, online_learning, robustness, runner
+from musculoskeletal_ae.experiments import (
+    measurement,
+    online_learning,
+    plots,
+    results,
+    robustness,
+    runner,
+)
 from musculoskeletal_ae.experiments.results import (
     KEPT,
     combine,
@@ -46,6 +53,27 @@ def test_a_number_that_json_cannot_say_is_refused(arm26, tmp_path):
     study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
     with pytest.raises(MusculoskeletalError, match='finite'):
         combine(study, {0: Measured({'deep': {'list': [1.0, float('nan')]}}, {})})
+
+
+def test_plots_are_written_as_png_and_the_same_numbers_give_the_same_pdf(
+    arm26, tmp_path, monkeypatch
+):
+    def errors(_study, rows):
+        figure, (panel,) = plots.new_figure(4.0, 3.0)
+        panel.plot([row.numbers['error_rad'] for row in rows.values()])
+        return figure, 'The errors.'
+
+    drawn = runner.EXPERIMENTS['sensors']._replace(plots=(errors,))
+    monkeypatch.setitem(runner.EXPERIMENTS, 'sensors', drawn)
+    rows = {'sensors': {seed: Measured({'error_rad': 0.1 * seed}, {}) for seed in (0, 1)}}
+    for folder, is_quick in (('one', False), ('two', False), ('quick', True)):
+        study = Study(arm26, 'default', (0, 1), 1.0, is_quick, tmp_path)
+        results.write(study, rows, tmp_path / folder)
+    one, two, quick = (tmp_path / folder / 'sensors' for folder in ('one', 'two', 'quick'))
+    assert (one / 'errors.pdf').read_bytes() == (two / 'errors.pdf').read_bytes()
+    assert (one / 'errors.pdf').read_bytes().startswith(b'%PDF')
+    assert (one / 'errors.png').read_bytes() == (quick / 'errors.png').read_bytes()
+    assert not (quick / 'errors.pdf').exists()
 
 
 @pytest.fixture

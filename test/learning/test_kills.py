@@ -9,7 +9,7 @@ from musculoskeletal_ae.mae import checkpoint
 def test_a_killed_learner_loses_nothing(arm26, initial, tmp_path):
     file = tmp_path / 'initial.safetensors'
     checkpoint.save(initial, file)
-    assert run(arm26, tmp_path / 'state', file, kills=2, seed=0) == []
+    assert run(arm26, tmp_path / 'state', file, kills=1, seed=0) == []
 
 
 def test_a_missing_sample_would_be_noticed(arm26):

@@ -45,7 +45,8 @@ import sys
 sys.argv[1:] = ['--help']
 from musculoskeletal_ae import executables
 executables.{node}()
-print('loaded', *sorted({{'numba', 'pinocchio', 'torch'}} & set(sys.modules)))
+heavy = {{'matplotlib', 'numba', 'pinocchio', 'scipy', 'torch'}}
+print('loaded', *sorted(heavy & set(sys.modules)))
 """
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
