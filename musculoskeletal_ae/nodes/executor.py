@@ -29,6 +29,8 @@ from rclpy.executors import (
     TimeoutException,
 )
 from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.task import Task
 from rclpy.timer import Timer
 from rclpy.waitable import NumberOfEntities
 
@@ -63,17 +65,42 @@ class _Group(NamedTuple):
 class LeanExecutor(SingleThreadedExecutor):
     """Runs the callbacks of timers, subscriptions, services and clients with little overhead.
 
-    rclpy handles everything else in a *full round*. Asynchronous callbacks, other tasks and actions
-    trigger a full round at once. QoS events wait until the next full round, at most a second.
+    rclpy handles everything else in a *full round*. Changes of entities, unfinished asynchronous
+    callbacks, other tasks and actions trigger a full round at once. QoS events wait for the next
+    one, at most a second.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
+        self._is_changed = True  # whether entities or tasks have been added or removed
         super().__init__(context=context)
         self._wait_set: Any = None  # wait set of rcl; None before it is built
         self._groups: tuple[_Group, ...] = ()
         self._actions: list[Any] = []
         self._handles = ExitStack()  # keeps entities of the wait set alive
         self._next_full_round = 0.0  # time of the next full round on the monotonic clock [s]
+
+    # The guard condition wakes the executor at each of these calls. It does not tell that one of
+    # them was the reason, because rclpy also triggers it after every callback of a full round.
+
+    def add_node(self, node: Node) -> bool:
+        """Add a node whose callbacks are to run."""
+        self._is_changed = True
+        return super().add_node(node)
+
+    def remove_node(self, node: Node) -> None:
+        """Remove a node."""
+        self._is_changed = True
+        super().remove_node(node)
+
+    def wake(self) -> None:
+        """Wake the executor, because a node has created or destroyed an entity."""
+        self._is_changed = True
+        super().wake()
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Run a function or coroutine in the next full round."""
+        self._is_changed = True
+        return super().create_task(callback, *args, **kwargs)
 
     def spin(self) -> None:
         """Run callbacks until shutdown, with this class's `spin_once` in every version of rclpy."""
@@ -99,18 +126,20 @@ class LeanExecutor(SingleThreadedExecutor):
         wait_set.wait(int(longest * S_TO_NS))
         if not self.context.ok():
             raise ExternalShutdownException
-        # The guard condition triggers when entities change or a task is created.
-        is_changed = bool(wait_set.get_ready_entities('guard_condition'))
         has_action = any(action.is_ready(wait_set) for action in self._actions)
         for group in groups:
             ready = wait_set.get_ready_entities(group.kind)
             for entity in group.entities if ready else ():
                 if entity.handle.pointer in ready:
                     self._run(entity, group.take)
-        is_due = time.monotonic() >= self._next_full_round
-        # Up to rclpy 7.1.8, tasks that await a future must be polled.
-        is_awaiting = bool(getattr(self, '_tasks', ()))
-        if (is_changed or has_action or is_due or is_awaiting) and not self._is_shutdown:
+        # Up to rclpy 7.1.8, tasks that await a future must be polled. Finished tasks may still be
+        # listed. Later versions trigger the guard condition to resume a task.
+        if hasattr(self, '_tasks'):
+            is_resumed = any(not task.done() for task, _, _ in self._tasks)
+        else:
+            is_resumed = bool(wait_set.get_ready_entities('guard_condition'))
+        is_due = is_resumed or has_action or time.monotonic() >= self._next_full_round
+        if (self._is_changed or is_due) and not self._is_shutdown:
             self._run_full_round()
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -134,6 +163,7 @@ class LeanExecutor(SingleThreadedExecutor):
             pass
 
     def _run_full_round(self) -> None:
+        self._is_changed = False
         self._release()
         try:
             while True:

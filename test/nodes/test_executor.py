@@ -4,6 +4,7 @@
 import os
 import signal
 import subprocess
+import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -101,6 +102,20 @@ def test_messages_are_handled_while_a_callback_awaits(graph):
     quick.publish(String(data='again'))
     graph.wait(lambda: 'done' in heard, 'the end')
     assert heard[0] == 'meanwhile'
+
+
+def test_a_busy_executor_keeps_its_wait_set_and_notices_new_entities_at_once(graph, monkeypatch):
+    built, ticks, heard = [], [], []
+    wait_set = executor.WaitSet
+    monkeypatch.setattr(executor, 'WaitSet', lambda *counts: built.append(1) or wait_set(*counts))
+    graph.node.create_timer(1e-3, lambda: ticks.append(1))  # something is always ready
+    begun = time.monotonic()
+    graph.wait(lambda: len(ticks) > 500, 'the timer')
+    rounds = (time.monotonic() - begun) / executor.FULL_ROUND_PERIOD
+    assert len(built) <= rounds + 2
+    graph.node.create_subscription(String, 'late', heard.append, 10)
+    graph.publisher(String, 'late').publish(String())
+    graph.wait(lambda: heard, 'the message')
 
 
 @pytest.mark.parametrize('numbers', [(7, 1, 0), (7, 2, 0), (9, 0, 0), ()])
