@@ -83,7 +83,7 @@ class Loop:
         """Repair the arm and call the services that a user would call."""
         self.arm.faults.set([])
         self.arm.reset(self.arm.theta)
-        self.run(1.5)
+        self.run(3.0)
         self.estimator.reset()
         self.controller.use_body(self.estimator.body)
         self.controller.anomaly(False)
