@@ -62,18 +62,16 @@ class Browser:
             tab = self._wait(self._find_tab)
             attached = self.call('Target.attachToTarget', targetId=tab, flatten=True)
             self._session = attached['sessionId']
-            self.resize(*size)
+            metrics = {'deviceScaleFactor': 1, 'mobile': False}
+            self.call(
+                'Emulation.setDeviceMetricsOverride', width=size[0], height=size[1], **metrics
+            )
             self.call('Page.enable')
             self.call('Page.addScriptToEvaluateOnNewDocument', source=SLOWLY)
             self.call('Page.navigate', url=url)
         except BaseException:
             self._process.kill()
             raise
-
-    def resize(self, width: int, height: int) -> None:
-        """Give the page a size [pixels]."""
-        metrics = {'deviceScaleFactor': 1, 'mobile': False}
-        self.call('Emulation.setDeviceMetricsOverride', width=width, height=height, **metrics)
 
     def _find_tab(self) -> str | None:
         targets = self.call('Target.getTargets')['targetInfos']
