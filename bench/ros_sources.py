@@ -116,6 +116,8 @@ class Builder:
         options = {
             'BUILD_TESTING': 'OFF',
             'CMAKE_BUILD_TYPE': 'Release',
+            # Otherwise pybind11 optimizes at link time, which takes longer than compiling.
+            'CMAKE_INTERPROCEDURAL_OPTIMIZATION': 'OFF',
             'CMAKE_INSTALL_PREFIX': wheel / f'{stem}.data' / 'data',
             'CMAKE_PREFIX_PATH': self.venv,
             'Python3_EXECUTABLE': self.python,
