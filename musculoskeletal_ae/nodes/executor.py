@@ -5,9 +5,11 @@ rclpy's `SingleThreadedExecutor` rebuilds its wait set, in Python, for every mes
 callback as a task. At 200 Hz this takes half of a node's CPU time. `LeanExecutor` keeps the wait
 set until entities are created or destroyed, and calls callbacks directly. `LeanExecutor` uses
 private names of rclpy. It therefore runs only with versions of rclpy that it was tested with, and
-only if all of these names exist. Otherwise a stock executor of rclpy runs, and the log says so.
+only if all of these names exist. Otherwise `SingleThreadedExecutor` runs, and the log says so.
+rclpy's `EventsExecutor` cannot replace it: up to rclpy 7.1.7 it runs no callbacks. In 7.1.11 it
+passes a message and its information as one tuple to callbacks that take both.
 
-The environment variable MUSCULOSKELETAL_AE_EXECUTOR overrides the choice: lean, events or single.
+The environment variable MUSCULOSKELETAL_AE_EXECUTOR overrides the choice: lean or single.
 """
 
 import os
@@ -15,7 +17,7 @@ import re
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from importlib import import_module, metadata
+from importlib import metadata
 from inspect import iscoroutinefunction
 from typing import Any, NamedTuple
 
@@ -38,12 +40,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.rclpy_names import WaitSet
 
 VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
-CHOICES = ('lean', 'events', 'single')
+CHOICES = ('lean', 'single')
 #: first and last version of rclpy that LeanExecutor was tested with
 TESTED = (7, 1, 1), (7, 1, 11)
-#: First version of rclpy whose EventsExecutor runs asynchronous callbacks. Up to 7.1.7,
-#: EventsExecutor runs no callbacks at all.
-EVENTS_SINCE = (7, 1, 11)
 #: undocumented attributes of SingleThreadedExecutor that LeanExecutor uses
 PRIVATE_NAMES = (
     '_guard', '_is_shutdown',
@@ -206,23 +205,16 @@ class LeanExecutor(SingleThreadedExecutor):
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """Return the executor that the environment variable selects, or the best one for this rclpy.
+    """Return the executor that the environment selects, or else the best one for this rclpy.
 
     Raises:
-        MusculoskeletalError: If the variable selects an unknown executor, or one that does not work
-            with this rclpy.
+        MusculoskeletalError: If the environment selects an unknown executor.
     """
     choice = os.environ.get(VARIABLE, '')
     if choice not in ('', *CHOICES):
         raise MusculoskeletalError(f'{VARIABLE}={choice!r}; legal: {", ".join(CHOICES)}')
     version = _rclpy_version()
     installed = f'rclpy {_dotted(version) or "of unknown version"}'
-    if choice == 'events' and version < EVENTS_SINCE:
-        needed = _dotted(EVENTS_SINCE)
-        raise MusculoskeletalError(
-            f'{VARIABLE}=events needs rclpy {needed} or later; installed: {installed}; unset '
-            f'{VARIABLE}'
-        )
     if choice == 'lean' or (not choice and TESTED[0] <= version <= TESTED[1]):
         executor = LeanExecutor(context=context)
         missing = [name for name in PRIVATE_NAMES if not hasattr(executor, name)]
@@ -230,16 +222,12 @@ def make_executor(context: Context | None = None) -> Executor:
             return executor
         executor.shutdown()
         installed += f', which has no {missing[0]}'
-    kind: Any = SingleThreadedExecutor
-    if choice != 'single' and version >= EVENTS_SINCE:
-        kind = import_module('rclpy.experimental').EventsExecutor
-    if choice not in ('events', 'single'):
+    if choice != 'single':
         get_logger('musculoskeletal_ae').info(
-            f'using {kind.__name__}: LeanExecutor was tested with rclpy {_dotted(TESTED[0])} to '
-            f'{_dotted(TESTED[1])}, and this is {installed}'
+            f'using SingleThreadedExecutor: LeanExecutor was tested with rclpy '
+            f'{_dotted(TESTED[0])} to {_dotted(TESTED[1])}, and this is {installed}'
         )
-    stock: Executor = kind(context=context)
-    return stock
+    return SingleThreadedExecutor(context=context)
 
 
 def _rclpy_version() -> tuple[int, ...]:
