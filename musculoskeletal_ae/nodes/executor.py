@@ -132,11 +132,11 @@ class LeanExecutor(SingleThreadedExecutor):
                 if entity.handle.pointer in ready:
                     self._run(entity, group.take)
         # Up to rclpy 7.1.8, tasks that await a future must be polled. Finished tasks may still be
-        # listed. Later versions trigger the guard condition to resume a task.
+        # listed. Later versions call `create_task` or list a task as ready to resume it.
         if hasattr(self, '_tasks'):
             is_resumed = any(not task.done() for task, _, _ in self._tasks)
         else:
-            is_resumed = bool(wait_set.get_ready_entities('guard_condition'))
+            is_resumed = bool(getattr(self, '_ready_tasks', ()))
         is_due = is_resumed or has_action or time.monotonic() >= self._next_full_round
         if (self._is_changed or is_due) and not self._is_shutdown:
             self._run_full_round()
