@@ -31,7 +31,11 @@ class Losses:
         self._last[topic] = number
 
     def settle(self, publishers: Callable[[str], int]) -> None:
-        """Count gaps since the last call; `publishers` returns how many publishers a topic has."""
+        """Add gaps since the last call to `lost`, for topics with at most one publisher.
+
+        Args:
+            publishers: Function that returns the number of publishers of a topic.
+        """
         for topic, gap in self._gaps.items():
             if publishers(topic) <= 1:
                 self.lost[topic] += gap

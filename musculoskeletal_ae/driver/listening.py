@@ -105,7 +105,7 @@ class Listening:
         least, most = -0.02 * most, 1.1 * most
         if robot.tension_source.is_current:  # wider, for drive friction and an unknown scale
             least, most = reading_range(robot)
-        #: range of possible values, (3, M)
+        #: lowest and highest possible values of l, T and temperature, (3, M)
         self._low = np.stack([low - beyond, least, coldest * ones])
         self._high = np.stack([high + beyond, most, hottest * ones])
 

@@ -181,7 +181,7 @@ class Controls:
             self._timeline.value = round(min(played), 1)
 
     def end_push(self) -> None:
-        """End a push, because its visitor may have left; the push of a present visitor resumes."""
+        """End a push, because its visitor may have left; the next event of a drag resumes it."""
         if self._is_pushing:
             self._is_pushing = self._force.visible = False
             self._act('push', np.zeros(3))
