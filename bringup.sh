@@ -285,21 +285,21 @@ stop() {
   mapfile -t pids < <(jobs -pr)
   [ ${#pids[@]} -gt 0 ] || return
   say stopping
-  kill -TERM "${pids[@]}" 2>/dev/null
+  kill -TERM "${pids[@]}"
   # Only a recording would lose something, so its process may take longer.
   for patience in 5 30; do
-    while kill -0 "${pids[@]}" 2>/dev/null && ((SECONDS - start < patience)); do sleep 0.1; done
+    while kill -0 "${pids[@]}" && ((SECONDS - start < patience)); do sleep 0.1; done
     for pid in "${pids[@]}"; do
       [ "${name_of[$pid]-}" != record ] || [ $patience = 30 ] || continue
-      ! kill -KILL "$pid" 2>/dev/null ||
+      ! kill -KILL "$pid" ||
         say "${name_of[$pid]-process $pid} did not stop within $patience s and was killed"
     done
   done
   wait
   # What the recorder says at its end: the number of messages, and those that were lost.
   [ -z "$record" ] || sed -n -e 's/^[0-9]* messages recorded/-- record: &/p' \
-    -e 's/^warning: /-- record: &/p' "$logs/record.log" 2>/dev/null
-}
+    -e 's/^warning: /-- record: &/p' "$logs/record.log"
+} 2>/dev/null # without bash's own messages about killed processes
 trap stop EXIT
 trap 'exit 130' INT
 trap 'exit 143' TERM
