@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
 
 UNKNOWN_TENSION = 'unknown: tension_source is none'
+#: key of the names of the isolated muscles with their faults, such as 'biceps (ruptured)'
+ISOLATION = 'isolated muscles with faults'
 SILENCE = 1.0  # time without a message after which the status is a warning [s]
 
 
@@ -77,6 +79,7 @@ def _suspects(core: Estimator) -> dict[str, str]:
     suspects, values = core.suspects, dict[str, str]()
     if core.body.isolated:
         values['isolated muscles'] = core.robot.names(core.body.isolated)
+        values[ISOLATION] = ', '.join(_isolation(core, muscle) for muscle in core.body.isolated)
     values['finding'] = 'none' if suspects.finding is None else suspects.finding.kind.value
     if suspects.finding is not None:
         values['evidence'] = suspects.finding.evidence
@@ -88,6 +91,12 @@ def _suspects(core: Estimator) -> dict[str, str]:
         values['last verified'] = suspects.last_verification
         values['last outcome'] = suspects.last_verdict[1].outcome.value
     return values
+
+
+def _isolation(core: Estimator, muscle: int) -> str:
+    """Return the name of an isolated muscle, with its fault if a verification has found one."""
+    name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
+    return name if fault is None else f'{name} ({fault})'
 
 
 def _residuals(core: Estimator) -> dict[str, str]:

@@ -54,6 +54,7 @@ class SuspectHandling:
         finding: The latched finding, or None.
         verification: The running verification of the suspect, or None.
         last_verdict: Index of the last verified suspect, and its verdict.
+        faults: Verdicts on the isolated muscles that turned out to be faulty, by index.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -62,6 +63,7 @@ class SuspectHandling:
         self.finding: Finding | None = None
         self.verification: Verification | None = None
         self.last_verdict: tuple[int, Verdict] | None = None
+        self.faults: dict[int, Verdict] = {}
         self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
 
     @property
@@ -103,6 +105,7 @@ class SuspectHandling:
             if not isolates or muscle in isolated:
                 return isolated
             self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
+            self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
         if self.finding is not None:
             if finding.kind in REVOKING and self.finding.kind not in REVOKING:
@@ -132,6 +135,7 @@ class SuspectHandling:
         if verdict.outcome is Outcome.HEALTHY:
             self._acquitted.append(now)
         else:
+            self.faults[self.verification.muscle] = verdict
             self.verification = None  # the suspect stays isolated
         return self.clear(isolated)
 
@@ -145,6 +149,11 @@ class SuspectHandling:
         return tuple(muscle for muscle in isolated if muscle != suspect)
 
     def on_isolated(self, isolated: Iterable[int]) -> None:
-        """Stop verifying a suspect that is no longer isolated; the finding stays latched."""
+        """Forget verdicts on muscles that are no longer isolated, and stop verifying them.
+
+        The finding stays latched.
+        """
+        isolated = tuple(isolated)
+        self.faults = {m: verdict for m, verdict in self.faults.items() if m in isolated}
         if self.verification is not None and self.verification.muscle not in isolated:
             self.verification = None

@@ -31,7 +31,7 @@ def learner_report(learner: Learner) -> Report:
     elif not learner.offset_check.is_believed:
         message = 'checking new length offsets against muscle_states'
     elif learner.collector.is_anomaly:
-        message = 'stopped by an anomaly; call estimator/reset to resume'
+        message = 'paused by an anomaly until its suspect is verified or estimator/reset is called'
         waits_for = {WAITS_FOR: ANOMALY}
     elif (idle_time := learner.idle_time) > LONGEST_IDLE:
         message = f'no usable data for {idle_time:.0f} s: {learner.collector.obstacle}'

@@ -4,20 +4,32 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from rclpy.node import Node
 
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
-from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.report import Report, load_text
 
 #: topics that are published continually, so that silence is an error, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
+EMULATOR = 'hardware_emulator'  # name of the node that emulates the driver and the arm
 SILENT_TOPIC = 'silent topic'  # key of a value in reports
 SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
 SLOW = 0.4  # fraction of the expected rate below which messages come too slowly
 SLOW_REPORTS = 3  # number of successive reports with too low a rate before the node warns of it
+
+
+def slow_cause(publishers: Iterable[str]) -> str:
+    """Return why messages come too slowly, as a text for users.
+
+    Args:
+        publishers: Names of the nodes that publish the topic.
+    """
+    if set(publishers) == {EMULATOR}:
+        return f'this computer is overloaded (load {load_text()}); stop other programs'
+    return 'the driver is slow, or this computer is overloaded'
 
 
 class NeededTopics:
@@ -83,9 +95,10 @@ class NeededTopics:
             is_slow = 0.0 < rate < SLOW * expected
             self._slow_reports[topic] = self._slow_reports[topic] + 1 if is_slow else 0
             if self._slow_reports[topic] >= SLOW_REPORTS:
+                publishers = self._node.get_publishers_info_by_topic(self._full_name(topic))
+                cause = slow_cause(publisher.node_name for publisher in publishers)
                 report = report.with_warning(
-                    f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz: the driver is '
-                    'slow, or this computer is overloaded'
+                    f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz: {cause}'
                 )
         return report
 

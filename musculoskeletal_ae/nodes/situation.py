@@ -20,6 +20,7 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control import stops
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.supervisor import StopState
+from musculoskeletal_ae.estimation.status import ISOLATION
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
@@ -35,8 +36,9 @@ FORGET_TIME = 5.0
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'  # key of the version in reports
-#: A node counts as using a wrong network after this number of reports (one a second), if the
-#: estimator's last reports (the same number) do not name the node's network.
+#: number of the estimator's reports (one a second) that a node may need to follow the estimator. A
+#: node counts as using a wrong network if these reports do not name its network, and as waiting for
+#: the end of an anomaly if they do not report one.
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
@@ -105,6 +107,7 @@ class Situation:
         self.samples = self.checkpoints = self.doing = ''
         self.suspect = self.evidence = ''
         self._finding = ''  # kind of the estimator's finding; 'none', or '' if it is unknown
+        self._clear_reports = 0  # successive reports of the estimator without a finding
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
@@ -149,6 +152,7 @@ class Situation:
     def _take_estimator(self, values: dict[str, str]) -> None:
         self._finding = values.get('finding', '')
         self.detected = self._finding not in ('', 'none')
+        self._clear_reports = self._clear_reports + 1 if self._finding == 'none' else 0
         self.suspect = values.get('suspect muscle', '')
         self.evidence = values.get('evidence', '')
         self.distance = self.limit = math.nan
@@ -214,7 +218,8 @@ class Situation:
             is_stopped = control.get('stop cause') == StopCause.SECOND_PUBLISHER.identifier
             return is_stopped and node.values[SEVERAL] in control.get('stop', '')
         if node.values.get(WAITS_FOR) == ANOMALY:
-            return self.detected
+            # When the anomaly has just ended, the last report of the waiting node may be older.
+            return self.detected or 0 < self._clear_reports <= REPORTS
         if name == f'{self._here}/controller':
             return node.values.get('mode') in (STOPPED, VERIFYING)
         if name == f'{self._here}/estimator':
@@ -292,7 +297,7 @@ class Situation:
         controller then treats them as unknown, although the estimator reports none as unknown.
         """
         values, troubles = self._values('estimator'), []
-        if isolated := values.get('isolated muscles'):
+        if isolated := values.get(ISOLATION) or values.get('isolated muscles'):
             troubles.append(Trouble(f'isolated: {isolated}'))
         key = 'unknown length offsets'
         if unknown := values.get(key) or self._values('controller').get(key):

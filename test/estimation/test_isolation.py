@@ -124,6 +124,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     report = loop.core.report(loop.now)
     assert report.level == 'warn'
     assert report.values['isolated muscles'] == robot.muscles[2]
+    assert report.values['isolated muscles with faults'] == f'{robot.muscles[2]} (ruptured)'
     assert report.values['finding'] == report.values['verification'] == 'none'
     assert report.values['last outcome'] == 'ruptured'
     loop.step(healthy, 30)  # the muscle is repaired

@@ -43,6 +43,16 @@ def test_the_first_finding_stays_latched(suspects, robot):
     assert suspects.cause == f'{robot.muscles[1]}: d = 9'
 
 
+def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(suspects):
+    isolated = suspects.take(DISTANCE, (), 0.0)
+    isolated = suspects.conclude(Verdict(Outcome.RUPTURED), isolated, 1.0)
+    isolated = suspects.take(Finding(2, Kind.VALUES_MISSING, ''), isolated, 2.0)
+    outcomes = {muscle: fault.outcome for muscle, fault in suspects.faults.items()}
+    assert outcomes == {1: Outcome.RUPTURED, 2: Outcome.VALUES_MISSING}
+    suspects.on_isolated([2])
+    assert set(suspects.faults) == {2}
+
+
 @pytest.mark.parametrize('outcome', Outcome)
 def test_only_a_healthy_suspect_is_restored_and_either_way_the_anomaly_is_over(suspects, outcome):
     isolated = suspects.take(DISTANCE, (4,), 0.0)

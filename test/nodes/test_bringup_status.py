@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from musculoskeletal_ae.control.stops import Condition, StopCause, remedy_of
 from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.nodes import bringup_status
-from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
+from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC, slow_cause
 from musculoskeletal_ae.nodes.situation import Situation, figures
 from musculoskeletal_ae.remedy import identifiers, sentence
 
@@ -148,6 +148,20 @@ def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_e
     situation.diagnosed(diagnostics('/left/estimator', **suspect, verification='none'))
     assert situation.trouble().startswith('ANOMALY: biceps: no tension, STOPPED: ')
     assert 'learner' not in situation.trouble()
+
+
+def test_after_an_isolation_the_fault_is_named_and_the_learner_advises_nothing_for_some_seconds():
+    situation = Situation('/left')
+    body = {'isolated_muscles': 'biceps', 'isolated_muscles_with_faults': 'biceps (ruptured)'}
+    isolated = diagnostics('/left/estimator', finding='none', state='isolated', **body)
+    paused = 'paused by an anomaly', DiagnosticStatus.WARN
+    situation.diagnosed(diagnostics('/left/estimator', finding='slack_tendon', **body))
+    situation.diagnosed(diagnostics('/left/learner', *paused, waits_for='anomaly'))
+    for _ in range(3):
+        situation.diagnosed(isolated)
+        assert situation.trouble() == 'isolated: biceps (ruptured)'
+    situation.diagnosed(isolated)  # the learner waits for something that is over
+    assert situation.trouble().endswith('warning: /left/learner: paused by an anomaly')
 
 
 @pytest.mark.parametrize(
@@ -339,6 +353,11 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
     assert situation.trouble() == f'STOPPED: {stop} (to go on: end it), warning: /sim: slow'
     situation.diagnosed(diagnostics('/bringup_status', 'the same again', DiagnosticStatus.ERROR))
     assert 'the same again' not in situation.trouble()
+
+
+def test_slow_messages_of_the_emulator_are_put_down_to_the_computer_not_to_a_driver():
+    assert 'driver' not in slow_cause(['hardware_emulator'])
+    assert 'driver' in slow_cause(['my_driver'])
 
 
 def test_a_silent_topic_is_shown_beside_a_stop_of_another_cause():
