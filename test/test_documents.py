@@ -163,6 +163,14 @@ def test_commands_that_play_a_recording_with_an_isolation_do_not_stop_at_the_ano
     assert all('-p estimator:on_anomaly:=isolate' in line for line in played)
 
 
+def test_messages_that_the_documents_publish_once_are_not_lost():
+    """Without `--keep-alive`, `ros2 topic pub` may end before a node has discovered it."""
+    lines = [command.line for page in PAGES for command in commands(ROOT / page)]
+    published = [line for line in lines if line.startswith('ros2 topic pub ')]
+    assert published
+    assert all(' --once --keep-alive 3 ' in line for line in published)
+
+
 def test_every_symbol_that_the_audit_of_the_paper_names_exists():
     text = (ROOT / 'notes' / 'paper_audit.md').read_text('utf-8')
     rows = re.findall(r'^\| (\d+) \|.*\| (exact|open|deviation) \| \w* ?\|$', text, re.M)

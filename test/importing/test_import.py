@@ -4,6 +4,7 @@
 import os
 import re
 from contextlib import suppress
+from pathlib import Path
 
 import bodies
 import numpy as np
@@ -15,10 +16,12 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.importing.convert import import_robot, read_source
 from musculoskeletal_ae.importing.source import SourceError, cut, urdf
+from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.description import TENSION_DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.import_robot import main
 
+EXAMPLE = Path(__file__).parents[2] / 'examples' / 'two_joint_arm.xml'
 PULLEY = '<pulley divisor="2"/>'
 BRANCH = f'{PULLEY}<site site="u2"/><site site="l2"/>{PULLEY}<site site="o3"/>'
 
@@ -49,6 +52,19 @@ def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
     assert result.robot.tension.limit[0] == pytest.approx(180.0)
     assert 'dropped: tendon none: it is a fixed tendon, which has no route' in result.notes
     assert 'dropped: actuator not: it does not act on a tendon' in result.notes
+
+
+def test_the_example_model_imports_exactly_and_is_sound(tmp_path):
+    result = import_robot(EXAMPLE, tmp_path / 'out')
+    assert result.robot.joints == ('shoulder', 'elbow')
+    assert len(result.robot.muscles) == 4
+    assert not [note for note in result.notes if note.startswith('dropped')]
+    lengths, _, flips = result.comparison
+    assert max(lengths.values()) < 1e-6
+    assert not any(flips.values())
+    check = check_robot(result.robot)
+    assert not check.faults
+    assert not check.warnings
 
 
 CURVE = '0.1 0.5 0.1 -0.05 0.02'
