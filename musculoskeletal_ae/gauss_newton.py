@@ -127,7 +127,7 @@ class Eliminated:
     """Factorised normal equations with the unknowns of individual samples eliminated.
 
     Attributes:
-        root: Upper triangular R (P, P); Rᵀ R is the Schur complement of w.
+        root: Upper triangular R (P, P); Rᵀ R is the Schur complement of A in the damped matrix.
     """
 
     def __init__(

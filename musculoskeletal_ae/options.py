@@ -137,7 +137,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_reality(self) -> None:
         """Add `--reality`, the emulator model."""
-        text = 'emulator model: kin shares the mechanics of this package; foreign uses MuJoCo'
+        text = 'emulator model: `kin` shares the mechanics of this package; `foreign` uses MuJoCo'
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:

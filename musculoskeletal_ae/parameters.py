@@ -107,7 +107,7 @@ CHECKPOINT = Parameter(
 )
 PRESET = Parameter(
     DEFAULT,
-    'default: the most accurate methods; paper: exactly the methods of the paper',
+    '`default`: the most accurate methods; `paper`: exactly the methods of the paper',
     legal=PRESET_NAMES,
 )
 SEED = Parameter(

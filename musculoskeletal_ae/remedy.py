@@ -28,16 +28,16 @@ class Step(Enum):
     FREE_ARM = 'free_arm', 'free the arm'
     CHECK_SENSOR = (
         'check_sensor',
-        'check the named sensor, or call estimator/zero if lengths are off',
+        'check the named sensor, or call estimator/zero if the lengths have offsets',
     )
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
     CHECK_DRIVER = (
         'check_driver',
-        'check that the driver is running and the computer not overloaded',
+        'check that the driver is running and that the computer is not overloaded',
     )
     CHECK_ESTIMATOR = (
         'check_estimator',
-        'check that the estimator is running and the computer not overloaded',
+        'check that the estimator is running and that the computer is not overloaded',
     )
     STOP_SECOND_PUBLISHER = (
         'stop_second_publisher',
@@ -45,11 +45,11 @@ class Step(Enum):
     )
     STOP_OTHER_ROBOT = (
         'stop_other_robot',
-        'stop the node that publishes accepted_checkpoint of another robot',
+        'stop the node of the other robot that publishes accepted_checkpoint',
     )
     PROVIDE_CHECKPOINT = (
         'provide_checkpoint',
-        'set the parameter checkpoint, or start the learner',
+        'set the parameter `checkpoint`, or start the learner',
     )
     WAIT_UNTIL_COOL = 'wait_until_cool', 'wait until all windings are below temperature_limit'
     REPORT_LOG = 'report_log', 'report the error with the log of the controller'

@@ -82,11 +82,11 @@ def _values(message: Any, rows: int, columns: int) -> Array:
     """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked."""
     count = len(message.data)
     if count > MOST_ENTRIES:
-        raise MessageError('oversized', f'{count} values, at most {MOST_ENTRIES}')
+        raise MessageError('oversized', f'{count} values; legal: at most {MOST_ENTRIES}')
     if count == 0:
-        raise MessageError('empty', f'no values, expected {rows * columns}')
+        raise MessageError('empty', f'the data have no values; expected {rows * columns}')
     if count != rows * columns:
-        raise MessageError('wrong length', f'{count} values, not {rows * columns}')
+        raise MessageError('wrong length', f'{count} values; expected {rows * columns}')
     stated = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
     legal = [('quantity', rows, rows * columns), ('muscle', columns, columns)][rows == 1 :]
     fits = len(stated) == len(legal) and all(
@@ -96,7 +96,9 @@ def _values(message: Any, rows: int, columns: int) -> Array:
     if stated and not fits:
         raise MessageError('wrong layout', f'{stated}; expected {legal}')
     if message.layout.data_offset != 0:
-        raise MessageError('wrong layout', f'data_offset {message.layout.data_offset}, not 0')
+        raise MessageError(
+            'wrong layout', f'data_offset is {message.layout.data_offset}; expected 0'
+        )
     return np.array(message.data, dtype=float).reshape(rows, columns)
 
 
@@ -175,7 +177,7 @@ def joint_names(message: Any) -> list[str]:
     names = list(message.name)
     counts = len(names), len(message.position), len(message.effort), len(message.velocity)
     if max(counts) > MOST_ENTRIES:
-        raise MessageError('oversized', f'{max(counts)} entries, at most {MOST_ENTRIES}')
+        raise MessageError('oversized', f'{max(counts)} entries; legal: at most {MOST_ENTRIES}')
     if not names:
         raise MessageError('empty', 'no joints')
     if counts[1] != counts[0] or not set(counts[2:]) <= {0, counts[0]}:
@@ -237,7 +239,9 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
     """
     names, points = list(message.joint_names), list(message.points)
     if len(names) * max(len(points), 1) > MOST_ENTRIES:
-        problem = f'{len(points)} points of {len(names)} joints, at most {MOST_ENTRIES} values'
+        problem = (
+            f'{len(points)} points of {len(names)} joints; legal: at most {MOST_ENTRIES} values'
+        )
         raise MessageError('oversized', problem)
     if not points:
         return None
@@ -252,7 +256,7 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
             'effort', 'the points have efforts; legal: positions, velocities, accelerations'
         )
     if velocity is None and acceleration is not None:
-        raise MessageError('wrong length', 'accelerations without velocities')
+        raise MessageError('wrong length', 'the points have accelerations, but no velocities')
     spans = [point.time_from_start for point in points]
     time = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     if not (np.diff(time, prepend=-1e-9) > 0.0).all() or time[0] < 0.0:
@@ -273,7 +277,7 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
 def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:
     """Check that a trajectory names joints of the robot, each once."""
     if not names:
-        raise MessageError('empty', 'points, but no joint_names')
+        raise MessageError('empty', 'the trajectory has points, but no joint_names')
     if unknown := [name for name in names if name not in joints]:
         raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
     if len(set(names)) < len(names):

@@ -184,7 +184,8 @@ class McapFile:
         topic.message_count += 1
         time = message.log_time
         if max(time, message.publish_time) > LATEST:
-            raise ValueError('a message has a time beyond the range of ROS time')
+            largest = max(time, message.publish_time)
+            raise ValueError(f'a message has the time {largest} ns; legal: at most {LATEST} ns')
         newest = self._newest[topic.name] = max(self._newest.get(topic.name, 0), time)
         self.start, self.end = min(self.start, time), max(self.end, time)
         if newest - time > LONGEST_DISORDER:

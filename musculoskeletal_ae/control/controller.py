@@ -54,6 +54,9 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream,
 
 WINDOW = 3  # number of messages in the median filter against outliers
 RESTORE = 'call estimator/restore to use isolated muscles again'
+GUIDED = (
+    'with method `float`, the arm is guided by hand; set the parameter `method` to another method'
+)
 #: longest time in which the estimator isolates the suspect of an anomaly, or reacts to a length
 #: jump [s]
 REACTION_TIME = 1.0
@@ -447,7 +450,7 @@ class Controller:
         if wanted and condition is not None:
             return f'stopped: {condition}'
         if wanted and self.settings.method == 'float':
-            return 'with method float, the arm is guided by hand; set another method first'
+            return GUIDED
         if wanted and not (self.robot.tension_source.is_known or self.stream.body.offsets.known):
             return (
                 'the length offsets are unknown, and exploration cannot determine them without '
@@ -719,6 +722,4 @@ class Controller:
 
     def _refuse_gravity_compensation(self) -> None:
         if self.settings.method == 'float':
-            raise MessageError(
-                'method float', 'the arm is guided by hand; set another method first'
-            )
+            raise MessageError('method float', GUIDED)

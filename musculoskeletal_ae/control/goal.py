@@ -81,5 +81,5 @@ class FollowedGoal:
         if off[m] <= bounds[m]:
             return None
         unit = self._core.robot.units[m].theta
-        error = f'is off by {off[m]:.3f} {unit}, tolerance {bounds[m]:.3g} {unit}'
+        error = f'deviates by {off[m]:.3f} {unit}; its tolerance is {bounds[m]:.3g} {unit}'
         return code, f'{self._joints[m]} {error}'

@@ -80,7 +80,7 @@ class Hand:
         theta, lack = nearest_held(robot, mae, start, theta)
         reason = '; '.join(filter(None, (reason, lack)))
         if reason and not nearest:
-            remedy = 'send another pose, or set the parameter unreachable to nearest'
+            remedy = 'send another pose, or set the parameter `unreachable` to `nearest`'
             raise MessageError(kind, f'{reason}; {remedy}')
         return theta, reason
 

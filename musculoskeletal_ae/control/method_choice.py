@@ -20,7 +20,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
         legal = tuple(method for method in METHODS if method not in BY_TENSION)
         raise MusculoskeletalError(
             f'method {settings.method!r} requires measured tensions, but tension_source in '
-            'muscles.yaml is current: the friction of a resting drive hides the force of a hand; '
+            'muscles.yaml is `current`: the friction of a resting drive hides the force of a hand; '
             f'legal: {", ".join(legal)}'
         )
     if robot.tension_source.is_known:
@@ -29,7 +29,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
     if settings.method not in legal:
         raise MusculoskeletalError(
             f'method {settings.method!r} requires tensions, but tension_source in muscles.yaml is '
-            f'none; legal with preset {settings.preset!r}: {", ".join(legal)}'
+            f'`none`; legal with preset {settings.preset!r}: {", ".join(legal)}'
         )
 
 

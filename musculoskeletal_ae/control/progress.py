@@ -95,7 +95,7 @@ class Progress:
 
     @property
     def has_fallen(self) -> bool:
-        """Whether an arm with isolated muscles rests far from the end of its trajectory."""
+        """Whether an arm with isolated muscles is far from the target after its trajectory."""
         is_at_rest = self.trajectory is not None and self.next is None and self.over > FALLING
         return is_at_rest and not self._robot.used.all() and self._largest_error > FALLEN
 

@@ -48,9 +48,9 @@ class Settings:
     )
     target_duration: float = settable(
         1.2,
-        'duration of a movement to a target with method `proposed` of preset default, or '
-        '`stiffness`; it is extended if the muscle modules are too slow, or the muscles that are '
-        'not isolated too weak (0: first_duration)',
+        'duration of a movement to a target with method `stiffness`, or with method `proposed` of '
+        'preset `default`; it is extended if the muscle modules are too slow, or if the muscles '
+        'that are not isolated are too weak (0: first_duration)',
         's',
         0.0,
         60.0,
@@ -93,7 +93,7 @@ class Settings:
     unreachable: str = settable(
         'refuse',
         'response to a target_pose out of reach, or to a target that is not holdable without the '
-        'isolated muscles: refuse it, or go to the nearest posture',
+        'isolated muscles: `refuse` the target, or go to the `nearest` posture',
         legal=UNREACHABLE,
     )
     max_age: float = settable(

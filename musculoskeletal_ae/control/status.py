@@ -76,7 +76,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         warnings.append(f'target clamped to the joint limits: {", ".join(target.clamped)}')
     _add_stiffness(core, values)
     if target.effort.any() and core.settings.method in ('geometric', 'first', 'second'):
-        warnings.append(f'method {core.settings.method} ignores the effort of the target')
+        warnings.append(f'method `{core.settings.method}` ignores the effort of the target')
     follower = core.activities.follower
     if core.is_following:
         values['lag of the winches'] = f'{1000.0 * follower.winches.lag:.0f} ms'
@@ -166,7 +166,7 @@ def slowed(follower: Follower) -> str:
             f'of {requested:.3g} s takes {slowed_duration:.3g} s because of the limits of '
             'the muscle modules'
         )
-    return f'slowed to {share:.0f} % of its speed for the muscle modules'
+    return f'slowed to {share:.0f} % of its speed because of the limits of the muscle modules'
 
 
 def _fallen(core: Controller, estimate: Array) -> str:
@@ -183,4 +183,4 @@ def _fallen(core: Controller, estimate: Array) -> str:
     missing = reach.lacking(robot, mae, estimate)
     if not missing:
         return text
-    return f'{text}; in this posture, the muscles lack {missing}; lift it by hand'
+    return f'{text}; in this posture, the muscles lack {missing}; lift the arm by hand'

@@ -116,7 +116,8 @@ class Trajectory:
         time, position = points.time[kept] - passed, points.position[kept]
         if ((apart := np.diff(time, prepend=0.0)) < RESOLUTION * time).any():
             raise MessageError(
-                'points too close in time', f'two points are only {apart.min():.3g} s apart'
+                'points too close in time',
+                f'two points are only {apart.min():.3g} s apart; send one of them only',
             )
         left = Points(points.joints, time, position, velocity, acceleration)
         return cls._joined(start, left)
@@ -183,13 +184,14 @@ class Trajectory:
         out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
         if not np.isfinite(out).all():
             raise MessageError(
-                'leaves the joint limits', 'the curve between the points overflows floating point'
+                'leaves the joint limits',
+                'the values of the curve between the points overflow floating point',
             )
         beyond = out / robot.kinematics.radian
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
             excess = f'{out[j]:.3g} {robot.units[j].theta}'
-            detail = f'between its points, {robot.joints[j]} exceeds its limits by {excess}'
+            detail = f'between the points, joint {robot.joints[j]} exceeds its limits by {excess}'
             raise MessageError('leaves the joint limits', detail)
 
     @property

@@ -143,10 +143,10 @@ class MotionTest(ABC):
         unknown = [name for j, name in enumerate(robot.joints) if j not in judgement.right]
         if judgement.right:
             names = ', '.join(robot.joints[j] for j in judgement.right)
-            verdict.notes.append(f'the joint sensors have the right sign: {names}')
+            verdict.notes.append(f'these joint sensors have the right sign: {names}')
         if unknown:
             verdict.notes.append(
-                f'the sign of these joint sensors is not known, because the joint moved too '
+                f'the sign of these joint sensors is not known, because the joints moved too '
                 f'little: {", ".join(unknown)}. Repeat the test with a higher --tension, or move '
                 'the arm by hand while check_driver listens'
             )

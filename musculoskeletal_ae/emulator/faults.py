@@ -47,7 +47,7 @@ KINDS = {
     'stuck_motor': Kind('motors are jammed'),
     'winch_speed': Kind('motors are limited to this speed', 0.009, SPEED_LIMIT, 'm/s'),
     'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
-    'slack': Kind('tendons are longer', 0.05, 1.0, 'm'),
+    'slack': Kind('tendons are longer by this size', 0.05, 1.0, 'm'),
     'overheat': Kind('modules have at least this temperature', 90.0, 1e3, '°C'),
 }
 LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)

@@ -119,8 +119,8 @@ class Estimator:
         self._valid_offsets = self.body.offsets  # the last known offsets
         self._commands = ModuleCommands()
         self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
-        #: whether the network determines the isolated muscles, as it does until `isolate` or a
-        #: finding
+        #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
+        #: with the first finding or call of `isolate` or `keep_isolated`
         self._follows_network = True
 
     @property
@@ -194,8 +194,8 @@ class Estimator:
         """
         if self.mae is None:
             raise MusculoskeletalError(
-                'a length calibration requires a checkpoint; set the parameter checkpoint or start '
-                'the learner'
+                'a length calibration requires a checkpoint; set the parameter `checkpoint`, or '
+                'start the learner'
             )
         check_stated_posture(self.robot, posture)
         if not posture and not self.robot.tension_source.is_known:

@@ -99,7 +99,7 @@ class LengthCalibration:
     def problem(self) -> str:
         """Why the calibration does not end although it has enough data, or ''."""
         if self._collector.has_moved_away:
-            return 'the arm moved away; let it stand and call estimator/zero again'
+            return 'the arm moved away; hold it still and call estimator/zero again'
         return self._problem
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:

@@ -28,7 +28,7 @@ class Detection:
     )
     on_anomaly: str = settable(
         'stop',
-        'stop: the arm stops until estimator/reset is called; isolate: the suspect muscle is '
+        '`stop`: the arm stops until estimator/reset is called; `isolate`: the suspect muscle is '
         'verified and, if it is faulty, isolated; then the arm resumes',
         legal=ON_ANOMALY,
     )

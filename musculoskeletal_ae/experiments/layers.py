@@ -129,8 +129,8 @@ def layers(_: Study, rows: Rows) -> Plot:
     count = row.numbers['trainings']
     return figure, (
         'Error of the estimate on the held-out motion with other hidden layers of the encoder, '
-        f'mean of {count} trainings, and a dot for each. In brackets: after how many of them '
-        'learning started.'
+        f'mean of {count} trainings, and a dot for each. In brackets: the number of trainings '
+        'whose network passed checkpoint validation, and with which learning started.'
     )
 
 

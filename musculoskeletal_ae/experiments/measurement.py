@@ -78,8 +78,9 @@ def _work_folder(args: Namespace) -> Iterator[Path]:
         before = json.loads(file.read_text(encoding='utf-8'))
         if before != options:
             changed = ', '.join(f'{key} {before.get(key)}' for key in options)
-            problem = f'--keep {args.keep} holds parts of a run with other options ({changed})'
-            raise MusculoskeletalError(f'{problem}; repeat them, or name an empty folder')
+            problem = f'--keep {args.keep} contains parts of a run with other options ({changed})'
+            remedy = 'use these options again, or name an empty folder'
+            raise MusculoskeletalError(f'{problem}; {remedy}')
     elif any(args.keep.iterdir()):
         raise MusculoskeletalError(f'--keep {args.keep}: expected an empty or new folder')
     file.write_text(json.dumps(options), encoding='utf-8')

@@ -147,7 +147,14 @@ def follow(
 
 
 def settling(loop: ClosedLoop, goal: Array) -> float:
-    """Return the time [s] until the arm stays within a distance WITHIN of `goal` [rad] (D,)."""
+    """Send a target; return the time [s] until the arm stays within a distance WITHIN of it.
+
+    The arm is simulated for SETTLING_TIME, which is also the result if the arm does not settle.
+
+    Args:
+        loop: The arm and its controller.
+        goal: The target [rad], (D,).
+    """
     last = 0
     loop.target(goal)
     for n in range(round(SETTLING_TIME / SAMPLE_TIME)):
@@ -320,7 +327,9 @@ def motion_hand(_: Study, rows: Rows) -> Plot:
         panel.set_aspect('equal')
         error = 1000.0 * np.linalg.norm(true - desired, axis=1).mean()
         plots.tidy(panel, '[mm]', '[mm]', f'mean error {error:.1f} mm', legend='below')
-    return figure, f'Circles of the hand at {SPEED} m/s by target_pose, individual {seed}.'
+    return figure, (
+        f'Circles of the hand, which target_pose commands at {SPEED} m/s. Individual {seed}.'
+    )
 
 
 PLOTS = motion, motion_hand, contact.forces

@@ -79,7 +79,8 @@ def text(results: Results, folder: Path) -> str:
         MusculoskeletalError: If there are no results.
     """
     if not results:
-        raise MusculoskeletalError(f'{folder} has no results; run experiment paper --page first')
+        command = f'experiment paper --page {folder}.md'
+        raise MusculoskeletalError(f'{folder} has no results; first run: {command}')
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=False,  # noqa: S701 (Markdown, not HTML)

@@ -113,7 +113,7 @@ def read(folder: Path) -> Results:
             try:
                 results[name] = _read_result(file)
             except MusculoskeletalError as error:
-                print(f'warning: {error}: left out', file=sys.stderr)
+                print(f'warning: {error}; this experiment is left out', file=sys.stderr)
     return results
 
 
@@ -228,7 +228,7 @@ def individuals(seeds: Sequence[int]) -> str:
 def readme_table(results: Results) -> str:
     """Return the text between the markers of a page."""
     if not results:
-        return '\n\nNothing measured yet: `experiment all --readme doc/results.md`.\n\n'
+        return '\n\nThere are no results yet; run `experiment all --readme doc/results.md`.\n\n'
     about = next(iter(results.values()))['about']
     text = (
         f'\n\n{about["robot"]}, means over emulated individuals, {about["minutes"]:g} minutes of '

@@ -206,7 +206,7 @@ def ablation(_: Study | None, rows: Rows) -> Plot:
     changes = dict(sorted(changes.items(), key=lambda item: float(np.mean(item[1]))))
     figure, (panel,) = plots.new_figure(8.0, 4.6)
     colours = [plots.AFTER] * len(changes)
-    title = 'Change of the error after learning without one group of effects'
+    title = 'Change of the error after learning if one group of effects is removed'
     xlabel = 'change of the mean error [mrad]; negative: the effects increase the error'
     plots.ranked_bars(panel, changes, colours, xlabel, title, digits=1)
     panel.axvline(0.0, color=plots.TRUE, lw=1.0)
@@ -217,7 +217,7 @@ def ablation(_: Study | None, rows: Rows) -> Plot:
         panel.axvspan(-largest, largest, color=plots.MARK, alpha=0.15, lw=0.0)
         spread = f' Grey: the largest change of a repeated run, {largest:.1f} mrad.'
     return figure, (
-        'Change of the error after learning without one group of effects of emulator model '
+        'Change of the error after learning if one group of effects is removed from emulator model '
         f'foreign. The error with all effects is {1e3 * whole:.0f} mrad (individuals '
         f'{", ".join(map(str, known))}).{spread}'
     )

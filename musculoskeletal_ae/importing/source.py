@@ -121,7 +121,9 @@ class Source:
         """Add a joint at a pose in the frame of the joint `parent` (0: none); return its index."""
         kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
         if (size := np.linalg.norm(axis)) < 1e-9:
-            raise ValueError(f'joint {name}: expected a direction as its axis')
+            raise ValueError(
+                f'joint {name}: axis {axis.tolist()}; expected a vector other than zero'
+            )
         if self.model.existJointName(name):
             raise ValueError(f'joint {name}: expected a unique name that pinocchio does not use')
         low, high = (np.array([limit]) for limit in self.limited(name, slides, *limits))
@@ -273,18 +275,20 @@ def cut(
     base: str = '',
     end: str = '',
 ) -> None:
-    """Reduce the source in place to a chain.
+    """Reduce the source in place to the links that descend from the base, and to some joints.
 
-    All other joints are held fixed, with a note. Links that do not descend from the base are
-    removed, with their muscles. Muscles that move no joint are removed as well.
+    The remaining joints are held fixed, with a note. All other links are removed, with their
+    muscles. Muscles that move no joint are removed as well.
 
     Args:
         source: The source.
-        joints: Joints that stay movable; by default all.
+        joints: Joints that stay movable; by default all. If `end` is given, joints that move
+            neither it nor a coupled joint on the path to it are held fixed as well.
         muscles: Muscles that stay; by default all.
         without: Muscles to remove.
         base: The new root link; by default the present one.
-        end: The end effector, a link or a point; by default it is chosen, with a note.
+        end: The end effector, a link or a point; by default it is chosen, with a note, and holds
+            no joint fixed.
     """
     model, links = source.model, source.links
     if base and base not in links:
@@ -297,7 +301,7 @@ def cut(
     inside = [i for i, above in enumerate(model.supports) if root in list(above)]
     if end and source.place(end)[0] not in inside:
         raise SourceError(
-            f'--end {end!r} is not in the chain that begins at --base {base!r}; choose another link'
+            f'--end {end!r} does not descend from --base {base!r}; choose another end or base'
         )
     source.links = [name for name in links if source.place(name)[0] in inside]
     source.links.sort(key=lambda name: name != base)

@@ -187,8 +187,8 @@ class StateStore:
             write_whole(self.directory / NETWORK, network)
         except OSError as error:
             raise StateError(
-                f'samples and network are saved, but not the checkpoint {self.directory / NETWORK} '
-                f'({error}); free disk space and try again'
+                'the state is saved with samples and network, but the network could not also be '
+                f'written to {self.directory / NETWORK} ({error}); free disk space and try again'
             ) from error
 
     def trouble(self, samples: SampleStore) -> str:

@@ -102,7 +102,10 @@ class CheckDriver:
         elif (publishers := node.count_publishers(self.topic)) > 1:
             verdict.failed('several', n=publishers, topic=self.topic)
         if not node.count_publishers(JOINTS):
-            verdict.notes.append('joint_states, which the learner needs, has no publisher')
+            verdict.notes.append(
+                'joint_states has no publisher; the learner needs it, unless its parameter '
+                '`joint_source` is `marker` or `none`'
+            )
         return verdict
 
     def alone(self, own: int = 0) -> bool:

@@ -250,8 +250,8 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
         section = sections.get(ALL_NODES)
         parameters = section.get('ros__parameters') if isinstance(section, dict) else None
         if not isinstance(parameters, dict):
-            problem = f'expected parameters of all nodes, in section {ALL_NODES!r} under'
-            raise _unreadable(file, f'{problem} ros__parameters, as in config/nodes.yaml')
+            problem = f'expected a section {ALL_NODES!r} with a mapping `ros__parameters`'
+            raise _unreadable(file, f'{problem}, as in config/nodes.yaml')
         try:
             check_names(map(str, parameters))
             for name in MOTORS.keys() & parameters.keys():

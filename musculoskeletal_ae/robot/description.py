@@ -111,7 +111,7 @@ def branches(route: Route) -> list[Route]:
 class TensionRange:
     """Muscle tensions [N], each of shape (M,)."""
 
-    bias: Array  # T_bias, which MSC maintains
+    bias: Array  # T_bias, which muscle stiffness control maintains
     limit: Array  # T_limit, the highest planned tension
     max: Array  # T_max, the highest permitted tension
 

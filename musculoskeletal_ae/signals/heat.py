@@ -99,7 +99,10 @@ class Heat:
         return np.where(self._known, self._state[0] + self._state[1], np.nan)
 
     def accept(self, *muscles: int) -> None:
-        """Accept the current constants of these muscles' modules as the new reference."""
+        """Accept the changed κ and τ₂ of these muscles' modules as the new reference.
+
+        Modules that are not in `changed` keep their reference.
+        """
         for m in self.changed.keys() & muscles:
             self._reference[:, m] = self._state[[2, 4], m]
             del self.changed[m]

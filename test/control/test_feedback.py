@@ -72,7 +72,8 @@ def test_relief_pays_out_antagonists_and_exerts_no_torque(robot):
         steps += 1
     assert steps * DT <= RELIEF_INTERVAL + 2 * DT
     change = feedback.relief - before
-    # The relief covers one more step than this loop counted: the arm was at rest before it.
+    # The relief covers one more step than this loop counted: the last step of `rested`, in which
+    # the arm was at rest already.
     expected = GAIN * (steps + 1) * DT * (needless - holding(robot)) / robot.stiffness
     assert change == pytest.approx(expected, abs=1e-9)
     assert jacobian(robot).T @ change == pytest.approx(np.zeros(robot.joint_count), abs=1e-9)

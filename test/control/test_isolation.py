@@ -192,7 +192,7 @@ def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
     assert reported
     for _ in range(150):
         bench.step(100)
-        if f'the muscles lack {reported}; lift it by hand' in bench.report().message:
+        if f'the muscles lack {reported}; lift the arm by hand' in bench.report().message:
             return
     raise AssertionError(bench.report().message)
 

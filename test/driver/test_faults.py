@@ -101,7 +101,7 @@ def test_a_sound_driver_is_found_sound(seed):
         assert not verdict.faults, str(verdict)
     verdict = settled(seed).wind()
     assert not verdict.faults, str(verdict)
-    assert f'joint sensors have the right sign: {", ".join(ROBOT.joints)}' in str(verdict)
+    assert f'these joint sensors have the right sign: {", ".join(ROBOT.joints)}' in str(verdict)
     reported = str(verdict).splitlines()
     for name, line in zip(ROBOT.muscles, reported[1:]):
         assert line.startswith(name)

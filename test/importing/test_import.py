@@ -492,7 +492,7 @@ def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_pa
     [
         ({'joints': ['knee']}, "--joints: unknown joint 'knee'; joints: swing, lift, elbow"),
         ({'muscles': ['psoas']}, "--muscles: unknown muscle 'psoas'"),
-        ({'base': 'lower', 'end': 'upper'}, "is not in the chain that begins at --base 'lower'"),
+        ({'base': 'lower', 'end': 'upper'}, "does not descend from --base 'lower'"),
     ],
 )
 def test_a_wrong_option_names_what_is_legal(mjcf, options, expected):

@@ -161,7 +161,7 @@ def test_permuted_muscles_are_refused(mae, robot):
         ({'preset': 'other'}, 'legal: default, paper'),
         ({'units': 'degree'}, 'units'),
         ({'version': -1}, 'version: expected int >= 0, got -1'),
-        ({'isolated': [2]}, 'different indices of muscles'),
+        ({'isolated': [2]}, 'indices of muscles, 0 to 1, each at most once'),
         ({'anomaly_calibrated': None}, 'tensors missing or unknown: anomaly'),
         ({'anomaly_thresholds': {'norm': float('nan')}}, 'NaN'),
         ({'anomaly_thresholds': {'norm': 10**400}}, 'anomaly_thresholds'),

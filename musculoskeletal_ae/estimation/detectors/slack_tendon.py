@@ -106,7 +106,7 @@ class SlackTendon(Detector):
             return None
         muscle = int(np.argmax(np.where(is_dead, self._slack_time, 0.0)))
         return Finding(
-            muscle, Kind.SLACK_TENDON, 'it has no tension although the command demands it'
+            muscle, Kind.SLACK_TENDON, 'it has no tension although the command demands tension'
         )
 
     def _demand(self, observation: Observation) -> Array | None:
