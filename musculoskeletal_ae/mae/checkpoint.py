@@ -97,8 +97,8 @@ class Metadata(Strict, frozen=True):
                 raise ValueError(problem)
         known, muscles = set(self.isolated), range(len(self.muscles))
         if len(known) < len(self.isolated) or not known <= {*muscles}:
-            legal = f'indices of muscles, 0 to {len(muscles) - 1}, each at most once'
-            raise ValueError(f'isolated {self.isolated}; legal: {legal}')
+            indices = f'indices of muscles, 0 to {len(muscles) - 1}, each at most once'
+            raise ValueError(f'isolated {self.isolated}; legal: {indices}')
         # Encoder and decoder have the same hidden layers; the latent layer is in the middle.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))
         for group, sizes in zip(self.groups, self.sizes_by_group(), strict=True):

@@ -234,8 +234,8 @@ def test_tools_read_the_file_of_the_nodes(tmp_path):
         ('/**: {ros__parameters: {spool_radiu: [0.01]}}', 'nearest: spool_radius'),
         ('estimator: {ros__parameters: {spool_radius: [0.01]}}', "state it under '/\\*\\*'"),
         ('a: {estimator: {ros__parameters: {spool_radius: [0.01]}}}', "state it under '/\\*\\*'"),
-        ('/**: {spool_radius: [0.01]}', "expected a section '/**'"),
-        ('just a text', "expected a section '/**'"),
+        ('/**: {spool_radius: [0.01]}', 'with a mapping `ros__parameters`'),
+        ('just a text', 'with a mapping `ros__parameters`'),
     ],
 )
 def test_a_file_that_tools_would_misread_is_refused(tmp_path, text, problem):
