@@ -321,10 +321,10 @@ train_once() {
     say "initial network from an earlier run (without what was learned since): $checkpoint"
     return
   fi
-  [ -t 1 ] || export TQDM_MININTERVAL=5 # fewer lines of a progress bar in a file
   say "training the initial network of $robot (once; it takes a minute or two)"
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
-    > >(tee "$logs/train.log") 2>&1
+    > >(tee "$logs/train.log" | sed -un -e '/^training: /p' -e '/^warning: /p' \
+      -e 's/^error on the geometric model: \([^(]*[^ (]\).*/-- initial network: \1 on the geometric model/p') 2>&1
   wait_for train || died train $?
 }
 
@@ -370,8 +370,9 @@ own_clock=false # whether the emulated arm is slower than real time
 [ -z "$mujoco" ] || import_mujoco
 [ -n "$checkpoint" ] || train_once
 
-under=()
-[ -z "$namespace" ] || under=(-r "__ns:=/$namespace")
+# Each process writes one log, to which `start` redirects its output; rcl would write a second one.
+under=(--disable-external-lib-logs)
+[ -z "$namespace" ] || under+=(-r "__ns:=/$namespace")
 common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
   -p "robot:=$(quoted "$robot")" -p "preset:=$preset" -p "seed:=$seed"
   -p "checkpoint:=$(quoted "$checkpoint")")

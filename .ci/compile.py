@@ -1,15 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fill numba's cache by one step of both emulator models and of the simulator.
 
-A node that compiles at run time cannot keep its rate, and cannot be stopped meanwhile.
+A node that compiles at run time cannot keep its rate, and cannot be stopped meanwhile. The progress
+is printed, because compilation takes half a minute on a fast computer, and minutes on a busy one.
 """
+
+import sys
+from typing import Any
+
+from numba.core import event
+from numba.extending import is_jitted
 
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-robot = Robot.load('arm26')
-for reality in ('kin', 'foreign'):
-    make_arm(robot, seed=0, reality=reality).step(0.001)
-Simulation(robot, initial_mae(robot, steps=1).mae).step(0.01)
+
+def functions_to_compile() -> set[str]:
+    """Return the names of the compiled functions of all imported modules of the package."""
+    return {
+        _name(function)
+        for module_name, module in list(sys.modules.items())
+        if module_name.startswith('musculoskeletal_ae.')
+        for function in vars(module).values()
+        if is_jitted(function)
+    }
+
+
+def _name(function: Any) -> str:
+    return f'{function.py_func.__module__}.{function.py_func.__qualname__}'
+
+
+class Progress(event.Listener):
+    """Prints how many functions of the package have been compiled."""
+
+    def __init__(self) -> None:
+        self._compiled: set[str] = set()
+
+    def on_start(self, compilation: event.Event) -> None:
+        """Do nothing: the end of a compilation counts."""
+
+    def on_end(self, compilation: event.Event) -> None:
+        """Count a function; numba may compile it several times, for several types."""
+        functions, name = functions_to_compile(), _name(compilation.data['dispatcher'])
+        if name in functions and name not in self._compiled:
+            self._compiled.add(name)
+            print(f'compiling: {len(self._compiled)} of {len(functions)}', flush=True)
+
+
+with event.install_listener('numba:compile', Progress()):
+    robot = Robot.load('arm26')
+    for reality in ('kin', 'foreign'):
+        make_arm(robot, seed=0, reality=reality).step(0.001)
+    Simulation(robot, initial_mae(robot, steps=1).mae).step(0.01)

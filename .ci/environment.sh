@@ -38,11 +38,16 @@ step() {
   return 1
 }
 
-# On a terminal, each line replaces the previous one.
+# On a terminal, each line replaces the previous one. Otherwise a line is shown every 20 s.
 show_progress() {
-  local line
+  local line shown=$SECONDS
   while read -r line; do
-    [ ! -t 1 ] || printf '\r   %.70s\033[K' "$line"
+    if [ -t 1 ]; then
+      printf '\r   %.70s\033[K' "$line"
+    elif ((SECONDS - shown >= 20)); then
+      shown=$SECONDS
+      printf '   %.70s\n' "$line"
+    fi
   done
   [ ! -t 1 ] || printf '\r\033[K'
 }
@@ -170,7 +175,7 @@ compile_package() { # PACKAGE STAMP
   if [ -e "$stamp" ] && [ -z "$(find "$package" -name '*.py' -newer "$stamp" \
     -exec grep -l njit {} +)" ]; then return; fi
   find "$package" -name '*.nb[ci]' -delete
-  step 'compiling with numba (this takes half a minute the first time)' \
+  step 'compiling with numba (half a minute the first time, or minutes on a busy computer)' \
     env PYTHONPATH="${package%/*}${PYTHONPATH:+:$PYTHONPATH}" "$python" "$repository/.ci/compile.py" ||
     fail 'The package could not be compiled.'
   touch "$stamp"

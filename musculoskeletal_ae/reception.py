@@ -11,6 +11,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
 SHOWN = 10.0  # time for which `refusal` reports the last refusal [s]
+#: longest time between two messages of a stream [s]; `ros2 topic pub` sends one message a second
+STREAM_GAP = 1.5
 # A source time that lies further back than this comes from another clock, not from reordering.
 REORDERING = 1_000_000_000  # [ns]
 
@@ -146,6 +148,21 @@ class Reception:
         elapsed, self._rates_taken_at = now - self._rates_taken_at, now
         received, self._received = self._received, Counter(dict.fromkeys(self._received, 0))
         return {topic: count / elapsed for topic, count in received.items()}
+
+
+class Streams:
+    """Distinguishes the first message of a stream from those that follow it.
+
+    A message belongs to a stream if the one before came at most STREAM_GAP seconds earlier.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[str, float] = {}  # time of the newest message [s], by topic
+
+    def begins(self, topic: str, now: float) -> bool:
+        """Note a message that arrived at `now` [s]; return whether it is not part of a stream."""
+        before, self._last[topic] = self._last.get(topic, -math.inf), now
+        return now - before > STREAM_GAP
 
 
 class Stamps:

@@ -4,7 +4,7 @@
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.reception import Reception, Streams
 
 SECOND = 1_000_000_000
 
@@ -19,6 +19,14 @@ class Inbox:
 
     def get(self, message, time, number):
         self.receive(message, {'source_timestamp': time, 'publication_sequence_number': number})
+
+
+def test_only_the_first_message_of_a_stream_begins_it_and_each_topic_has_its_own():
+    streams = Streams()
+    assert [streams.begins('target', now) for now in (0.0, 1.0, 1.1, 5.0)] == [
+        True, False, False, True
+    ]  # fmt: skip
+    assert streams.begins('pose', 5.1)
 
 
 def test_repeated_and_late_messages_are_dropped_and_counted():

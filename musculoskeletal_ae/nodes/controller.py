@@ -30,7 +30,7 @@ from musculoskeletal_ae.control.method_choice import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.control.stops import StopCause
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
     RELIABLE,
@@ -43,7 +43,7 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
-from musculoskeletal_ae.reception import Stamps
+from musculoskeletal_ae.reception import Stamps, Streams
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
@@ -77,6 +77,7 @@ class Controller(Shell):
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
         self.published_mode = ''
         self.estimate_stamps = Stamps()
+        self.requests = Streams()  # accepted requests for motion
         self.publishers_of = {
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
@@ -185,6 +186,8 @@ class Controller(Shell):
 
     def _target(self, message: JointState) -> None:
         self.core.target(read_target(message, self.robot.joints))
+        names = ', '.join(f'{n} {p:.3f}' for n, p in zip(message.name, message.position))
+        self._log_accepted('target_joint_states', printable(names))
         warn = self.get_logger().warning
         if not self.core.supervisor.is_running:
             condition = self.core.supervisor.condition
@@ -199,6 +202,11 @@ class Controller(Shell):
         points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
         begin = stamp.sec + 1e-9 * stamp.nanosec  # a stamp of 0 means: begin now
         self.core.trajectory(points, begin - self.now() if begin > 0.0 else 0.0)
+        content = 'no points, so the motion ends'
+        if message.points:
+            end = message.points[-1].time_from_start
+            content = f'{len(message.points)} points, {end.sec + 1e-9 * end.nanosec:.1f} s'
+        self._log_accepted('joint_trajectory', content)
         self._warn_if_slowed()
 
     def _pose(self, message: PoseStamped) -> None:
@@ -206,6 +214,8 @@ class Controller(Shell):
         pose = read_pose(message, self.root_frame, only)
         before = self.core.target_state.unreachable_reason
         self.core.pose(pose, not only, self.now())
+        x, y, z = pose.translation
+        self._log_accepted('target_pose', f'position ({x:.3f}, {y:.3f}, {z:.3f}) m')
         reason = self.core.target_state.unreachable_reason
         if reason not in ('', before):
             self.get_logger().warning(f'out of reach: {reason}')
@@ -213,6 +223,12 @@ class Controller(Shell):
 
     def _twist(self, message: TwistStamped) -> None:
         self.core.twist(read_twist(message, self.root_frame))
+        self._log_accepted('target_twist', 'the hand moves at this velocity')
+
+    def _log_accepted(self, topic: str, content: str) -> None:
+        """Log an accepted request for motion; of a stream of requests, log only the first."""
+        if self.requests.begins(topic, time.monotonic()):
+            self.get_logger().info(f'accepted {topic}: {content}')
 
     def _warn_if_slowed(self) -> None:
         if slowed := status.slowed(self.core.activities.follower):

@@ -220,6 +220,7 @@ class ArmTerms(NamedTuple):
     name: str
     other: str  # where to route a muscle that must act in the other direction
     better: str  # where to route a muscle for a larger moment arm
+    guided: str  # how to keep a tendon on one side of the joint, as the end of a sentence, or ''
 
     def decimals(self, longest: float) -> int:
         """Return the number of decimals for moment arms of at most `longest` [m]."""
@@ -230,8 +231,9 @@ def arm_terms(robot: Robot, joint: int) -> ArmTerms:
     """Return unit and wording for moment arms at a joint."""
     if robot.kinematics.slides[joint]:
         towards_other_end = 'towards the other end of'
-        return ArmTerms(100.0 / RACK, '%', 'force share', towards_other_end, 'more parallel to')
-    return ArmTerms(1e3, 'mm', 'moment arm', 'to the other side of', 'further from')
+        return ArmTerms(100.0 / RACK, '%', 'force share', towards_other_end, 'more parallel to', '')
+    guided = ', or keep it on one side of the axis by `wrap: cylinder` around the axis'
+    return ArmTerms(1e3, 'mm', 'moment arm', 'to the other side of', 'further from', guided)
 
 
 def required_stiffness(robot: Robot, required: float) -> str:

@@ -75,6 +75,7 @@ def train(args: Namespace) -> None:
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
     planned = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, limit))
+    print(model_error(planned, robot.kinematics.distance_unit))
     print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
     if (most > limit).any():
         overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
@@ -306,6 +307,12 @@ def table(errors: list[PairError], title: str) -> str:
         cells = [f'{e.norm:.4f} ({e.elements.mean():.4f})' for e in errors if e.mask is mask]
         lines.append(f'{name:<12}' + ''.join(cell.rjust(26) for cell in cells))
     return '\n'.join(lines)
+
+
+def model_error(errors: list[PairError], unit: str) -> str:
+    """Return the mean error of the estimated joint angles as one line, which bringup.sh shows."""
+    (error,) = (e.norm for e in errors if (e.mask, e.output) == (Mask.TENSION_LENGTH, 'theta'))
+    return f'error on the geometric model: {error:.3f} {unit} (mean of unseen states, from T and l)'
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:

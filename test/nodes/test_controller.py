@@ -48,9 +48,10 @@ def test_method_tension_sends_tensions_only_and_returns_to_lengths(arm):
     arm.goes_to(THERE)
 
 
-def test_a_target_beyond_the_limits_is_clamped_and_an_unknown_joint_rejected(arm):
+def test_a_target_beyond_the_limits_is_clamped_and_an_unknown_joint_rejected(arm, capfd):
     arm.targets.publish(JointState(name=['elbow'], position=[-9.0]))
     arm.says('target clamped')
+    assert 'accepted target_joint_states: elbow -9.000' in capfd.readouterr().err
     arm.targets.publish(JointState(name=['knee'], position=[0.0]))
     rejected = arm.controller.rejected
     arm.graph.wait(lambda: rejected['target_joint_states: unknown joint'] == 1, 'the rejection')

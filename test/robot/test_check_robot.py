@@ -278,6 +278,7 @@ def test_a_main_action_that_changes_sign_is_a_warning_not_a_fault(tmp_path):
     result = check_robot(Robot.load(change(write_robot(tmp_path), cross)))
     assert [warning.kind for warning in result.warnings] == ['flipping_muscle']
     assert "'crosser'" in result.warnings[0].message
+    assert '`wrap: cylinder`' in result.warnings[0].remedy
     assert result.faults == ()
 
 
