@@ -9,7 +9,7 @@
 #
 # Afterwards $python is the interpreter, and $executables the folder of the package's executables.
 
-: "${repository:?is set before this file is sourced}"
+: "${repository:?must be set before this file is sourced}"
 
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 

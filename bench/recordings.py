@@ -224,7 +224,8 @@ def main(argv: list[str]) -> int:
             print(f'{key}: {value}')
     if not rows:
         raise MusculoskeletalError(
-            f'no repository of the bench is cloned in {args.clones}; add --fetch to clone them'
+            f'no repository of the bench is cloned in {args.clones} and matches '
+            '--only; add --fetch to clone them, or change --only'
         )
     args.out.mkdir(parents=True, exist_ok=True)
     document = {'errors': rows, 'also': shown}

@@ -81,7 +81,10 @@ def read_source(file: Path) -> Source:
         problem = f'the root element {root.tag[:60]!r} is unknown; legal: {", ".join(READERS)}'
         raise refuse(file, f'{problem}; for an SDF, name the cardsflow.xml in its directory')
     if any('/xacro}' in element.tag for element in root.iter()):
-        raise refuse(file, 'this is a xacro, not a URDF; expand it first:  xacro FILE > arm.urdf')
+        raise refuse(
+            file,
+            'this is a xacro, not a URDF; expand it to a new file first:  xacro FILE > NEW.urdf',
+        )
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)

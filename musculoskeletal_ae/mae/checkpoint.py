@@ -86,7 +86,7 @@ class Metadata(Strict, frozen=True):
         """Check the rules that types cannot express."""
         for key, names in (('joints', self.joints), ('muscles', self.muscles)):
             if len(set(names)) < len(names) or not all(n and n.isprintable() for n in names):
-                raise ValueError(f'{key} {names}; legal: different printable names')
+                raise ValueError(f'{key} {names}; legal: printable names, each at most once')
         words = ('units', self.units, [UNITS]), ('preset', self.preset, PRESET_NAMES)
         for key, word, legal in words:
             if word not in legal:
@@ -384,7 +384,7 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
             for part, most in zip(answers, LARGEST_ESTIMATES, strict=True)
         ):
             limits = '±{:g} rad, ±{:g} N, ±{:g} m or ±{:g} m/rad'.format(*LARGEST_ESTIMATES)
-            problem = f'the estimate of the middle posture is not finite or beyond {limits}'
+            problem = f'the estimate of the middle posture is not finite, or is beyond {limits}'
             raise CheckpointError(problem)
 
 

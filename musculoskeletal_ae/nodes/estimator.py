@@ -146,7 +146,7 @@ class Estimator(Shell):
     def _isolate_more(self, request: Trigger.Request) -> str:
         if not self.muscles_to_isolate:
             raise MusculoskeletalError(
-                'the parameter isolate_muscles names no muscle; set it first'
+                '`isolate_muscles` names no muscle; set that parameter first'
             )
         wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
         self.core.reset()  # called before isolating, because a reset restores a suspect

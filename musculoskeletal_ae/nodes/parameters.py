@@ -76,7 +76,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             settable=True,
         ),
         'zero_at_start': Parameter(
-            False, 'calibrate lengths at the start, for winches without absolute encoders'
+            False, 'calibrate length offsets at the start, for winches without absolute encoders'
         ),
         **parameters_of(Detection),
         'isolate_muscles': Parameter(
@@ -105,8 +105,8 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         ),
         'deviates': Parameter(
             False,
-            'with an MJCF file as reality: emulate an individual that deviates from the file, '
-            'depending on the seed (doc/howto/mujoco.md)',
+            'if `reality` is an MJCF file: emulate an individual that deviates from the file, '
+            'depending on `seed` (doc/howto/mujoco.md)',
         ),
         'clock': Parameter(
             False,

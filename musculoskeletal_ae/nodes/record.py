@@ -241,7 +241,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         count, left_out = recover(bag, target, options.compression)
         print(f'{count} messages recovered to {target}')
         if left_out:
-            problem = f'not recorded, because they are not in CDR: {", ".join(left_out)}'
+            problem = f'topics that are not in CDR were not recovered: {", ".join(left_out)}'
             print(f'warning: {bag}: {problem}', file=sys.stderr)
     else:
         with STOP.reacting(Reaction.REMEMBER):  # queued messages are still written

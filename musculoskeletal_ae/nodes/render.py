@@ -60,7 +60,7 @@ def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
     add = parser.add_argument
-    topic_help = f'MarkerArray to draw (default: {BODY} if it is published, else {ESTIMATE})'
+    topic_help = f'topic of the markers to draw (default: {BODY} if published, else {ESTIMATE})'
     add('--topic', help=topic_help)
     add(
         '--timeout',

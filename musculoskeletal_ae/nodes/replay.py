@@ -278,7 +278,7 @@ def _check_combination(parser: Parser, options: Namespace) -> None:
             'by their own clocks the arm would seem faster or slower than it was'
         )
     if options.robot and not options.check:
-        parser.error('--robot requires --check')
+        parser.error('--robot requires --check; add it, or remove --robot')
     if options.check:
         changed = {
             name for name, value in vars(options).items() if value != parser.get_default(name)

@@ -217,7 +217,7 @@ class Shell(Node):
     def _on_incompatible(self, topic: str, who: str, event: Any) -> None:
         policy = QoSPolicyKind(event.last_policy_kind)
         remedy = QOS_REMEDIES.get(
-            (who, policy), 'see "Quality of service" in topics_and_services.md'
+            (who, policy), 'see "Quality of service" in doc/reference/topics_and_services.md'
         )
         this_node = 'this node needs' if who == 'publisher offers' else 'this node offers'
         problem = f'a {who} another {policy.name.lower()} than {this_node}; {remedy}'

@@ -463,7 +463,7 @@ def _read_end_effectors(
         _check_link(place, name, links, fail)
         if not moved[name]:
             legal = ', '.join(link for link in links if moved[link])
-            raise fail(f'{place}: expected a link that the joints move, {legal}; got {name!r}')
+            raise fail(f'{place}: expected a link that the joints move ({legal}), got {name!r}')
     if places:
         return tuple(places.values())
     # Choose the link that the largest number of joints move. If several links are equal in this,

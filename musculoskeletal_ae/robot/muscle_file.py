@@ -76,7 +76,7 @@ class RouteEntry(Strict, frozen=True):
         if self.wrap is None:
             of_wraps = self.axis, self.radius, self.side, self.side_link
             if any(value is not None for value in of_wraps):
-                legal = 'need wrap: sphere or wrap: cylinder'
+                legal = 'need `wrap: sphere` or `wrap: cylinder`'
                 raise ValueError(f'axis, radius, side and side_link {legal}')
             return
         if self.divisor is not None:
@@ -87,7 +87,8 @@ class RouteEntry(Strict, frozen=True):
             raise ValueError("key 'radius' is missing")
         if self.wrap == 'sphere':
             if self.axis is not None:
-                raise ValueError("unknown key 'axis'; a sphere has link, xyz, radius, side")
+                legal = 'link, xyz, wrap, radius, side, side_link'
+                raise ValueError(f"unknown key 'axis'; legal for a sphere: {legal}")
             return
         if self.axis is None:
             raise ValueError("key 'axis' is missing")
@@ -121,7 +122,7 @@ class MuscleEntry(Strict, frozen=True):
             problem = 'name: expected a name without a comma and without spaces around it'
             raise ValueError(f'{problem}, got {self.name!r}')
         if printable(self.name) != self.name:
-            raise ValueError('name: expected printable characters only')
+            raise ValueError(f'name: expected printable characters only, got {self.name!r}')
         is_wrap = [entry.wrap is not None for entry in self.route]
         if is_wrap[0] or is_wrap[-1] or any(map(all, pairwise(is_wrap))):
             raise ValueError('route: expected a point before and after each wrap')

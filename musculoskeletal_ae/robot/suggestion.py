@@ -16,6 +16,7 @@ import yaml
 from tqdm import tqdm
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_yaml
 from musculoskeletal_ae.robot import checks
 from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
@@ -160,7 +161,7 @@ def write(robot: Robot, change: Array, out: Path) -> None:
     except shutil.Error as error:
         failures = '; '.join(f'{source}: {reason}' for source, _, reason in error.args[0])
         problem = f'muscles.yaml is written, but other files could not be copied: {failures}'
-        raise refusal(out, problem) from error
+        raise RobotDescriptionError(f'{out}: {problem}; copy them from {here}') from error
     middle, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
     lines = []
     pairs = zip(draw_arm(robot, middle, bias), draw_arm(after, middle, bias), strict=True)

@@ -122,7 +122,7 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 def _check_expanded(file: Path, root: ET.Element) -> None:
     """Reject a file that still needs a preprocessor, because the URDF parser ignores macros."""
     for problem in _preprocessor_parts(root):
-        remedy = 'expand it first:  xacro FILE > robot.urdf'
+        remedy = 'expand it to a new file first:  xacro FILE > NEW.urdf'
         raise RobotDescriptionError(f'{file}: this is a xacro, not a URDF ({problem}); {remedy}')
 
 

@@ -127,7 +127,7 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
     value, least, most = distinct(theta[j], low, high)
     raise MessageError(
         'θ far outside the joint limits',
-        f'{robot.joints[j]} {value} {unit}, limits {least} to {most}',
+        f'{robot.joints[j]} is {value} {unit}; limits: {least} to {most} {unit}',
     )
 
 

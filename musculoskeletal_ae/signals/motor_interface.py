@@ -71,7 +71,8 @@ class MotorInterface:
         self.state_type = JOINT_STATE if self.is_ros2_control else ARRAY
         self.command_topic = settings.motor_command_topic
         if self.command_topic and not self.is_ros2_control:
-            raise _refused('motor_command_topic', 'needs motor_state_topic, which is empty')
+            problem = 'needs motor_state_topic, which is empty; set both, or none'
+            raise _refused('motor_command_topic', problem)
         if len(self._motors) != count:
             legal = f'a motor for each of the {count} muscles: {", ".join(muscles)}'
             raise _refused('motor_names', f'got {len(self._motors)} names; expected {legal}')

@@ -17,19 +17,23 @@ def main(argv: list[str] | None = None) -> int:
         'Exit status 0: sound (with --suggest: the arm that it wrote is sound), 1: not sound.',
     )
     parser.add_robot('robot', default=None)
-    parser.add_argument('--postures', type=whole(1, 10_000), default=200, help='random postures')
+    parser.add_argument(
+        '--postures', type=whole(1, 10_000), default=200, help='number of random postures'
+    )
     parser.add_seed('of the postures')
     parser.add_plot('moment arms and stiffness')
     parser.add_argument('--quiet', action='store_true', help='print the verdict only')
     text = 'search for the smallest change of via points that makes the robot sound (takes minutes)'
     parser.add_argument('--suggest', action='store_true', help=text)
-    text = 'new directory for the arm that --suggest finds, and a picture of before and after'
+    text = 'new directory for the arm that --suggest finds and a picture of the changed routes'
     parser.add_argument('--out', type=Path, metavar='DIR', help=text)
     text = f'how far --suggest may move a via point [m] (default: {REACH:g})'
     parser.add_argument('--reach', type=number(1e-3, 1.0), help=text)
     args = parser.parse_args(argv)
-    if args.suggest != bool(args.out) or (args.out and args.out.exists()):
+    if args.suggest != bool(args.out):
         parser.error('use --suggest and --out DIR, a new directory, together')
+    if args.out and args.out.exists():
+        parser.error(f'--out {args.out} exists; state --out DIR, a new directory')
     if args.reach and not args.suggest:
         parser.error('use --reach with --suggest only')
     args.reach = args.reach or REACH

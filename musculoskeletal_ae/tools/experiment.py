@@ -23,19 +23,19 @@ def main(argv: list[str] | None = None) -> int:
         'beside ours. Exit status 1: a part failed or a file is unusable, 2: invalid options.',
     )
     text = (
-        f'{", ".join(NAMES)}; several, separated by commas; all; '
-        'or paper, for all experiments that repeat the paper'
+        f'{", ".join(NAMES)}; several, separated by commas; "all"; '
+        'or "paper", for all experiments that repeat the paper'
     )
     parser.add_argument('names', metavar='NAME', type=_names, help=text)
     parser.add_robot()
-    parser.add_preset('preset to measure; results of preset paper are always shown beside it')
+    parser.add_preset('preset to measure; results of preset "paper" are always shown beside it')
     parser.add_seeds(None, 'seeds of the emulated individuals (default: 0,1,2,3,4; quick: 0)')
     parser.add_reality()
     parser.add_minutes('duration of the exploration (default: 10; quick: 2)', None)
     parser.add_quick('a short version of each experiment, in a minute')
     parser.add_out('DIR', 'results and report', Path('experiments'))
     cores = len(os.sched_getaffinity(0))
-    parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='processes')
+    parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='number of processes')
     text = (
         'folder that keeps networks, recordings and measured parts; a later run with the same '
         'options measures only the parts that are missing (use only folders of your own runs)'
@@ -57,5 +57,5 @@ def _names(text: str) -> tuple[str, ...]:
     groups = {'all': NAMES, 'paper': PAPER}
     names = groups.get(text) or tuple(dict.fromkeys(text.split(',')))
     if unknown := [name for name in names if name not in NAMES]:
-        raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)}, all or paper')
+        raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)}, or "all" or "paper"')
     return names

@@ -82,4 +82,4 @@ def test_types_that_are_not_known_are_copied_as_they_are(tmp_path):
 def test_topics_that_are_not_in_cdr_are_left_out_and_named(tmp_path, capsys):
     write(tmp_path / 'a.mcap', message_encoding='json')
     assert recover(tmp_path / 'a.mcap') == 0
-    assert 'not recorded, because they are not in CDR: /anomaly' in capsys.readouterr().err
+    assert 'topics that are not in CDR were not recovered: /anomaly' in capsys.readouterr().err

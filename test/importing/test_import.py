@@ -510,7 +510,7 @@ def test_a_directory_in_use_and_a_foreign_file_are_refused(mjcf, tmp_path, capsy
     assert 'is unknown; legal: mujoco, cardsflow' in capsys.readouterr().err
     xacro = '<robot xmlns:x="http://www.ros.org/wiki/xacro"><x:arg name="side"/></robot>'
     assert main([str(put(tmp_path, 'arm.xacro', xacro)), '--out', str(tmp_path / 'out')]) == 1
-    assert 'expand it first:  xacro FILE' in capsys.readouterr().err
+    assert 'expand it to a new file first:  xacro FILE' in capsys.readouterr().err
     bomb = '<!DOCTYPE x [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><mujoco>&b;</mujoco>'
     assert main([str(put(tmp_path, 'bomb.xml', bomb)), '--out', str(tmp_path / 'out')]) == 1
     assert 'no DOCTYPE is allowed' in capsys.readouterr().err

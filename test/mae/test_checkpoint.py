@@ -153,7 +153,7 @@ def test_permuted_muscles_are_refused(mae, robot):
         ({'extra': 1}, "unknown key 'extra'; legal keys: format_version, units"),
         ({'joints': [1]}, r'\$.joints\[0\]: expected str, got int: 1'),
         ({'joints': ['kn\nee']}, 'printable'),
-        ({'muscles': ['quad', 'quad']}, 'different printable names'),
+        ({'muscles': ['quad', 'quad']}, 'printable names, each at most once'),
         ({'layer_sizes': [8, 4, 3, 4, 6]}, 'layer_sizes'),
         ({'layer_sizes': [8, 5, 3, 5, 5]}, 'shape'),
         ({'layer_sizes': [8, 10**12, 3, 10**12, 5]}, r'layer_sizes\[1\]: expected int <= 4096'),

@@ -73,7 +73,7 @@ BAD = {
     'tension order': (put(['tension', 'limit'], 20.0), ['bias < limit <= max', '20']),
     'end effector at rest': (
         put(['end_effector'], 'torso'),
-        ["'torso'", 'that the joints move, upper_arm, forearm, hand'],
+        ["'torso'", 'that the joints move (upper_arm, forearm, hand)'],
     ),
     'end effector': (put(['end_effector'], 'claw'), ["'claw'", 'torso, upper_arm, forearm, hand']),
 }
@@ -242,7 +242,7 @@ def test_a_urdf_that_is_still_to_be_expanded_is_refused(tmp_path, old, new):
     if 'xmlns' in new:
         text = text.replace('</robot>', '<x:macro name="tool" params="parent"/></robot>')
     file.write_text(text)
-    refused(tmp_path, str(file), 'expand it first:  xacro FILE')
+    refused(tmp_path, str(file), 'expand it to a new file first:  xacro FILE')
 
 
 # -- malicious and strange URDFs ------------------------------------------------------------------
