@@ -67,8 +67,9 @@ class AnomalyLatch:
             self._is_latched = False
             self._follow(False)
         else:
+            report = 'nothing' if answer is None else answer.message
             self._node.get_logger().warning(
-                f'anomaly_detected is false, but the estimator reports: {answer and answer.message}'
+                f'anomaly_detected is false, but the estimator reports: {report}'
             )
 
     def _give_up(self) -> None:
