@@ -210,7 +210,7 @@ def _around(namespace: str) -> list[str]:
 def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
     """Return the namespace that lies within all others.
 
-    The result is None if there is none, or if a topic is in two of the namespaces.
+    The result is None without such a namespace, or if a topic is in two of the namespaces.
     """
     innermost = max(nested, key=len)
     if not set(nested) <= {innermost, *_around(innermost)}:

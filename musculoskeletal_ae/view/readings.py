@@ -24,9 +24,9 @@ GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
 HEIGHT = 84  # height of a plot [pixels]
 TIME_AXIS = {'incrs': [0.25 * DURATION], 'space': 30, 'size': 26}
-#: Of these distances between ticks, uPlot takes the smallest one of at least `space` pixels, which
-#: is half of any `scale_top`. The axes never change, because viser's charts would lose the time
-#: axis.
+#: `incrs` lists the possible distances between ticks. uPlot takes the smallest one that covers at
+#: least `space` pixels, which is half of any `scale_top`. The same axes serve all scales, because
+#: viser's charts would lose the time axis if the axes changed.
 VALUE_AXIS = {
     'incrs': [step * 10.0**power for power in range(-6, 7) for step in (0.5, 1.0, 2.5)],
     'space': 18,
