@@ -313,7 +313,7 @@ train_once() {
   mkdir -p "$cache" || exit 1
   hash=$(
     find "$robot_directory"/{robot.urdf,muscles.yaml} "$package"/{robot,mae,presets,paper} \
-      "$package/tools/initial_training.py" \( -name '*.py' -o -name '*.yaml' -o -name '*.urdf' \) \
+      "$package/tools/model_training.py" \( -name '*.py' -o -name '*.yaml' -o -name '*.urdf' \) \
       -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -c 1-16
   )
   checkpoint=$cache/$(basename "$(realpath "$robot_directory")")-$preset-$hash.safetensors

@@ -51,6 +51,5 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(f'--plot {args.plot} would overwrite the checkpoint; name another file')
     if args.from_bag and args.plot:
         parser.error('--plot shows the initial training; do not use it with --from-bag')
-    return exit_status(
-        lambda: import_heavy('musculoskeletal_ae.tools.initial_training').train(args)
-    )
+    work = 'bag_learning' if args.from_bag else 'model_training'
+    return exit_status(lambda: import_heavy(f'musculoskeletal_ae.tools.{work}').train(args))

@@ -14,8 +14,8 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import initial_training
-from musculoskeletal_ae.tools.initial_training import anomaly_in, error, learn, read
+from musculoskeletal_ae.tools import bag_learning, model_training
+from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read
 from musculoskeletal_ae.tools.train import main
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
@@ -119,9 +119,9 @@ def test_progress_and_wrong_joint_sensors_are_reported(
             progress(step, 0.5)
         return SimpleNamespace(mae=initial)
 
-    monkeypatch.setattr(initial_training, 'REPORT_INTERVAL', 0.0)
-    monkeypatch.setattr(initial_training, 'initial_mae', trained)
-    monkeypatch.setattr(initial_training, 'read', lambda *_: recording)
+    monkeypatch.setattr(model_training, 'REPORT_INTERVAL', 0.0)
+    monkeypatch.setattr(model_training, 'initial_mae', trained)
+    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
     out = str(tmp_path / 'out.safetensors')
     assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 0
     printed = capsys.readouterr()
@@ -162,7 +162,7 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     length, nobody = initial.lengths(theta, tension), np.zeros(tension.shape, dtype=int)
     recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
     assert anomaly_in(arm26, recording, initial, 'default') == ''
-    monkeypatch.setattr(initial_training, 'HealthMonitor', Monitor)
+    monkeypatch.setattr(bag_learning, 'HealthMonitor', Monitor)
     learner = Learner(arm26, initial)
     assert 'learning stopped 3.0 s after the start: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')

@@ -5,7 +5,7 @@ from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import initial_training
+from musculoskeletal_ae.tools import model_training
 from musculoskeletal_ae.tools.train import main
 
 
@@ -66,7 +66,7 @@ def test_a_checkpoint_is_written_before_anything_is_printed_of_it(tmp_path, monk
     def fail(*_):
         raise BrokenPipeError('the terminal is gone')
 
-    monkeypatch.setattr(initial_training, 'table', fail)
+    monkeypatch.setattr(model_training, 'table', fail)
     out = tmp_path / 'a.safetensors'
     assert main(['--robot', 'arm26', '--quick', '--preset', 'paper', '--out', str(out)]) == 1
     assert load(out, Robot.load('arm26')).preset == 'paper'
