@@ -61,27 +61,39 @@ def line(axes: Any, x: Any, y: Any, window: int = 1, **style: Any) -> None:
     axes.plot(x[::step], (np.convolve(y, kernel, mode='same') / count)[::step], **style)
 
 
+def mean_of_known(values: Any, digits: int = 3) -> tuple[float, str]:
+    """Return the mean over the individuals that have a value, and its label.
+
+    The label states how many individuals have a value, if not all of them do. NaN stands for no
+    value. If there is none at all, the mean is 0 and the label is `none`.
+    """
+    known = np.asarray(values, dtype=float)
+    known = known[np.isfinite(known)]
+    if not len(known):
+        return 0.0, 'none'
+    mean = float(known.mean())
+    count = '' if len(known) == len(values) else f' ({len(known)} of {len(values)})'
+    return mean, f'{mean:.{digits}f}{count}'
+
+
 def bars(
     panel: Any, names: Sequence[str], groups: Mapping[str, tuple[str, Any]], xlabel: str, title: str
 ) -> None:
     """Draw means over N individuals as bars with their values, and a dot for each individual.
 
-    `groups` maps labels to a colour and values (N, K) of the K names. NaN stands for no value: the
-    mean is that of the others, and its label states how many there are.
+    `groups` maps labels to a colour and values (N, K) of the K names. NaN stands for no value
+    (`mean_of_known`).
     """
     place, height = np.arange(len(names)), 0.8 / len(groups)
     for g, (label, (colour, values)) in enumerate(groups.items()):
         at = place + (g - 0.5 * (len(groups) - 1)) * height
-        known = [column[np.isfinite(column)] for column in np.transpose(values)]
-        means = [column.mean() if len(column) else 0.0 for column in known]
-        panel.barh(at, means, 0.95 * height, color=colour, label=label)
-        panel.plot(np.transpose(values), at, '.', color=TRUE, ms=4)
-        for y, mean, column in zip(at, means, known):
-            text = f'{mean:.3f}' if len(column) else 'none'
-            if 0 < len(column) < len(values):
-                text += f' ({len(column)} of {len(values)})'
+        columns = np.transpose(values)
+        means = [mean_of_known(column) for column in columns]
+        panel.barh(at, [mean for mean, _ in means], 0.95 * height, color=colour, label=label)
+        panel.plot(columns, at, '.', color=TRUE, ms=4)
+        for y, (_, text), column in zip(at, means, columns):
             style = {'textcoords': 'offset points', 'va': 'center', 'fontsize': 9}
-            panel.annotate(text, (column.max(initial=0.0), y), (6, 0), **style)
+            panel.annotate(text, (column[np.isfinite(column)].max(initial=0.0), y), (6, 0), **style)
     panel.set_yticks(place, names)
     panel.invert_yaxis()
     panel.margins(x=0.12)
@@ -98,15 +110,14 @@ def ranked_bars(
 ) -> None:
     """Draw one bar per name: the mean over individuals, a dot for each, and the mean in a column.
 
-    `values` maps names to the individuals' values; None stands for no value.
+    `values` maps names to the individuals' values; None stands for no value (`mean_of_known`).
     """
     place = np.arange(len(values))
     numbers = {name: np.array(each, dtype=float) for name, each in values.items()}
-    means = [float(np.mean(each)) for each in numbers.values()]
-    panel.barh(place, means, 0.7, color=list(colours))
-    for at, each, mean in zip(place, numbers.values(), means):
+    means = [mean_of_known(each, digits) for each in numbers.values()]
+    panel.barh(place, [mean for mean, _ in means], 0.7, color=list(colours))
+    for at, each, (_, text) in zip(place, numbers.values(), means):
         panel.plot(each, [at] * len(each), 'o', color=TRUE, ms=4, mfc='white', mew=1.0)
-        text = 'none' if np.isnan(mean) else f'{mean:.{digits}f}'
         # The column lies beside the axes, where it hides no dot.
         style = {'textcoords': panel.get_yaxis_transform(), 'va': 'center', 'fontsize': 9}
         panel.annotate(text, (0.0, at), (1.02, at), annotation_clip=False, **style)

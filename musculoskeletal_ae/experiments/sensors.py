@@ -107,9 +107,9 @@ BARS = {
 def sensors(_: Study | None, rows: Rows) -> Plot:
     """Draw the error for each set of sensors."""
     figure, (panel,) = plots.new_figure(8.0, 3.2)
-    means = {key: np.mean([row.numbers[key] for row in rows.values()]) for key in BARS}
-    ranked = sorted(BARS, key=means.__getitem__, reverse=True)
-    values = {BARS[key]: [row.numbers[key] for row in rows.values()] for key in ranked}
+    measured = {key: [row.numbers[key] for row in rows.values()] for key in BARS}
+    ranked = sorted(BARS, key=lambda key: plots.mean_of_known(measured[key])[0], reverse=True)
+    values = {BARS[key]: measured[key] for key in ranked}
     colours = [plots.BEFORE if key == 'before_rad' else plots.AFTER for key in ranked]
     title = 'Joint-angle error with fewer joint sensors'
     plots.ranked_bars(panel, values, colours, 'mean error on held-out motion [rad]', title)

@@ -8,6 +8,7 @@ import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from musculoskeletal_ae.emulator.reality import FOREIGN
@@ -74,6 +75,18 @@ def test_plots_are_written_as_png_and_the_same_numbers_give_the_same_pdf(
     assert (one / 'errors.pdf').read_bytes().startswith(b'%PDF')
     assert (one / 'errors.png').read_bytes() == (quick / 'errors.png').read_bytes()
     assert not (quick / 'errors.pdf').exists()
+
+
+def test_both_kinds_of_bars_show_the_mean_of_the_individuals_that_have_a_value():
+    columns = {'all': [0.1, 0.3], 'one': [0.2, None], 'nobody': [None, None]}
+    _, (panel, ranked) = plots.new_figure(4.0, 3.0, 1, 2)
+    table = np.array(list(columns.values()), dtype=float).T
+    plots.bars(panel, list(columns), {'error': (plots.AFTER, table)}, '', '')
+    plots.ranked_bars(ranked, columns, 3 * [plots.AFTER], '', '')
+    for axes in (panel, ranked):
+        shown = [text.get_text() for text in axes.texts if text.get_text() != 'mean']
+        assert shown == ['0.200', '0.200 (1 of 2)', 'none']
+        assert [bar.get_width() for bar in axes.patches] == pytest.approx([0.2, 0.2, 0.0])
 
 
 @pytest.fixture
