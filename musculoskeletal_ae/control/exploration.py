@@ -3,8 +3,8 @@
 
 The preset draws the steps (`Preset.exploration`). Preset `default` puts the targets of some joints
 at their limits, because the learner identifies joint-sensor offsets from joints at their stops
-(`learning.stops`). Of several random T_const, this preset uses the one that presses these joints
-most strongly against their stops.
+(`learning.joint_stops`). Of several random T_const, this preset uses the one that presses these
+joints most strongly against their stops.
 """
 
 from collections.abc import Iterator

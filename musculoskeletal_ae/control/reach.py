@@ -25,7 +25,7 @@ from itertools import pairwise
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.friction import tendon_friction
+from musculoskeletal_ae.control.assumed_friction import tendon_friction
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot

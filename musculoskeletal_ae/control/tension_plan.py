@@ -12,9 +12,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.assumed_friction import FRICTION, tendon_friction
 from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.feedback import depends_on_limit
-from musculoskeletal_ae.control.friction import FRICTION, tendon_friction
 from musculoskeletal_ae.control.methods import Solution, stiffness_command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.slowness import SHARE

@@ -42,10 +42,10 @@ from musculoskeletal_ae.gauss_newton import (
     noise_and_weight,
     student,
 )
+from musculoskeletal_ae.learning.joint_stops import Stops
 from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Residuals, Unknowns
 from musculoskeletal_ae.learning.priors import GroupPrior
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.stops import Stops
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody

@@ -10,8 +10,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import Layout
+from musculoskeletal_ae.learning.joint_stops import sensor_zeros
 from musculoskeletal_ae.learning.posture_model import PostureModel
-from musculoskeletal_ae.learning.stops import sensor_zeros
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
 #: Errors of the body model are common to all samples. Therefore all samples together count as at

@@ -10,9 +10,9 @@ from exact_mae import ExactMae, rest_readings
 from robots import write_robot
 
 from musculoskeletal_ae.control import reach
+from musculoskeletal_ae.control.assumed_friction import FRICTION
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
-from musculoskeletal_ae.control.friction import FRICTION
 from musculoskeletal_ae.control.planner import Planner
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import METHODS, Settings
