@@ -97,13 +97,17 @@ def failures_of(worst: float, filled: float, most: float, times: list[float]) ->
             f'the error rose to {worst:.2f} times its minimum; legal: at most {TOLERATED:g}'
         )
     if most > TOLERATED * filled:
-        problems.append(f'memory rose from {filled:.0f} to {most:.0f} MB')
+        problems.append(
+            f'memory rose from {filled:.0f} to {most:.0f} MB; legal: at most '
+            f'{TOLERATED * filled:.0f} MB'
+        )
     quarter = len(times) // 4
     if quarter:
         first, last = np.median(times[:quarter]), np.median(times[-quarter:])
         if last > SLOWER * first:
             problems.append(
-                f'an update took {first:.2f} s at the beginning and {last:.2f} s at the end'
+                f'an update took {first:.2f} s at the beginning and {last:.2f} s at the end; '
+                f'legal: at most {SLOWER * first:.2f} s'
             )
     return problems
 

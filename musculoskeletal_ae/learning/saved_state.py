@@ -157,12 +157,12 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     """
     if added := [name for name in robot.muscles if name not in state.muscles]:
         raise StateError(
-            f'the saved network lacks the muscles {", ".join(added)}; only the saved samples are '
-            'used'
+            'only the saved samples are used, because the saved network lacks the muscles '
+            f'{", ".join(added)}'
         )
     if state.network is None:
         return None
     try:
         return checkpoint.from_bytes(state.network, robot, 'the saved network')
     except CheckpointError as error:
-        raise StateError(f'{error}; only the saved samples are used') from error
+        raise StateError(f'only the saved samples are used, because {error}') from error

@@ -67,9 +67,10 @@ class AnomalyLatch:
             self._is_latched = False
             self._follow(False)
         else:
-            report = 'nothing' if answer is None else answer.message
+            report = 'did not answer' if answer is None else f'reports: {answer.message}'
             self._node.get_logger().warning(
-                f'anomaly_detected is false, but the estimator reports: {report}'
+                f'anomaly_detected is false, but the estimator {report}. The anomaly counts as '
+                'present until the estimator confirms its end'
             )
 
     def _give_up(self) -> None:

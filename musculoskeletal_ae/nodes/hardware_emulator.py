@@ -148,5 +148,6 @@ class HardwareEmulator(Arm):
             return Report('error', f'{problem}; call hardware_emulator/reset', values)
         if self.arm.safe:
             problem = 'the modules are in their safe state, because no commands arrive'
-            return Report('warn', problem, values)
+            remedy = 'start the controller, or publish commands'
+            return Report('warn', f'{problem}; {remedy}', values)
         return Report('ok', 'following commands', values)

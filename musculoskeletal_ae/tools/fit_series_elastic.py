@@ -71,8 +71,11 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     from scipy.optimize import least_squares
 
     table = np.column_stack([tension, absolute_length, elongation])
-    if len(table) < 4 or not np.isfinite(table).all():
-        raise ValueError(f'a testbed table needs at least 4 finite rows, got {len(table)} rows')
+    if (finite := int(np.isfinite(table).all(axis=1).sum())) < len(table) or finite < 4:
+        raise ValueError(
+            'a testbed table needs at least 4 rows, all of finite numbers; got '
+            f'{len(table)} rows, {finite} of them finite'
+        )
     if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
         raise ValueError('a testbed table needs several tensions at several muscle lengths')
     if elongation @ (tension - tension.mean()) <= 0.0:

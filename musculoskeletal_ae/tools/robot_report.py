@@ -79,7 +79,8 @@ def _suggested(robot: Robot, args: Namespace) -> int:
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     """Return the holding and stiffness part of the report."""
     count, held = len(result.setting.theta), result.held
-    need = f'required of both: {100 * REQUIRED_SHARE:.0f} % of postures'
+    share = f'{100 * REQUIRED_SHARE:.0f} %'
+    need = f'{share} of the postures must be held, and {share} must be stiff'
     required = required_stiffness(robot, result.required)
     desired = DESIRED_SHARE * robot.tension.limit
     tension = f'T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N'
