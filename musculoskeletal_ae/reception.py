@@ -43,6 +43,9 @@ class Reception:
         self._used_at: dict[str, float] = {}  # time of the last used message by topic [s]
         #: sequence number of the newest message by topic; 0: unknown
         self.numbers: Counter[str] = Counter()
+        #: time at which the newest message was sent, by the publisher's clock [ns], by topic; 0:
+        #: unknown
+        self.source_times: Counter[str] = Counter()
         #: how often the sequence number decreased, by topic: once when a publisher restarts,
         #: continually when two publishers alternate
         self.turns: Counter[str] = Counter()
@@ -78,7 +81,7 @@ class Reception:
                 return False
             if number < last:
                 self.turns[topic] += 1
-            before = sent
+            self.source_times[topic] = before = sent
             self.numbers[topic] = last = number
             return True
 

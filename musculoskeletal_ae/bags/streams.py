@@ -20,6 +20,7 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
@@ -95,20 +96,27 @@ class Streams(NamedTuple):
         return Pairs(time, postures, values[:, 0], values[:, 1], isolated)
 
 
+class _Arrival(NamedTuple):
+    """When a message was received."""
+
+    time: float  # time of reception since the bag's start [s]
+    delay: float  # how late the message is (`MessageDelay`) [s]
+
+
 @dataclass
 class _Stream:
     """Values of a topic while it is being read."""
 
     shape: tuple[int, ...]  # shape of the values of one message
-    read: Callable[[Any, float], Array]  # converts a message and its time [s] to values
+    read: Callable[[Any, _Arrival], Array]  # converts a message to values
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
 
-    def take(self, message: tuple[float, Any]) -> None:
-        """Add a message, given as (time [s], content)."""
+    def take(self, message: tuple[_Arrival, Any]) -> None:
+        """Add a message, given as (arrival, content)."""
         came, content = message
         self.values.append(self.read(content, came))
-        self.times.append(came)
+        self.times.append(came.time)
 
     def series(self) -> Series:
         """Return the times and values of all messages."""
@@ -141,24 +149,25 @@ class _ArmStreams:
             'muscle_length_zeros': self._offsets,
         }
 
-    def _posture(self, message: Any, _: float) -> Array:
+    def _posture(self, message: Any, _: _Arrival) -> Array:
         joints = self._robot.joints
         theta = read_posture(message, joints, some=True)
         for name in joints_not_finite(message, joints):
             self._ignore(f'position of {name} is not finite')
         return theta
 
-    def _muscle_states(self, message: Any, came: float) -> Array:
+    def _muscle_states(self, message: Any, came: _Arrival) -> Array:
         stream = self._muscle_stream
-        stream.use_body(_body_at(came, stream.body, self._isolated, self._offsets))
-        sample = stream.take(self._interface.reading(message), came)
+        stream.use_body(_body_at(came.time, stream.body, self._isolated, self._offsets))
+        reading = self._interface.reading(message)
+        sample = stream.take(reading, came.time, delay=came.delay)
         self.had_offsets.append(stream.body.offsets.known)
         return np.array([sample.length, sample.tension_read, sample.temperature])
 
-    def _command(self, message: Any, _: float) -> Array:
+    def _command(self, message: Any, _: _Arrival) -> Array:
         return read_array(message, 1, self._robot.muscle_count)
 
-    def _isolated_mask(self, message: Any, _: float) -> Array:
+    def _isolated_mask(self, message: Any, _: _Arrival) -> Array:
         indices = self._robot.muscle_indices(read_names(message))
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
@@ -241,7 +250,7 @@ def _deliver(
     clock_offsets: Mapping[str, int],
     reception: Reception,
 ) -> None:
-    """Pass all messages to the takers of their topic, as pairs of time [s] and content.
+    """Pass all messages to the takers of their topic, as pairs of arrival and content.
 
     Args:
         bag: The recording.
@@ -251,6 +260,7 @@ def _deliver(
         reception: Rejects and counts messages.
     """
     receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
+    delays = defaultdict[tuple[str, ...], MessageDelay](MessageDelay)
     for message in chain(bag.messages(early), bag.messages(takers.keys() - early)):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic may have different clocks.
@@ -264,8 +274,10 @@ def _deliver(
         if message.topic in clock_offsets:
             came = message.publish_time + clock_offsets[message.topic]
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
+        time = (came - bag.start) / 1e9
+        arrival = _Arrival(time, delays[sender].step(time, message.publish_time))
         for take in receive[sender]:
-            take(((came - bag.start) / 1e9, decoded), sent)
+            take((arrival, decoded), sent)
 
 
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:

@@ -243,14 +243,19 @@ class Controller:
         if self.activities.entered is self.activities.ramped_target:
             self.activities.ramps.solve_again()
 
-    def take(self, message: Any, now: float) -> None:
+    def take(self, message: Any, now: float, delay: float = 0.0) -> None:
         """Process a message of muscle_states: check it, filter it and use it from now on.
+
+        Args:
+            message: The message.
+            now: Time of reception by the steady clock [s].
+            delay: How late the message is (`MessageDelay`) [s].
 
         Raises:
             RejectionError: If the message cannot be used.
         """
         with self._relieving(now):
-            self._use_sample(self.stream.take(message, now), now)
+            self._use_sample(self.stream.take(message, now, delay=delay), now)
 
     def muscles(self, states: Array, now: float) -> None:
         """Process raw l [m], T [N] and temperature [°C], (3, M), as `take` does with a message.

@@ -157,7 +157,8 @@ class Follower(ActivityControl):
         if progress.trajectory is None:
             return None
         if progress.is_moving:
-            self.winches.step(inputs.sample.length, inputs.pull.motor, sent, dt)
+            sample = inputs.sample
+            self.winches.step(sample.length, inputs.pull.motor, sent, dt, sample.delay)
         else:  # at rest, the measurements contain only noise and do not determine λ
             self.winches.forget()
         if progress.advance(dt):

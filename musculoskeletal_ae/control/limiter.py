@@ -88,7 +88,7 @@ class CommandLimiter:
         #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
         self._relief: Array = np.zeros(robot.muscle_count)  # relief r of each muscle [m]
-        #: time [s], T [N] and dT/dt [N/s], (M,), of the last message
+        #: time of sending [s], T [N] and dT/dt [N/s], (M,), of the last message
         self._tension: tuple[float, Array, Array] | None = None
         #: l_exceeded of each muscle (see the module's description) [m], (M,)
         self._exceeded: Array = np.full(robot.muscle_count, -np.inf)
@@ -264,7 +264,7 @@ class CommandLimiter:
         """Return the shortest length [m], (M,), that demands no tension above the limit."""
         robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable
-        rate = self._tension_rate(sample.time, tension)
+        rate = self._tension_rate(sample.sent_at, tension)
         depth, most = actuation.depth(tension, rate, limit), actuation.largest_depth(limit)
         tension = np.where(np.isfinite(tension), tension, 0.0)
         per_length = actuation.tension_per_length(limit)

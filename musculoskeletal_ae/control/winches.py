@@ -28,6 +28,7 @@ class Winches:
         self._robot = robot
         self._products, self._squares = 0.0, LAGS
         self._since = self._last = 0.0
+        self._delay = 0.0  # delay of the last message [s]
         self._length: Array | None = None
         self._speed: Array = np.zeros(robot.muscle_count)  # dl/dt [m/s], (M,)
 
@@ -45,7 +46,9 @@ class Winches:
         """Length by which modules that wind in lag behind their commands [m], (M,)."""
         return self.lag * np.maximum(-self._speed, 0.0)
 
-    def step(self, length: Array, tension: Array, command: Array, dt: float) -> None:
+    def step(
+        self, length: Array, tension: Array, command: Array, dt: float, delay: float = 0.0
+    ) -> None:
         """Update the fit.
 
         Args:
@@ -53,7 +56,10 @@ class Winches:
             tension: T [N], (M,).
             command: Length command at the time of l and T [m], (M,).
             dt: Time since the previous call [s].
+            delay: How late the message with l and T is (`MessageDelay`) [s].
         """
+        # Messages that have waited arrive together, so a speed needs the times of sending.
+        dt, self._delay = max(dt + self._delay - delay, 0.0), delay
         # `length` is a median of three messages, so it belongs to the time of the previous call.
         # The time between two lengths therefore counts each `dt` one call later.
         self._since, self._last = self._since + self._last, dt

@@ -246,13 +246,19 @@ class Estimator:
 
     # -- messages -------------------------------------------------------------------------------
 
-    def take(self, message: Any, time: float, now: float) -> Output | None:
+    def take(self, message: Any, time: float, now: float, delay: float = 0.0) -> Output | None:
         """Process a muscle_states message as `step` processes raw values.
+
+        Args:
+            message: The message.
+            time: Time of the message [s].
+            now: Time on the steady clock [s].
+            delay: How late the message is (`MessageDelay`) [s].
 
         Raises:
             RejectionError: If the message cannot be used.
         """
-        return self._take(partial(self.stream.take, message, time, now), now)
+        return self._take(partial(self.stream.take, message, time, now, delay), now)
 
     def step(self, states: Array, time: float, now: float) -> Output | None:
         """Estimate the state and check for faults.
@@ -300,19 +306,33 @@ class Estimator:
         self._handle(self.health.read(sample.newest, self.body.used, now), now)
         self._handle_jump(now)
         before, self.sample = self.sample, sample
-        elapsed = 0.0 if before is None else max(sample.time - before.time, 0.0)
+        elapsed = sent_apart = 0.0
+        if before is not None:
+            elapsed = max(sample.time - before.time, 0.0)
+            sent_apart = max(sample.sent_at - before.sent_at, 0.0)
         temperature = np.where(self.body.used, sample.temperature, np.nan)
         self.heat.step(sample.model_tension, temperature, elapsed)
         if self.mae is None:
             return None
         self.stepped_at = now
-        if elapsed > INTERRUPTION:
+        pause = max(elapsed, sent_apart)
+        if pause > INTERRUPTION:
             self.health.reset()
-        if elapsed > SILENCE:
+        if pause > SILENCE:
             self.contact.reset()
-        return self._estimate(sample, elapsed, now)
+        return self._estimate(sample, elapsed, sent_apart, now)
 
-    def _estimate(self, sample: MuscleSample, elapsed: float, now: float) -> Output | None:
+    def _estimate(
+        self, sample: MuscleSample, elapsed: float, sent_apart: float, now: float
+    ) -> Output | None:
+        """Estimate the state, and check the health of the body.
+
+        Args:
+            sample: The sample.
+            elapsed: Time between the receptions of this sample and the one before [s].
+            sent_apart: Time between their sendings [s].
+            now: Time on the steady clock [s].
+        """
         dt, guess = min(elapsed, LONGEST_PERIOD), self.body.offsets
         if self.calibration is not None:
             before = self.body.offsets
@@ -334,7 +354,7 @@ class Estimator:
         contact = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
-            contact = self.contact.step(estimate.state.theta, pull, elapsed)
+            contact = self.contact.step(estimate.state.theta, pull, sent_apart)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
         )

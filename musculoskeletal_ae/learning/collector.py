@@ -130,8 +130,13 @@ class SampleCollector:
         measured[first : first + len(values)] = values
         self._pairing.joints(time, measured)
 
-    def take(self, time: float, message: Any) -> Paired[MuscleSample] | None:
-        """Check a message of muscle_states received at `time` [s], and pair it with θ.
+    def take(self, time: float, message: Any, delay: float = 0.0) -> Paired[MuscleSample] | None:
+        """Check a message of muscle_states, and pair it with θ.
+
+        Args:
+            time: Time of reception [s].
+            message: The message.
+            delay: How late the message is (`MessageDelay`) [s].
 
         Returns:
             The previous message with its θ, or None if there is none.
@@ -140,7 +145,7 @@ class SampleCollector:
             RejectionError: If the message cannot be used; it is also counted in `rejected`.
         """
         try:
-            sample = self._stream.take(message, time)
+            sample = self._stream.take(message, time, delay=delay)
         except RejectionError as error:
             self._note_rejected(error)
             raise

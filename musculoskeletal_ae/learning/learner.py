@@ -146,13 +146,18 @@ class Learner:
         """Record an accelerometer reading [m/s²] (3,) in the axes of a link at `time` [s]."""
         self.collector.imu(time, link, acceleration)
 
-    def take(self, message: Any, time: float) -> None:
-        """Learn from a message of muscle_states received at `time` [s].
+    def take(self, message: Any, time: float, delay: float = 0.0) -> None:
+        """Learn from a message of muscle_states.
+
+        Args:
+            message: The message.
+            time: Time of reception [s].
+            delay: How late the message is (`MessageDelay`) [s].
 
         Raises:
             RejectionError: If the message cannot be used.
         """
-        self._learn_from(self.collector.take(time, message), time)
+        self._learn_from(self.collector.take(time, message, delay), time)
 
     def muscles(self, states: Array, time: float) -> None:
         """Learn from raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s]."""

@@ -166,8 +166,8 @@ class Controller(Shell):
     def _use_body(self) -> None:
         self.core.use_body(self.body)
 
-    def _muscles(self, message: Float64MultiArray) -> None:
-        self.core.take(message, time.monotonic())
+    def _muscles(self, message: Float64MultiArray, now: float, delay: float) -> None:
+        self.core.take(message, now, delay)
 
     def _anomaly(self, detected: bool) -> None:
         self.core.anomaly(detected)

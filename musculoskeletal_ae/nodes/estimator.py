@@ -193,11 +193,11 @@ class Estimator(Shell):
             command = command - self.core.body.offsets.offset
         self.core.commanded(time.monotonic(), **{kind: command})
 
-    def _on_muscles(self, message: Float64MultiArray) -> None:
-        clock, now = self.get_clock().now(), time.monotonic()
+    def _on_muscles(self, message: Float64MultiArray, now: float, delay: float) -> None:
+        clock = self.get_clock().now()
         isolated = self.core.body.isolated
         try:
-            output = self.core.take(message, clock.nanoseconds * 1e-9, now)
+            output = self.core.take(message, clock.nanoseconds * 1e-9, now, delay)
         except RejectionError:
             if self.core.body.isolated != isolated:  # the core has isolated a muscle with a fault
                 self.get_logger().warning(self.core.suspects.last_verification)

@@ -108,8 +108,8 @@ class Learner(Shell):
         prefix = self.parameter('frame_prefix')
         self.core.imu(self.now(), *read_imu(message, self.links, prefix))
 
-    def _take_muscle_states(self, message: Float64MultiArray) -> None:
-        self.core.take(message, self.now())
+    def _take_muscle_states(self, message: Float64MultiArray, _: float, delay: float) -> None:
+        self.core.take(message, self.now(), delay)
 
     def _use_offsets(self) -> None:
         self.core.use_body(self.core.body.with_offsets(self.body.offsets))

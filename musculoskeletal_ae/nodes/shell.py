@@ -60,6 +60,7 @@ from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.validity import (
@@ -458,13 +459,24 @@ class Shell(Node):
         muscles = self.robot.muscle_count
         self.listen(Float64MultiArray, topic, lambda m: follow(read_array(m, rows, muscles)), qos)
 
-    def follow_muscle_messages(self, follow: Callable[[Any], object]) -> None:
+    def follow_muscle_messages(self, follow: Callable[[Any, float, float], object]) -> None:
         """Call `follow` with each message of muscle_states, whose values are not checked yet.
 
         On a ros2_control robot, the messages of the motors are converted to muscle_states.
+
+        Args:
+            follow: Called with the message, the time of its reception by the steady clock [s], and
+                its delay [s] (`MessageDelay`).
         """
         kind = JointState if self.motors.is_ros2_control else Float64MultiArray
-        self.listen(kind, STATES, lambda message: follow(self.motors.reading(message)), SENSOR)
+        delays = MessageDelay()
+
+        def take(message: Any) -> None:
+            now = time.monotonic()
+            delay = delays.step(now, self._reception.source_times[STATES])
+            follow(self.motors.reading(message), now, delay)
+
+        self.listen(kind, STATES, take, SENSOR)
 
     def follow_offsets(self, changed: Callable[[], object]) -> None:
         """Keep the estimator's length offsets in `body`; call `changed` when they change.

@@ -2,7 +2,10 @@
 """Rejects messages after a length has jumped, until the new level of the length has lasted.
 
 A length jumps if it changes faster than a muscle can, for example because a module has lost its
-length offset. `LengthJumps.step` receives every message and decides:
+length offset. The change between two messages is compared with the pause between their receptions
+or between their sendings, whichever is longer: messages in between may have been lost, and the
+later message may have arrived right after a late one (`message_delay`). `LengthJumps.step`
+receives every message and decides:
 
     no jump ── a length jumps ──────────────────────────────► waiting: messages are rejected
     waiting ── the lengths have returned ───────────────────► no jump
@@ -152,12 +155,15 @@ class LengthJumps:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._last: Array | None = None  # the last lengths, accepted or not [m], (M,)
-        self._last_at = math.inf  # time of the last message [s]
+        self._last_at = math.inf  # time of reception of the last message [s]
+        self._last_delay = 0.0  # delay of the last message [s]
         self._jump: Jump | None = None  # the jump whose new level is not accepted yet
         self._was_unseen = False  # `Jump.is_unseen` of the last accepted jump
         self._rupture = PresumedRupture(robot)
 
-    def step(self, length: Array, tension: Array, used: Bools, now: float) -> Verdict:
+    def step(
+        self, length: Array, tension: Array, used: Bools, now: float, delay: float = 0.0
+    ) -> Verdict:
         """Return what the lengths of the newest message show.
 
         Args:
@@ -165,9 +171,10 @@ class LengthJumps:
             tension: T_read [N], (M,); NaN where it is unknown.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
+            delay: How late the message is (`MessageDelay`) [s].
         """
-        last, pause = self._last, max(now - self._last_at, 0.0)
-        self._last, self._last_at = length, now
+        last, pause = self._last, self._pause(now, delay)
+        self._last, self._last_at, self._last_delay = length, now, delay
         if last is None:
             return Verdict()
         allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
@@ -189,6 +196,11 @@ class LengthJumps:
             return Verdict()
         muscles = np.flatnonzero(jump.remaining(used)).tolist()
         return Verdict(None, tuple(muscles), jump.is_unseen)
+
+    def _pause(self, now: float, delay: float) -> float:
+        """Return the pause between receptions or between sendings, whichever is longer [s]."""
+        received = max(now - self._last_at, 0.0)
+        return received + max(self._last_delay - delay, 0.0)
 
     def _problem(self, jump: Jump, used: Bools) -> tuple[str, str]:
         """Return reason and detail of the rejection of a message."""

@@ -70,6 +70,7 @@ class MuscleSample:
             filter, (3, M).
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
         tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors.
+        delay: How late the message is, compared with the fastest one (`MessageDelay`) [s].
     """
 
     time: float
@@ -84,6 +85,16 @@ class MuscleSample:
     newest: Array
     jumped: tuple[int, ...] = ()
     tension_spread: Array | float = 0.0
+    delay: float = 0.0
+
+    @property
+    def sent_at(self) -> float:
+        """Time of sending by the caller's clock, except for a constant [s].
+
+        Rates are computed from differences of this time, because messages that have waited arrive
+        together.
+        """
+        return self.time - self.delay
 
     @property
     def model_tension(self) -> Array:
@@ -183,7 +194,8 @@ class MuscleStream:
         self._direction = FrictionDirection()
         self._median.reset()
         self._pull.reset()
-        self._time = math.inf
+        self._time = self._sent_at = math.inf  # reception and sending of the last sample [s]
+        self._delay = 0.0  # delay of the newest message, accepted or not [s]
 
     def use_transmission(self, transmission: Transmission) -> None:
         """Convert readings of tension to T and T_end by this transmission from now on."""
@@ -205,15 +217,18 @@ class MuscleStream:
 
     def implausible(self, now: float) -> str:
         """Return why messages have been implausible for longer than a glitch, or ''."""
-        return self._implausible.lasting(now)
+        return self._implausible.lasting(now - self._delay)
 
-    def take(self, message: Any, time: float, now: float | None = None) -> MuscleSample:
+    def take(
+        self, message: Any, time: float, now: float | None = None, delay: float = 0.0
+    ) -> MuscleSample:
         """Check and convert a Float64MultiArray message.
 
         Args:
             message: The message.
             time: Time of reception by the caller's clock [s].
             now: Time of reception by a steady clock [s]; None if `time` is by a steady clock.
+            delay: How late the message is, compared with the fastest one (`MessageDelay`) [s].
 
         Raises:
             RejectionError: If the message is invalid or implausible.
@@ -233,17 +248,20 @@ class MuscleStream:
                 self._pull.note(raw)
                 pull = self._pull.median(self.body.offsets.offset)
             raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
-        return self.take_states(states, time, now)
+        return self.take_states(states, time, now, delay)
 
-    def take_states(self, states: Array, time: float, now: float | None = None) -> MuscleSample:
+    def take_states(
+        self, states: Array, time: float, now: float | None = None, delay: float = 0.0
+    ) -> MuscleSample:
         """Check and convert values as measured: l [m], T_read [N] and temperature [°C], (3, M).
 
-        `take` describes the times.
+        `take` describes the times and the delay.
 
         Raises:
             RejectionError: If the values are implausible.
         """
         now = time if now is None else now
+        self._delay = delay
         offsets = self.body.offsets
         states = states.copy()
         states[1] = self._robot.tension_source.known(states[1])
@@ -252,12 +270,14 @@ class MuscleStream:
         self._pull.note(states)
         verdict = self._judge(states, newest, now)
         problem = verdict.problem
-        self._implausible.note('' if problem is None else ': '.join(problem), now)
+        self._implausible.note('' if problem is None else ': '.join(problem), now - delay)
         if problem is not None:
             raise RejectionError(*problem, states, self._pull.median(offsets.offset))
-        if not 0.0 <= time - self._time <= LIMITS.pause:
+        sent_at = time - delay
+        pause = max(time - self._time, sent_at - self._sent_at)
+        if time < self._time or pause > LIMITS.pause:
             self._direction.reset()
-        self._time = time
+        self._time, self._sent_at = time, sent_at
         read = self._median.step(states)
         length = read[0] - offsets.offset
         sliding = self._direction.step(length)
@@ -271,11 +291,12 @@ class MuscleStream:
             motor_tension=self._transmission.motor(read[1], sliding),
             bone_tension=self._robot.actuation.known_tension(end),
             sliding=sliding,
-            temperature=self._temperatures.step(read[2], now),
+            temperature=self._temperatures.step(read[2], now - delay),
             usable=self.body.used,
             newest=newest,
             jumped=verdict.displaced,
             tension_spread=self._transmission.spread(read[1], sliding),
+            delay=delay,
         )
 
     def _judge(self, read: Array, states: Array, now: float) -> Verdict:
@@ -290,7 +311,7 @@ class MuscleStream:
         problem = self._levels.problem(states, used, known)
         if problem is not None:
             return Verdict(problem)
-        verdict = self._jumps.step(read[0], read[1], used, now)
+        verdict = self._jumps.step(read[0], read[1], used, now, self._delay)
         self.displaced.note(verdict)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
         # is no reason to reject the message.

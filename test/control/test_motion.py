@@ -209,8 +209,9 @@ def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effor
     assert 'clamped' in bench.report().message
 
 
-@pytest.mark.parametrize('dt', [DT, 0.002])
-def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(dt):
+@pytest.mark.parametrize(('dt', 'late'), [(DT, 0.0), (0.002, 0.0), (DT, 0.8 * DT)])
+def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(dt, late):
+    """Every third message is `late` [s]."""
     rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
     length = np.zeros(ROBOT.muscle_count)
     for n in range(round(3.0 / dt)):
@@ -220,7 +221,8 @@ def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(
         length = length + speed * dt
         command = length - (tension - ROBOT.tension.bias) / ROBOT.stiffness + lag * speed
         noise = rng.normal(0.0, 1e-4, ROBOT.muscle_count)
-        winches.step(length + noise, tension, command, dt)
+        delay, before = (late * (k % 3 == 0) for k in (n, n - 1))
+        winches.step(length + noise, tension, command, dt + delay - before, delay)
     assert winches.lag == pytest.approx(lag, rel=0.15)
 
 

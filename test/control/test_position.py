@@ -79,6 +79,18 @@ def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hi
     assert (np.array(tensions[100:]) > 1.1).mean() < 0.06
 
 
+def test_a_rising_tension_is_extrapolated_by_the_times_at_which_its_messages_were_sent():
+    commands = []
+    for delay in (0.0, 0.009):  # the second message arrives on time, or just before the third
+        limiter = CommandLimiter(ROBOT, Settings())
+        for n, late in enumerate((0.0, delay, 0.0)):
+            now = sample(0.0, 100.0 + 0.5 * n, ROBOT)
+            now = replace(now, time=n * DT + late, delay=late)
+            sent = limiter.limit(Command(LENGTH, np.full(COUNT, -0.05)), now, LIMIT, DT).value
+        commands.append(sent)
+    np.testing.assert_allclose(commands[1], commands[0], atol=1e-12)
+
+
 def test_a_motor_current_that_reads_too_little_does_not_lead_to_too_much_tension():
     robot = Robot(with_modules(ROBOT.description, 'position', 'current'))
     stream, limiter = MuscleStream(robot), CommandLimiter(robot, Settings())

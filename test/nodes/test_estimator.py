@@ -3,6 +3,7 @@
 
 import shutil
 import signal
+import time
 from copy import deepcopy
 from dataclasses import replace
 
@@ -108,6 +109,21 @@ def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimato
     estimator.received['/diagnostics'].clear()
     estimator.wait(lambda: values(estimator), 'the diagnosis')
     assert {f'rejected muscle_states: {reason}' for reason in cases} <= values(estimator).keys()
+
+
+def test_a_length_that_changes_over_lost_messages_has_not_jumped_if_they_were_sent_long_ago(
+    estimator, healthy
+):
+    answer(estimator, healthy)
+    moved = deepcopy(healthy)
+    moved.data[0] += 0.046
+    before = len(estimator.received['estimated_joint_states'])
+    estimator.muscles.publish(healthy)
+    time.sleep(0.1)  # the estimator runs in this process, so the first message waits
+    estimator.muscles.publish(moved)
+    estimates = estimator.received['estimated_joint_states']
+    estimator.wait(lambda: len(estimates) >= before + 2, 'two estimates')
+    assert not any('jumped' in reason for reason in estimator.estimator.rejected)
 
 
 def test_a_checkpoint_is_replaced_by_parameter_and_topic_and_an_unfit_one_refused(

@@ -13,6 +13,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
+from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 ROBOT = Robot.load('arm26')
@@ -163,6 +164,58 @@ def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
     stream = MuscleStream(ROBOT)
     assert jump_together(stream, size=0.09, pause=2.0 * LIMITS.pause) == [0, 1, 2]
     assert stream.displaced.is_unseen
+
+
+def taken(stream, deliveries):
+    """Return which messages a stream accepts.
+
+    Args:
+        stream: The stream.
+        deliveries: Time of reception [s], time of sending [s] and length of muscle 1 [m] of each
+            message. The clock of the publisher is 50 s ahead.
+    """
+    delays, accepted = MessageDelay(), []
+    for received, sent, length in deliveries:
+        delay = delays.step(received, round(1e9 * (sent + 50.0)))
+        accepted.append(False)
+        with suppress(RejectionError):
+            stream.take_states(resting(length=(1, length)), received, delay=delay)
+            accepted[-1] = True
+    return accepted
+
+
+def steady(count=20):
+    return [(n * PERIOD, n * PERIOD, 0.0) for n in range(count)]
+
+
+def test_a_change_during_lost_messages_is_no_jump_even_if_the_message_before_was_late():
+    # One message waits for 0.2 s; those of the next 0.2 s are lost.
+    bunch = [(0.4, 0.2, 0.0), (0.401, 0.4, 0.046), (0.41, 0.41, 0.047)]
+    assert all(taken(MuscleStream(ROBOT), steady() + bunch))
+    late = steady() + [(0.4, 0.4, 0.0), (0.401, 0.401, 0.046)]
+    assert taken(MuscleStream(ROBOT), late)[-2:] == [True, False]
+
+
+def test_the_clock_of_the_publisher_hides_no_jump():
+    for step in (100.0, 0.3, -0.004, -100.0):
+        jump = [(n * PERIOD, n * PERIOD + step, 0.03 + 0.02) for n in range(20, 30)]
+        assert not any(taken(MuscleStream(ROBOT), steady() + jump)[20:])
+
+
+def test_no_pause_of_the_sender_explains_a_change_beyond_that_of_the_longest_step():
+    most = LIMITS.step + LIMITS.speed * LIMITS.longest_step
+    for length, is_accepted in ((0.99 * most, True), (1.01 * most, False)):
+        bunch = [(5.0, 0.2, 0.0), (5.001, 5.0, length)]
+        assert taken(MuscleStream(ROBOT), steady() + bunch)[-1] == is_accepted
+
+
+def test_hot_readings_that_arrive_apart_but_were_sent_together_are_not_believed():
+    stream, delays = MuscleStream(ROBOT), MessageDelay()
+    for received, sent, degrees in ((0.0, 0.0, 199.0), (0.5, 0.01, 199.0), (0.51, 0.51, 30.0)):
+        delay = delays.step(received, round(1e9 * (sent + 1.0)))
+        states = resting(temperature=(0, degrees))
+        sample = stream.take_states(states, received, delay=delay)
+        assert not sample.temperature[0] > 100.0
 
 
 def jumps_of_a_winding_tendon(by, tension):
