@@ -18,7 +18,12 @@ columns of a row are
 - the estimation error on the held-out motion before learning, after learning with preset `paper`,
   and after learning with preset `default` [rad, norm over the joints],
 - the numbers of ruptures that were detected, and attributed to the right muscle,
-- the error while the arm follows trajectories of 2 s between holdable postures [rad],
+- the error while the arm follows four trajectories of 2 s between holdable postures, the first of
+  which is approached in 3 s [rad]. Only motions that the muscles of the individual can exert are
+  measured, with tendon friction, damping of the joints, and a reserve of 15 % of the tensions. If
+  there are fewer than four among 400 random postures, their number replaces the error,
+- the error after 5 s of holding a posture in which the arm was placed [rad, mean over five holdable
+  postures],
 - errors of moment arms [mm, median over the muscles]: of the exported model relative to the
   learned network, of the exported model relative to the individual, and of the file relative to
   the individual; then the size of these moment arms,
@@ -34,7 +39,8 @@ that arrived: below 100 %, the emulator is slower than real time, or the machine
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
-from itertools import pairwise
+from contextlib import suppress
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +48,17 @@ import numpy as np
 
 from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.exploration_steps import holdable_postures
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.experiments import motion, online_learning
 from musculoskeletal_ae.experiments.detection import GraspAndRupture, detection, run_detector
-from musculoskeletal_ae.experiments.recording import estimation_error, record
+from musculoskeletal_ae.experiments.recording import ClosedLoop, estimation_error, record
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
@@ -60,14 +70,18 @@ from musculoskeletal_ae.robot.robot import Robot
 ALL_NODES = 'with learner'  # the kind of `bench wire` that runs all nodes
 HEAD = (
     'model', 'seed', 'joints', 'muscles', 'before [rad]', '`paper`', 'after', 'detected', 'named',
-    'trajectory [rad]', 'export, network [mm]', 'export, body', 'file, body', 'of', 'real time',
-    'training [s]',
+    'trajectory [rad]', 'held [rad]', 'export, network [mm]', 'export, body', 'file, body', 'of',
+    'real time', 'training [s]',
 )  # fmt: skip
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
+MOMENTS = 25  # number of moments at which the torque of a motion is evaluated
+LEAST_TORQUE = 1e-6  # missing torque above which the muscles cannot exert a motion [N·m]
+HOLDING = 5.0  # time for which a posture is held [s]
 ARM_POSTURES = 300
 RATE = 100.0  # rate of muscle_states with --nodes [Hz]
 LISTS = 'joints', 'muscles', 'without'
+MuscleJacobian = Callable[[Array], Array]
 
 
 class Individuals(Study):
@@ -97,16 +111,71 @@ def speed(arm: Arm) -> float:
     return 2.0 / (time.process_time() - start)
 
 
+def holdable(study: Study, seed: int) -> Iterator[Array]:
+    """Yield the random postures θ (D,) that the muscles of an individual can hold."""
+    robot, jacobian = study.robot, study.arm(seed).individual.muscle_jacobian
+    for theta in robot.random_postures(TRIES, np.random.default_rng([seed, 0x307])):
+        with suppress(RobotDescriptionError):
+            holdable_postures(robot, [theta], 1, jacobian)
+            yield theta
+
+
+def can_exert(limits: reach.Limits, muscle_jacobian: MuscleJacobian, planned: Trajectory) -> bool:
+    """Return whether the muscles can exert the torque of a trajectory at every moment.
+
+    Args:
+        limits: The bone-side tensions that the arm may use.
+        muscle_jacobian: Returns the true G [m/rad] (N, M, D) for θ (N, D).
+        planned: The trajectory.
+    """
+    moments = planned.sample(np.linspace(0.0, planned.duration, MOMENTS + 1)[1:])
+    each = zip(muscle_jacobian(moments.theta), map(Setpoint._make, zip(*moments)))
+    missing = (limits.missing_in_motion(G, at, reach.LEAST_LAG, 1.0) for G, at in each)
+    return all(torque < LEAST_TORQUE for torque in missing)
+
+
+def exertable_path(study: Study, seed: int) -> list[Array]:
+    """Return MOTIONS + 1 postures (D,) between which the muscles can move the arm from rest.
+
+    Raises:
+        MusculoskeletalError: If the random postures contain too few such postures.
+    """
+    arm, limits = study.arm(seed), reach.Limits(study.robot, study.network(seed))
+    path, duration = [arm.theta], motion.STARTING
+    for theta in holdable(study, seed):
+        straight = Trajectory.to(Setpoint.resting(path[-1]), theta, duration)
+        if can_exert(limits, arm.individual.muscle_jacobian, straight):
+            path.append(theta)
+            duration = DURATION
+        if len(path) == MOTIONS + 2:
+            return path[1:]
+    raise MusculoskeletalError(f'{max(len(path) - 2, 0)} of {MOTIONS} motions')
+
+
 def tracking_error(study: Study, seed: int) -> float:
-    """Return the mean error while the arm moves between holdable postures [rad]."""
-    robot, rng, mae = study.robot, np.random.default_rng([seed, 0x307]), study.network(seed)
-    arm = study.arm(seed)
-    postures = robot.random_postures(TRIES, rng)
-    held = holdable_postures(robot, postures, MOTIONS + 1, arm.individual.muscle_jacobian)
-    targets = [theta for theta, _ in held]
-    loop = motion.loop_at(study.arm(seed), mae, targets[0], motion.OURS, DURATION)
-    runs = [motion.follow(loop, a, b, motion.OURS, DURATION) for a, b in pairwise(targets)]
+    """Return the mean error while the arm moves between postures of `exertable_path` [rad]."""
+    path, mae = exertable_path(study, seed), study.network(seed)
+    loop = motion.loop_at(study.arm(seed), mae, path[0], motion.OURS, DURATION)
+    runs = [motion.follow(loop, a, b, motion.OURS, DURATION) for a, b in pairwise(path)]
     return float(np.concatenate([run.error for run in runs]).mean())
+
+
+def holding_error(study: Study, seed: int) -> float:
+    """Return the mean error after the arm has held each of several postures [rad].
+
+    Raises:
+        MusculoskeletalError: If no posture is holdable, or if the controller stops.
+    """
+    errors, arm = list[float](), study.arm(seed)
+    for theta in islice(holdable(study, seed), MOTIONS + 1):
+        arm.reset(theta)
+        loop = ClosedLoop(arm, study.network(seed), Settings(rate_limit=SPEED_LIMIT))
+        loop.step()
+        loop.go(theta, HOLDING)
+        errors.append(float(np.linalg.norm(arm.theta - theta)))
+    if not errors:
+        raise MusculoskeletalError('no holdable posture')
+    return float(np.mean(errors))
 
 
 def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
@@ -120,7 +189,8 @@ def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
         online_learning.teach(learner, online_learning.explore(loop, learner, 60.0 * study.minutes))
         checkpoint.save(learner.mae, study.network_file(preset, seed))
         cells.append(f'{estimation_error(learner.mae, held_out):.4f}')
-    cells += [*rupture_cells(study, seed), attempt(lambda: f'{tracking_error(study, seed):.4f}')]
+    cells += rupture_cells(study, seed)
+    cells += [attempt(error, study, seed) for error in (tracking_error, holding_error)]
     out = study.folder / f'model_{seed}'
     report = export(robot, study.network(seed), out)
     exported = import_robot(out / 'model.xml', study.folder / f'exported_{seed}').robot
@@ -131,7 +201,7 @@ def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
     return [*cells, f'{speed(study.arm(seed)):.1f}', f'{training:.0f}']
 
 
-def arm_errors(arm: Arm, muscle_jacobian: Callable[[Array], Array]) -> Array:
+def arm_errors(arm: Arm, muscle_jacobian: MuscleJacobian) -> Array:
     """Return the root mean square error of each muscle's moment arms over the workspace, (M,)."""
     theta = arm.robot.random_postures(ARM_POSTURES, np.random.default_rng(0x308))
     error = muscle_jacobian(theta) - arm.individual.muscle_jacobian(theta)
@@ -157,12 +227,12 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
     return [f'{round(result[k] * count)} of {count}' for k in ('detected_share', 'named_share')]
 
 
-def attempt(cell: Callable[[], str]) -> str:
-    """Return what `cell` returns, or the message of its error."""
+def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> str:
+    """Return an error of an individual, or the message of the exception that it raises."""
     try:
-        return cell()
-    except MusculoskeletalError as error:
-        return str(error)[:80]
+        return f'{error(study, seed):.4f}'
+    except MusculoskeletalError as problem:
+        return str(problem)[:80]
 
 
 def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> list[str]:
