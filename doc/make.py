@@ -95,8 +95,10 @@ COMMAND_LINE_INTRODUCTION = """\
 `install/musculoskeletal_ae/lib/musculoskeletal_ae/NAME` run the same executable. Nodes take no
 options of their own, only `--ros-args`; [Parameters](parameters.md) lists their parameters.
 
-A node ends with status 0 on Ctrl-C (SIGINT) and SIGTERM. A tool ends with 130; `record` and
-`replay`, for which that is the usual end, end with 0."""
+A node ends with status 0 on Ctrl-C (SIGINT) and SIGTERM. `record` and `replay`, for which that is
+the usual end, end with 0 as well. Any other tool ends with 130 and one line, which states whether
+its result was written. `train --from-bag` then saves what it has learned to
+`NAME.interrupted.safetensors` beside the file of `--out`."""
 
 
 def _first(node: ast.AST) -> str:

@@ -8,7 +8,8 @@ reading function returns the exception to raise.
 import csv
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -166,6 +167,26 @@ def _check(text: str) -> None:
             )
         if len(within) > DEEPEST:
             raise ValueError(f'{where}: entries are nested more than {DEEPEST} levels deep')
+
+
+@contextmanager
+def new_directory(directory: Path, refuse: Refuse) -> Iterator[None]:
+    """Create a directory, or take an empty one, and let a `with` block write files into it.
+
+    After an error or Ctrl-C, everything is removed again, so that no partial result remains.
+    """
+    is_there = os.path.lexists(directory)
+    if is_there and (not directory.is_dir() or any(directory.iterdir())):
+        raise refuse(directory, 'expected a new or empty directory')
+    directory.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for file in directory.iterdir():
+            file.unlink()
+        if not is_there:
+            directory.rmdir()
+        raise
 
 
 def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:

@@ -185,16 +185,38 @@ def save_figure(figure: Any, file: Path) -> None:
         raise MusculoskeletalError(f'picture {file} cannot be written: {error}') from error
 
 
-def exit_status(work: Callable[[], int | None], *also: type[Exception]) -> int:
+def exit_status(
+    work: Callable[[], int | None], *also: type[Exception], out: Path | None = None
+) -> int:
     """Run a tool's work and return its exit status; None counts as 0.
 
     For MusculoskeletalError, OSError and the exceptions in `also`, print one line and return 1.
+    After Ctrl-C, print one line and return INTERRUPTED. The line is the text of the
+    KeyboardInterrupt, or says whether `out`, the file or directory of results, was written.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
+    before = _versions(out)
     try:
         return work() or 0
     except refused as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
+        if stop.args:
+            kept = f': {stop}'
+        elif out is None:
+            kept = ''
+        else:
+            kept = f'; {out} was {"not " if _versions(out) == before else ""}written'
+        print(f'interrupted{kept}', file=sys.stderr)
         return INTERRUPTED
+
+
+def _versions(out: Path | None) -> dict[Path, int]:
+    """Return the modification time of a file, or of each file in a directory [ns]."""
+    if out is None:
+        return {}
+    with suppress(OSError):
+        files = sorted(out.iterdir()) if out.is_dir() else [out]
+        return {file: file.stat().st_mtime_ns for file in files}
+    return {}

@@ -91,6 +91,24 @@ class StopSignals:
 STOP = StopSignals()
 
 
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT within a `with` block, and in child processes that are started there.
+
+    Ctrl-C sends SIGINT to the whole process group, but only the parent may end its children.
+    """
+    from multiprocessing import resource_tracker
+
+    # The resource tracker unblocks SIGINT when it starts. Start it before SIGINT is blocked,
+    # because the first child would otherwise start it afterwards.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def import_heavy(module: str) -> ModuleType:
     """Import a slow module; a stop signal during the import ends the process at once."""
     with STOP.reacting(Reaction.EXIT):

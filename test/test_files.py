@@ -203,3 +203,24 @@ def test_a_file_that_cannot_be_written_leaves_the_one_before_it(tmp_path, monkey
         files.write_whole(file, b'2', previous)
     assert file.read_bytes() == b'1'
     assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize('is_there', [False, True])
+def test_a_directory_of_results_is_complete_or_as_before(tmp_path, is_there):
+    directory = tmp_path / 'results'
+    if is_there:
+        directory.mkdir()
+
+    @files.new_directory(directory, refuse)
+    def interrupted():
+        (directory / 'file').write_text('a part')
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert directory.exists() == is_there
+    with files.new_directory(directory, refuse):
+        (directory / 'file').write_text('everything')
+    with pytest.raises(Refused, match='new or empty'), files.new_directory(directory, refuse):
+        pass
+    assert (directory / 'file').read_text() == 'everything'

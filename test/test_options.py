@@ -10,6 +10,7 @@ import pytest
 from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.options import Parser, exit_status
+from musculoskeletal_ae.stop_signals import INTERRUPTED
 
 
 def parser():
@@ -93,8 +94,8 @@ def test_ctrl_c_ends_without_a_traceback(capsys):
     def interrupt():
         raise KeyboardInterrupt
 
-    assert exit_status(interrupt) == 130
-    assert capsys.readouterr().err == ''
+    assert exit_status(interrupt) == INTERRUPTED
+    assert capsys.readouterr().err == 'interrupted\n'
 
 
 def test_an_unexpected_exception_is_not_hidden():
@@ -115,3 +116,23 @@ def test_help_states_no_default_twice(tool, capsys):
         import_module(f'musculoskeletal_ae.{tool}').main(['--help'])
     options = ' '.join(capsys.readouterr().out.split()).split(' --')
     assert [option for option in options if option.count('(default:') > 1] == []
+
+
+@pytest.mark.parametrize('is_directory', [False, True])
+@pytest.mark.parametrize('writes', [False, True])
+def test_ctrl_c_ends_with_one_line_that_says_whether_the_result_was_written(
+    tmp_path, capsys, is_directory, writes
+):
+    out = tmp_path / 'out'
+    file = out / 'file' if is_directory else out
+    if is_directory:
+        out.mkdir()
+
+    def work():
+        if writes:
+            file.write_text('result')
+        raise KeyboardInterrupt
+
+    assert exit_status(work, out=out) == INTERRUPTED
+    result = 'was written' if writes else 'was not written'
+    assert capsys.readouterr().err == f'interrupted; {out} {result}\n'

@@ -45,7 +45,13 @@ def measure(args: Namespace) -> None:
                 bar.n = share
                 bar.set_description_str(running)
 
-            parts = run(study, names, args.jobs, report)
+            try:
+                parts = run(study, names, args.jobs, report)
+            except KeyboardInterrupt as stop:
+                kept = 'use --keep DIR next time to keep the parts that were measured'
+                if args.keep:
+                    kept = f'--keep {args.keep} has the parts that were measured'
+                raise KeyboardInterrupt(f'nothing was written to {args.out}; {kept}') from stop
         files = [*write(study, parts, args.out), write_report(args.out)]
     if args.readme:
         files += update_readme(args.readme, args.out)

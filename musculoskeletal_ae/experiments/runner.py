@@ -12,7 +12,6 @@ second time fails.
 
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -22,6 +21,7 @@ from typing import Any
 from musculoskeletal_ae.experiments import NAMES, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study, round_numbers
 from musculoskeletal_ae.presets.registry import PRESETS
+from musculoskeletal_ae.stop_signals import interrupts_blocked
 
 EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES
@@ -161,7 +161,8 @@ class _Workers:
         if name in PRESETS:
             task = _train, online_learning.train_initial, self._study, name
         try:
-            future = self._pool.submit(*task)
+            with interrupts_blocked():  # this starts the fork server, or a worker
+                future = self._pool.submit(*task)
         except BrokenProcessPool as error:  # the pool broke after the last check
             future = Future()
             future.set_exception(error)
@@ -187,9 +188,10 @@ class _Workers:
 
     def abort(self) -> None:
         """End all processes at once."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        # First the processes: one that is starting fails with a traceback if the pool is gone.
         for child in multiprocessing.active_children():
             child.terminate()
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
         """End the processes, which have nothing left to do."""
@@ -221,8 +223,6 @@ def _measure(name: str, study: Study, seed: int) -> Measured:
 
 
 def _start() -> None:
-    # Ctrl-C reaches the whole process group, but the parent terminates its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     import torch
 
     torch.set_num_threads(1)

@@ -26,6 +26,7 @@ from musculoskeletal_ae.emulator.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting.fit import fit
+from musculoskeletal_ae.files import new_directory
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
@@ -98,8 +99,15 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
     Raises:
         MusculoskeletalError: If the directory is in use, or MuJoCo does not load the model.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise MusculoskeletalError(f'{out}: expected a new or empty directory')
+
+    def refuse(file: Path, problem: str) -> MusculoskeletalError:
+        return MusculoskeletalError(f'{file}: {problem}')
+
+    with new_directory(out, refuse):
+        return _write(robot, mae, out, seed)
+
+
+def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
     robot = robot.with_elasticity(mae.elasticity)
     fitted = fit(robot, mae, seed)
     moved = Robot(replace(robot.description, routes=_moved(robot, fitted.shift)))
@@ -112,7 +120,6 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
     except (ValueError, mujoco.FatalError) as error:
         message = f'MuJoCo rejects the exported model: {" ".join(str(error).split())}'
         raise MusculoskeletalError(f'{out}: {message}') from error
-    out.mkdir(parents=True, exist_ok=True)
     file = out / 'model.xml'
     file.write_text(text, encoding='utf-8')
     warnings: list[str] = []

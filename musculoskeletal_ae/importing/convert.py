@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convert a file of another format to a robot directory, and report the result (`import_robot`)."""
 
-import os
 import re
 import time
 from argparse import Namespace
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.files import new_directory, read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
 from musculoskeletal_ae.importing.mjcf import read_mjcf
 from musculoskeletal_ae.importing.source import (
@@ -113,17 +112,9 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     cut(source, **chain)
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle remains', *source.lost()[-3:]]))
-    if (there := os.path.lexists(out)) and (not out.is_dir() or any(out.iterdir())):
-        raise refuse(out, 'expected a new or empty directory')
-    try:
+    with new_directory(out, refuse):
         write(source, out)
         robot = Robot.load(out)
-    except BaseException:  # leave no partial robot, even after Ctrl-C
-        for file in out.glob('*'):  # the directory was empty before
-            file.unlink()
-        if not there and out.exists():
-            out.rmdir()
-        raise
     return Imported(robot, tuple(source.notes), compare(source, robot))
 
 

@@ -425,7 +425,7 @@ def urdf(source: Source) -> str:
 
 
 def write(source: Source, out: Path) -> None:
-    """Write robot.urdf and muscles.yaml into a directory, which is created if necessary."""
+    """Write robot.urdf and muscles.yaml into a directory."""
     muscles: list[dict[str, Any]] = []
     for name, route in source.routes.items():
         muscles.append({'name': name, 'route': [written(item) for item in route]})
@@ -441,7 +441,6 @@ def write(source: Source, out: Path) -> None:
         document['joint_elasticity'] = elasticity
     text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)
     head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
-    out.mkdir(parents=True, exist_ok=True)
     (out / 'muscles.yaml').write_text(head + text, encoding='utf-8')
     (out / 'robot.urdf').write_text(body, encoding='utf-8')
 

@@ -13,13 +13,9 @@ import math
 import multiprocessing
 import os
 import queue
-import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
@@ -31,6 +27,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.stop_signals import interrupts_blocked
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
@@ -128,7 +125,7 @@ class TrainerProcess(Trainer):
         try:
             ours, theirs = context.Pipe()
             process = context.Process(target=serve, args=(theirs, *arguments), daemon=True)
-            with theirs, _interrupts_blocked():
+            with theirs, interrupts_blocked():
                 process.start()
         except OSError as error:
             self._schedule_restart(f'cannot be started ({error})')
@@ -202,22 +199,6 @@ class TrainerProcess(Trainer):
         """End the process and discard the job."""
         self._end()
         self._job, self._restart_at = None, math.inf
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT within a `with` block, and in child processes that are started there.
-
-    Ctrl-C sends SIGINT to the whole process group, but only the node may end the child.
-    """
-    # The resource tracker unblocks SIGINT when it starts. Start it before SIGINT is blocked,
-    # because the first child would otherwise start it afterwards.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _talk(

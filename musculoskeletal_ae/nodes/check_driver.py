@@ -163,7 +163,12 @@ class CheckDriver:
             # discovered late.
             return self.alone(1) and (winding.done or time.monotonic() - last > SILENCE)
 
-        self.spin_until(ended, math.inf)
+        try:
+            self.spin_until(ended, math.inf)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(
+                'no more commands are sent, and the driver must release the arm by itself'
+            ) from stop
         if not winding.done:
             verdict.failed('silence', gap=SILENCE)
 

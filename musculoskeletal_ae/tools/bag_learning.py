@@ -26,6 +26,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
+from musculoskeletal_ae.stop_signals import STOP, Reaction
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 
 
@@ -52,12 +53,15 @@ def train(args: Namespace) -> None:
         mae = train_on_model(robot, args).mae
     learner = Learner(robot, mae, args.preset, args.seed)
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
-    for path, pairs in recordings.items():
-        if path not in args.hold_out:
-            total = round(pairs.time[-1] - pairs.time[0], 1)
-            with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
-                if stop := learn(learner, pairs, bar.update):
-                    warnings.append(f'{path}: {stop}')
+    try:
+        for path, pairs in recordings.items():
+            if path not in args.hold_out:
+                total = round(pairs.time[-1] - pairs.time[0], 1)
+                with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
+                    if stop := learn(learner, pairs, bar.update):
+                        warnings.append(f'{path}: {stop}')
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(_keep(learner, args)) from interrupt
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
     for path, pairs in recordings.items():
@@ -73,6 +77,22 @@ def train(args: Namespace) -> None:
     print(f'checkpoint: {args.out}')
     sys.stdout.flush()
     _warn(warnings)
+
+
+def _keep(learner: Learner, args: Namespace) -> str:
+    """Save the network of an interrupted run beside `--out`; return a sentence that says so.
+
+    The file of `--out` does not change: it may have the network of an earlier, complete run.
+    """
+    if args.checkpoint and not learner.updates:
+        return f'nothing was learned yet, and {args.out} was not written'
+    file = args.out.with_name(f'{args.out.stem}.interrupted{args.out.suffix}')
+    with STOP.reacting(Reaction.REMEMBER):  # a second Ctrl-C must not lose the network
+        checkpoint.save(learner.mae, file)
+    return (
+        f'{file} has the network learned so far ({len(learner.samples)} samples, {learner.updates} '
+        f'updates); --checkpoint continues from it. {args.out} was not written'
+    )
 
 
 def _warn(warnings: list[str]) -> None:

@@ -37,4 +37,6 @@ def main(argv: list[str] | None = None) -> int:
     if args.reach and not args.suggest:
         parser.error('use --reach with --suggest only')
     args.reach = args.reach or REACH
-    return exit_status(lambda: import_heavy('musculoskeletal_ae.tools.robot_report').check(args))
+    return exit_status(
+        lambda: import_heavy('musculoskeletal_ae.tools.robot_report').check(args), out=args.out
+    )

@@ -20,7 +20,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_robot(default=None)
     parser.add_out('DIR', 'new or empty directory, for model.xml and report.txt')
     args = parser.parse_args(argv)
-    return exit_status(lambda: _run(args))
+    return exit_status(lambda: _run(args), out=args.out)
 
 
 def _run(args: Namespace) -> int:

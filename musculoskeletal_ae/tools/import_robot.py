@@ -31,4 +31,6 @@ def main(argv: list[str] | None = None) -> int:
     text = 'simulate an MJCF file for a second and report its speed; exit status 3: below real time'
     parser.add_argument('--play', action='store_true', help=text)
     args = parser.parse_args(argv)
-    return exit_status(lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args))
+    return exit_status(
+        lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args), out=args.out
+    )

@@ -52,4 +52,6 @@ def main(argv: list[str] | None = None) -> int:
     if args.from_bag and args.plot:
         parser.error('--plot shows the initial training; do not use it with --from-bag')
     work = 'bag_learning' if args.from_bag else 'model_training'
-    return exit_status(lambda: import_heavy(f'musculoskeletal_ae.tools.{work}').train(args))
+    return exit_status(
+        lambda: import_heavy(f'musculoskeletal_ae.tools.{work}').train(args), out=args.out
+    )

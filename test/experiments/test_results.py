@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
@@ -201,6 +202,26 @@ def test_after_the_kill_of_a_worker_only_a_part_whose_worker_is_killed_again_fai
     measured = runner.run(study, names, 2, lambda *_: None)
     assert measured['body_change'].pop(0).startswith('BrokenProcessPool in body_change')
     assert all(isinstance(each, Measured) for rows in measured.values() for each in rows.values())
+
+
+def reached_by_ctrl_c(_name, _study, _seed):
+    """Return how many of this process and its parent, the fork server, do not block SIGINT."""
+    reached = 0
+    for process in (os.getpid(), os.getppid()):
+        status = Path(f'/proc/{process}/status').read_text('utf-8')
+        (blocked,) = re.findall(r'^SigBlk:\s*(\w+)$', status, re.M)
+        reached += not int(blocked, 16) >> (signal.SIGINT - 1) & 1
+    return Measured({'reached': reached}, {})
+
+
+def test_ctrl_c_in_a_terminal_reaches_no_worker_whose_traceback_it_would_print(
+    arm26, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(online_learning, 'train_initial', learns)
+    monkeypatch.setattr(runner, '_measure', reached_by_ctrl_c)
+    study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
+    measured = runner.run(study, ['online_learning'], 1, lambda *_: None)
+    assert measured['online_learning'][0].numbers == {'reached': 0}
 
 
 def test_if_initial_training_fails_every_part_reports_it(monkeypatch, tmp_path, capsys):

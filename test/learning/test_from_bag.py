@@ -12,8 +12,10 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.stop_signals import INTERRUPTED
 from musculoskeletal_ae.tools import bag_learning, model_training
 from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read
 from musculoskeletal_ae.tools.train import main
@@ -129,6 +131,32 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     warning = printed.err.splitlines()[-1]
     assert warning.startswith('warning: BAG: ')
     assert f'sign of these joint sensors is reversed: {arm26.joints[0]}. Publish θ' in warning
+
+
+def test_ctrl_c_keeps_what_was_learned_and_leaves_the_earlier_network(
+    arm26, trained_file, initial, monkeypatch, tmp_path, capsys
+):
+    theta = np.tile(0.5 * (arm26.lower + arm26.upper), (500, 1))
+    tension = np.full((500, arm26.muscle_count), 60.0)
+    unknown = np.full(tension.shape, -1)
+    time = 0.01 * np.arange(500)
+    recording = Pairs(time, theta, initial.lengths(theta, tension), tension, unknown)
+
+    def interrupted(learner, *_):
+        learner.scheduler.updates = 3
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(bag_learning, 'learn', interrupted)
+    out, kept = tmp_path / 'out.safetensors', tmp_path / 'out.interrupted.safetensors'
+    out.write_text('an earlier network')
+    arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(out)]
+    assert main([*arguments, '--checkpoint', trained_file]) == INTERRUPTED
+    assert load(kept, arm26).joints == tuple(arm26.joints)
+    assert out.read_text() == 'an earlier network'
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith(f'interrupted: {kept} has the network learned so far (0 samples, 3 upd')
+    assert f'{out} was not written' in line
 
 
 @pytest.mark.parametrize('name', ['foreign', 'teaching'])
