@@ -10,7 +10,7 @@ network. With the learned network, the bench measures:
 - control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random holdable postures,
 - rupture: several muscles rupture in turn while the arm explores. The columns are the share of
   ruptures after which a muscle is isolated within 10 s, the share after which it is the ruptured
-  muscle, and the mean time from a rupture to the isolation,
+  muscle, and the mean time from a rupture to the first isolation (10 s if there is none),
 - max/limit: the highest true tension as a multiple of `tension.limit`, except after a rupture,
 - wrong: the number of muscles that are isolated, and of stops, although the arm is healthy.
 
@@ -64,7 +64,7 @@ class Result(NamedTuple):
     control: float
     isolated: float  # fraction of the ruptures after which a muscle was isolated
     named: float  # fraction of the ruptures after which only the ruptured muscle was isolated
-    finding_time: float  # mean time from a rupture to the isolation [s]
+    finding_time: float  # mean time from a rupture to the first isolation, LATEST without one [s]
     highest: float  # highest tension, relative to tension.limit
     wrong: float
     samples: float
@@ -140,7 +140,8 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
 
     Returns:
         The share of ruptures after which a muscle was isolated, the share after which only the
-        ruptured muscle was, and the mean time from rupture to isolation [s].
+        ruptured muscle was, and the mean time from rupture to first isolation [s], which is LATEST
+        for a rupture without isolation.
     """
     isolated, named, times = 0, 0, []
     for m in np.random.default_rng([seed, 0x2B]).permutation(arm.robot.muscle_count)[:count]:

@@ -151,9 +151,8 @@ class Attack:
             tuple[float, str, str]
         ] = []  # time [s], level and text of the status line
         self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
-        #: intervals [s] in which other nodes may send commands, or sensor data are wrong
-        self.foreign: list[tuple[float, float]] = []
-        self.lying: list[tuple[float, float]] = []
+        self.foreign: list[tuple[float, float]] = []  # when other nodes may send commands [s]
+        self.lying: list[tuple[float, float]] = []  # when sensor data are wrong [s]
         self.strangers: list[Process] = []  # duplicate nodes that the attack started
         self.watches_processes = True  # whether a process that ends counts as a violation
         self._learner = ''  # identity of the system's own learner, from /diagnostics

@@ -46,7 +46,7 @@ from musculoskeletal_ae.signals.limits import share_outside
 LOAD, MINUTE = 3.6, 60.0  # mass of the payload [kg]; time until it is added or removed again [s]
 
 MESSAGES = {
-    'change of l in 10 ms [m]': SIGNAL_LIMITS.step,
+    'change of l in 10 ms [m]': SIGNAL_LIMITS.step + SIGNAL_LIMITS.speed * SAMPLE_TIME,
     'T relative to tension.max': SIGNAL_LIMITS.highest_tension,
     'θ_est beyond its limits, relative to the range': SIGNAL_LIMITS.estimate_outside,
 }

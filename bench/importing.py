@@ -160,12 +160,14 @@ def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
 def main(argv: list[str]) -> None:
     """Print the table."""
     parser = Parser('importing', 'Imports public models that you have downloaded.')
-    parser.add_argument('files', nargs='+', type=Path, metavar='FILE')
+    parser.add_argument(
+        'files', nargs='+', type=Path, metavar='FILE', help='model to import as a robot'
+    )
     parser.add_argument(
         '--out', type=Path, metavar='DIR', help='folder that keeps the robot directories'
     )
     parser.add_argument(
-        '--learn', action='store_true', help='also learn an emulated individual of each'
+        '--learn', action='store_true', help='also learn an emulated individual of each robot'
     )
     parser.add_minutes('duration of the exploration', 10.0)
     args = parser.parse_args(argv)

@@ -269,8 +269,9 @@ def main(argv: list[str]) -> None:
     """Print the table, row by row."""
     parser = Parser('mujoco', 'Learns MuJoCo models that you have fetched.')
     text = (
-        'a model, such as arm26=arm26.xml or '
-        'arm=myoarm.xml:joints=elbow_flexion,pro_sup:without=A,B'
+        'name and MJCF file of a model, and the part of it to import: joints=…, muscles=…, '
+        'without=… (muscles to leave out), end=… (end effector), base=… (root link); for '
+        'example arm=myoarm.xml:joints=elbow_flexion,pro_sup'
     )
     parser.add_argument('models', nargs='+', type=parse, metavar='NAME=FILE…', help=text)
     parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='a new directory')

@@ -65,7 +65,11 @@ class MessageError(MusculoskeletalError):
 
 
 class BagError(MusculoskeletalError):
-    """A recording is damaged or has an unexpected format."""
+    """A recording cannot be used as requested.
+
+    It is damaged, lacks what is needed, or does not fit the request. The text names the problem and
+    a remedy.
+    """
 
     def __init__(self, file: Path, problem: str, remedy: str) -> None:
         super().__init__(f'{file}: {problem}; {remedy}')

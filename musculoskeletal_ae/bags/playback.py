@@ -160,7 +160,7 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
         raise BagError(bag.path, problem, 'choose a part without gaps with --start and --duration')
     longest = SPACING * (MOST_ENTRIES // joint_count - 2)
     if span > longest:
-        problem = f'{topic} lasts {span:.0f} s; a trajectory may last {longest:.0f} s'
+        problem = f'the motion on {topic} lasts {span:.0f} s; legal: at most {longest:.0f} s'
         raise BagError(bag.path, problem, 'choose a part with --start and --duration')
 
 

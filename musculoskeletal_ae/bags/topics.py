@@ -101,16 +101,19 @@ def select(
         relevant = sent if wanted[0] == DEFAULT else [*topics]
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
-            problem = f'has no topic to replay by default; {topics_of_bag}'
-            raise BagError(bag.path, problem, 'choose with --topics all or --topics NAME,…')
+            kind = 'of the interface' if wanted[0] == ALL else 'to replay by default'
+            legal = '--topics NAME,…' if wanted[0] == ALL else f'--topics {ALL} or --topics NAME,…'
+            problem = f'has no topic {kind}; {topics_of_bag}'
+            raise BagError(bag.path, problem, f'choose with {legal}')
     else:
         chosen = [name for one in wanted for name in names if one in (name, names[name])]
         for one in wanted:
             if one not in {*names, *names.values()}:
                 raise BagError(bag.path, f'topic {one} is not in the bag', topics_of_bag)
+    leave_out = ', or leave it out with --topics' if list(wanted) in ([DEFAULT], [ALL]) else ''
     for name in chosen:
         topic = topics.get(names[name])
-        _compare_type(bag, name, topic.type if topic else bag.topics[name].type)
+        _compare_type(bag, name, topic.type if topic else bag.topics[name].type, leave_out)
     return {name: name if keep_names else names[name] for name in chosen}
 
 
@@ -183,12 +186,12 @@ def _relative_names(
         elif others:
             several = ', '.join(name or '/' for name in (namespace, *others))
             problem = f'topics of the interface are in several namespaces: {several}'
-            remedy = 'choose one with --from-namespace (or replay all with --keep-names)'
-            raise BagError(bag.path, problem, remedy)
+            raise BagError(bag.path, problem, 'choose one with --from-namespace')
     prefix = f'/{namespace.strip("/")}/'.replace('//', '/')
     if not any(name.startswith(prefix) for name in bag.topics):
         there = ', '.join(name or '/' for name in namespaces(placed)) or 'none'
-        raise BagError(bag.path, f'has no topic under {prefix!r}', f'namespaces in it: {there}')
+        remedy = f'choose one of its namespaces with --from-namespace: {there}'
+        raise BagError(bag.path, f'has no topic under {prefix!r}', remedy)
     names = {
         name: name if name == DIAGNOSTICS else name.removeprefix(prefix) for name in bag.topics
     }
@@ -220,11 +223,13 @@ def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
     return innermost if len(ours) == len(set(ours)) else None
 
 
-def _compare_type(bag: Bag, name: str, expected: str) -> None:
+def _compare_type(bag: Bag, name: str, expected: str, leave_out: str = '') -> None:
+    """Raise a BagError if a topic has another type; `leave_out` is appended to the remedy."""
     topic = bag.topics[name]
     if topic.type != expected:
-        problem = f'topic {name} has the type {topic.type[:80]!r}; expected {expected!r}'
-        remedy = f'choose other topics, or record it again under a name other than {name}'
-        raise BagError(bag.path, problem, remedy)
+        problem = f'topic {name} has the type {topic.type[:80]!r}, but the interface uses this '
+        remedy = f'record the topic under another name{leave_out}'
+        raise BagError(bag.path, f'{problem}name for {expected!r}', remedy)
     if topic.problem:
-        raise BagError(bag.path, f'topic {name} {topic.problem}', 'choose other topics')
+        remedy = f'record the topic with ROS 2 Jazzy{leave_out}'
+        raise BagError(bag.path, f'topic {name} {topic.problem}', remedy)

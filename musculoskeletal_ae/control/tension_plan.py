@@ -24,7 +24,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
-TURNING = 0.005  # speed of a tendon above which its sliding direction is certain [m/s]
+TURNING = 0.005  # scale of the speed at which a tendon's sliding direction becomes certain [m/s]
 AHEAD = 0.2  # T_K is computed at this interval, for a setpoint that is the same time ahead [s]
 
 

@@ -98,8 +98,8 @@ class Trajectory:
 
         Args:
             start: Setpoint at which the trajectory begins.
-            points: The points; those that are no longer ahead are dropped.
-            passed: How long ago the time of the points was 0 [s].
+            points: The points, with times relative to the same time 0.
+            passed: Time elapsed since time 0 of the points [s]; points up to then are dropped.
 
         Raises:
             MessageError: If no point remains, or two points are too close in time.

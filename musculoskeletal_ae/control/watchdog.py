@@ -25,7 +25,9 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LONGEST_STEP = 0.1  # largest time step [s]; after a pause, control does not catch up
 OWN_PAUSE = 0.3  # longest time between two steps that counts as age [s]
-SLOWEST = 0.05  # smallest pace of the messages' clock that is compensated
+#: smallest pace of the messages' clock by which age limits are extended; below it, the steps of a
+#: stopped arm follow the steady clock
+SLOWEST = 0.05
 PACE_SPAN = 1.0  # time constant of the average pace of the messages' clock [s]
 OVERHEATED = 20.0  # excess over temperature_limit at which the arm stops [°C]
 #: ratio of a tension to tension.limit above which the arm stops after OVERLOAD_TIME; during this

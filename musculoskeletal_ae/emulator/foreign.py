@@ -180,7 +180,7 @@ class LateSensors:
         self._history[:] = now
 
     def append(self, now: Array) -> None:
-        """Append the values after one more step to the history."""
+        """Append the present values to the history, one step after the previous ones."""
         self._steps += 1
         self._history[self._steps % HISTORY] = now
 

@@ -226,8 +226,8 @@ def _obstacle(
 ) -> tuple[int, Array, Array, float]:
     """Return joint, centre, axis and radius [m] of the object that bends a tendon between two ends.
 
-    The radius is 0 if there is no such object.
-
+    Centre and axis are in the frame of the joint, which is given by its index. The radius is 0 if
+    there is no such object.
 
     Candidates are the heads of bones at joints between the ends, and the bellies of other muscles.
     The object lengthens the tendon by `kink` [m] in at least one posture, or by as much as

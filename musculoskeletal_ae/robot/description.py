@@ -386,7 +386,7 @@ def _read_joint_elasticity(
     if joints and (values := np.linalg.eigvalsh(stiffness))[0] < LEAST_EIGENVALUE * values[-1]:
         raise fail(
             f'$.joint_elasticity: the stiffness matrix has the eigenvalue {values[0]:.3g}; legal: '
-            'none below 0, because springs only store energy; make the terms under coupled smaller'
+            'none below 0, because springs only store energy; reduce the values in `coupled`'
         )
     return JointElasticity(stiffness, stiffness @ rest, damping)
 

@@ -78,7 +78,8 @@ class MotorInterface:
             raise _refused('motor_names', f'got {len(self._motors)} names; expected {legal}')
         if len(set(self._motors)) < count:
             twice = max(self._motors, key=self._motors.count)
-            raise _refused('motor_names', f'{twice!r} is listed twice; each muscle has one motor')
+            problem = f'{twice!r} is listed twice; each muscle needs a motor of its own'
+            raise _refused('motor_names', problem)
         order = tuple(filter(None, settings.motor_command_order)) or self._motors
         if sorted(order) != sorted(self._motors):
             wrong = sorted({*order} ^ {*self._motors}) or [max(order, key=order.count)]

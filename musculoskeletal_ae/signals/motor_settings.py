@@ -13,7 +13,11 @@ _EACH = 'one value for all muscles, or one for each'
 
 @dataclass(frozen=True)
 class MotorSettings:
-    """The parameters of `motor_interface`; lists are in the order of muscles.yaml."""
+    """The parameters of `motor_interface`.
+
+    Lists are in the order of muscles.yaml, except `motor_command_order`, which states the order of
+    the command controller.
+    """
 
     motor_state_topic: str = Parameter(
         '',

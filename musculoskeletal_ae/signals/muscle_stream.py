@@ -4,11 +4,14 @@
     message ─► shape, finite ─► plausible level ─► plausible step ─► median ─► length offset
             ─► tendon friction, plausible temperature ─► MuscleSample
 
-A message that fails a check raises a `RejectionError`, which names the reason, the value and the
-legal range. Nodes, bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits.
-Values of isolated muscles are not checked. A rejected message may contain valid tensions, for
-example if only a length jumped. `RejectionError.pull` contains these tensions for the limiter.
-After a jump, messages are rejected until the new level has lasted (`length_jumps`).
+A message with an illegal shape, an implausible level or a jump raises a `RejectionError`, which
+names the reason and the value; for a level also the legal range. A temperature that changes
+implausibly fast does not reject a message: the sample has the last accepted temperature. Nodes,
+bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits. Values of isolated
+muscles are not checked. A rejected message may contain valid tensions, for example if only a length
+jumped. `RejectionError.pull` contains these tensions for the limiter. After a jump, messages are
+rejected until the new level has lasted (`length_jumps`). While the length offsets are unknown,
+jumps and levels of lengths reject no message.
 """
 
 from __future__ import annotations

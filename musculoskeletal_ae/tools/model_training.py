@@ -113,7 +113,9 @@ def table(errors: list[PairError], title: str) -> str:
 def model_error(errors: list[PairError], unit: str) -> str:
     """Return the mean error of the estimated joint angles as one line, which bringup.sh shows."""
     (error,) = (e.norm for e in errors if (e.mask, e.output) == (Mask.TENSION_LENGTH, 'theta'))
-    return f'error on the geometric model: {error:.3f} {unit} (mean of unseen states, from T and l)'
+    return (
+        f'error on the geometric model: {error:.3f} {unit} (mean over unseen states, from T and l)'
+    )
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:

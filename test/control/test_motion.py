@@ -409,7 +409,7 @@ def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
     wanted = ROBOT.kinematics.end_effector_pose(start + 0.6 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation
     assert np.linalg.norm(at - wanted) < 0.006
-    moved(bench, 150)  # no other twist arrives, so the last one times out
+    moved(bench, 150)  # no other pose arrives, so the hand comes to rest at the last one
     assert not bench.follower.progress.is_moving
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation

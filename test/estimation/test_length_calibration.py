@@ -141,7 +141,7 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
 def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibration(
     monkeypatch, robot, mae, moment, sees
 ):
-    # Fits without a muscle take still more CPU time.
+    # Fit even less often than the fixture `seldom`, because fits without a muscle take longer.
     monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 10.0)
     rng = np.random.default_rng(0)
 

@@ -142,7 +142,7 @@ def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, 
     motors.run(600)
     assert set(motors.heat.changed) == {2}
     assert motors.core.cause.startswith(f'{ROBOT.muscles[2]}: its module ')
-    motors.core.heat.accept(3)  # another module than the changed one was replaced
+    motors.core.heat.accept(3)  # accepting another module does not clear the report of module 2
     assert set(motors.heat.changed) == {2}
     motors.core.reset()  # after a reset, the present state of all modules counts as healthy
     motors.run(60)
