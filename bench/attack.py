@@ -293,11 +293,12 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--messages',
         type=whole(1, 10_000_000),
-        help='number of hostile messages (default: 100 000)',
+        help='number of hostile messages (default: 100 000; with --quick 800)',
     )
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
     parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
-    parser.add_argument('--seeds', type=numbers, help='random seeds (default: 0,1,2,3,4)')
+    text = 'random seeds (default: 0,1,2,3,4; with --quick 0)'
+    parser.add_argument('--seeds', type=numbers, help=text)
     parser.add_argument('--kinds', type=names, help='names of the attacks to run (default: all)')
     options = parser.parse_args(argv)
     size, begun = QUICK if options.quick else FULL, time.monotonic()

@@ -113,8 +113,10 @@ def write(frames: list[Image.Image], kept: dict[str, int], out: Path) -> None:
 def main(argv: list[str]) -> int:
     """Run the system, record its page and write the film."""
     parser = Parser('film', 'Records the film of the README from the running system.')
-    parser.add_argument('--port', type=whole(1, 65535), default=8099, metavar='N')
-    parser.add_argument('--learning', type=float, default=LEARNING, metavar='S')
+    text = 'port of the page that is recorded'
+    parser.add_argument('--port', type=whole(1, 65535), default=8099, metavar='N', help=text)
+    text = 'time of learning before a muscle ruptures [s]'
+    parser.add_argument('--learning', type=float, default=LEARNING, metavar='S', help=text)
     parser.add_argument('--frames', type=Path, metavar='DIR', help='folder that keeps every frame')
     parser.add_out('DIR', default=ROOT / 'doc' / 'images')
     options = parser.parse_args(argv)

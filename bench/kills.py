@@ -179,7 +179,7 @@ def main(argv: list[str]) -> int:
     parser = Parser('kills', 'Kills a learner at random moments, and checks its saved state.')
     parser.add_robot(default='arm26')
     parser.add_argument('--kills', type=int, default=50, help='number of kills')
-    parser.add_seed('of the moments')
+    parser.add_seed('of the times of the kills')
     parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
     parser.add_argument('--live', type=int, help=argparse.SUPPRESS)
     parser.add_argument('--directory', type=Path, help=argparse.SUPPRESS)

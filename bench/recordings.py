@@ -205,7 +205,8 @@ def main(argv: list[str]) -> int:
     parser = Parser('recordings', "Learns public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')
-    parser.add_argument('--only', default='', help='use only repositories whose name contains this')
+    text = 'use only repositories whose name contains this text'
+    parser.add_argument('--only', default='', metavar='TEXT', help=text)
     parser.add_argument('--out', type=Path, default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)
     rows, shown = list[dict[str, Any]](), dict[str, Any]()

@@ -147,7 +147,7 @@ def _fit(
         f'{n} messages were used only in part: {why}' for why, n in streams.ignored.items()
     ]
     if not len(streams.muscles.time) and not len(streams.joints.time):
-        problem = f'cannot check the fit to {name}: it has neither joint_states nor muscle_states'
+        problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
         return [problem], left_out
     pairs = streams.pairs()
     misplaced = [

@@ -132,7 +132,10 @@ def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTo
     """Add a topic, or add its messages to the topic of the same name; return the topic."""
     first = topics.setdefault(topic.name, replace(topic, message_count=0))
     if (first.type, first.problem) != (topic.type, topic.problem):
-        problem = f'topic {topic.name} has the types {first.type[:80]} and {topic.type[:80]}'
-        raise BagError(file, problem, 'record a topic with one type only')
+        if first.type != topic.type:
+            problem = f'topic {topic.name} has the types {first.type[:80]} and {topic.type[:80]}'
+            raise BagError(file, problem, 'record a topic with one type only')
+        problem = f'topic {topic.name} was recorded with two definitions of {topic.type[:80]}'
+        raise BagError(file, problem, 'record the topic with ROS 2 Jazzy only')
     first.message_count += topic.message_count
     return first

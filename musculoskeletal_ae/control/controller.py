@@ -718,7 +718,8 @@ class Controller:
         if condition is not None:
             raise MessageError('stopped', str(condition))
         if not self.stream.body.offsets.known:
-            raise MessageError('length offsets are unknown', 'call estimator/zero')
+            remedy = 'wait for the length calibration; if none is in progress, call estimator/zero'
+            raise MessageError('length offsets are unknown', remedy)
         progress = self.activities.follower.progress
         if progress.trajectory is not None and not progress.has_lost_path:
             return progress.ahead(delay), self.mae

@@ -146,7 +146,8 @@ class Hand:
         free = (inside == theta).all(axis=0)
         if missing := lacking(robot, mae, inside[-1]):
             detail = f'at the end of this motion, the muscles lack {missing}'
-            raise MessageError('not holdable', f'{detail}; send a smaller or another twist')
+            remedy = 'send a smaller twist, or one in another direction'
+            raise MessageError('not holdable', f'{detail}; {remedy}')
         rates = np.array([1.0, 1.0, 0.0])[:, None] * velocity * free
         return Trajectory.through(
             start, Points(np.arange(len(velocity)), time, inside, rates, 0.0 * rates)

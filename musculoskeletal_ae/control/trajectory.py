@@ -24,6 +24,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
 #: largest allowed excess over the joint limits between points [rad]; for prismatic joints times
@@ -109,9 +110,8 @@ class Trajectory:
             points = points._replace(time=points.time + AT_ONCE)
             kept = points.time >= AT_ONCE
         if not kept.any():
-            raise MessageError(
-                'all points have passed', f'the trajectory started {passed:.3g} s ago'
-            )
+            detail = f'the trajectory started {passed:.3g} s ago; send a later header.stamp, or 0'
+            raise MessageError('all points have passed', detail)
         velocity, acceleration = (None if part is None else part[kept] for part in points[3:])
         time, position = points.time[kept] - passed, points.position[kept]
         if ((apart := np.diff(time, prepend=0.0)) < RESOLUTION * time).any():
@@ -185,14 +185,18 @@ class Trajectory:
         if not np.isfinite(out).all():
             raise MessageError(
                 'leaves the joint limits',
-                'the values of the curve between the points overflow floating point',
+                'between the points, the curve is not finite; send smaller velocities and '
+                'accelerations',
             )
         beyond = out / robot.kinematics.radian
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
-            excess = f'{out[j]:.3g} {robot.units[j].theta}'
+            excess, legal = distinct(out[j], BEYOND * robot.kinematics.radian[j])
             detail = f'between the points, joint {robot.joints[j]} exceeds its limits by {excess}'
-            raise MessageError('leaves the joint limits', detail)
+            remedy = (
+                f'at most {legal} {robot.units[j].theta}; send more points or smaller velocities'
+            )
+            raise MessageError('leaves the joint limits', f'{detail}; legal: {remedy}')
 
     @property
     def path(self) -> tuple[Array, Array]:

@@ -187,10 +187,15 @@ class Listening:
                 self._judge_lengths_and_joints(verdict, theta[known[few]], length, tension)
             else:
                 lacking = np.isnan(theta).all(axis=0)
-                which = ', '.join(np.array(self._robot.joints)[lacking]) or 'all joints at once'
+                unknown = ', '.join(np.array(self._robot.joints)[lacking])
+                reason = (
+                    f'the angles of {unknown} are unknown'
+                    if unknown
+                    else 'the angles of all joints were never known at the same time'
+                )
                 verdict.notes.append(
-                    f'sign, zero and order of l were not checked, because the angles of {which} '
-                    'are unknown; publish joint_states, or hold the arm still and pass --posture'
+                    f'sign, zero and order of l were not checked, because {reason}; publish '
+                    'joint_states of all joints, or hold the arm still and pass --posture'
                 )
         return verdict
 

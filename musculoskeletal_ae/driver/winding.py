@@ -100,7 +100,7 @@ class Winding(MotionTest):
                 needed, limit = distinct(least, most)
                 raise MusculoskeletalError(
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, but '
-                    f'tension.max is {limit} N; this muscle cannot be checked'
+                    f'tension.max is {limit} N; name only other muscles with --muscles'
                 )
             if self._highest[m] < least:
                 needed, limit = distinct(least, self._highest[m])
@@ -217,7 +217,7 @@ class Winding(MotionTest):
             return
         verdict.passed('unit', m)
         if wound[m] < -RESPONSE[1]:
-            detail = f'l rose by {-1e3 * wound[m]:.1f} mm as it was wound in'
+            detail = f'l rose by {-1e3 * wound[m]:.1f} mm while the muscle was wound in'
             verdict.failed('sign', m, detail=detail)
         verdict.passed('sign', m)
         if (other := self._whose_tension(m, home, last)) != m:

@@ -138,7 +138,7 @@ def _route_warnings(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
     largest = np.abs(off).max(axis=0)
     return tuple(
         f'reality {file}: muscle {robot.muscles[m]!r} is up to {1e3 * largest[m]:.0f} mm longer or '
-        f'shorter there than in {robot.description.directory}; is it the same robot?'
+        f'shorter there than in {robot.description.directory}; check that both are the same robot'
         for m in np.flatnonzero(largest > OTHER_ROUTE)
     )
 

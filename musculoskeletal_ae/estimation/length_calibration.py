@@ -33,7 +33,9 @@ LARGEST_RESIDUAL = 0.02
 #: wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
 #: remedy for users; a network that has not learned the arm can be too inexact for this calibration
-OTHER_WAY = 'provide joint sensors, or hold the arm in zero_posture and call estimator/zero'
+OTHER_WAY = (
+    'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
+)
 CORRELATED = 10.0  # number of successive moments with the information of one independent moment
 BEYOND_STOP = 0.01  # fraction of its range by which a stated joint angle may exceed a limit
 MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
@@ -175,7 +177,7 @@ class LengthCalibration:
             limit = 1e3 * LARGEST_RESIDUAL
             return (
                 f'the length of {name} differs from the fit by {1e3 * residual.max():.1f} mm; '
-                f'legal: at most {limit:g} mm'
+                f'legal: at most {limit:g} mm; check this muscle, or {OTHER_WAY}'
             )
         cost = self._fit.cost_per_residual(fit)
         # At a high cost, the fit may have found wrong postures that are similar to the true ones.

@@ -78,7 +78,8 @@ class SuspectHandling:
         """What ends the anomaly, as a text for users, or ''."""
         if self.finding is None:
             return ''
-        return 'verifying it' if self.verification else sentence(self.finding.remedy)
+        wait = 'wait until the muscle has been verified'
+        return wait if self.verification else sentence(self.finding.remedy)
 
     @property
     def last_verification(self) -> str:

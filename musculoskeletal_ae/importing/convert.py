@@ -89,9 +89,9 @@ def read_source(file: Path) -> Source:
         source.couplings = resolved(source.couplings)
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as e:
         problem = str(e) if isinstance(e, ValueError) else repr(e)
-        raise refuse(file, f'it cannot be imported: {problem}') from e
+        raise refuse(file, f'cannot be imported: {problem}') from e
     if not source.routes:
-        raise refuse(file, '; '.join(['it has no muscle with a route', *source.lost()[-3:]]))
+        raise refuse(file, '; '.join(['has no muscle with a route', *source.lost()[-3:]]))
     return source
 
 
@@ -164,8 +164,8 @@ def play(robot: Robot, file: Path) -> int:
         return 0
     slower = needed / REAL_TIME
     print(
-        f'{message}, about {slower:.2g} times too slow for real time; all nodes then use the '
-        "emulator's slower clock"
+        f'{message}, about {slower:.2g} times too slow for real time; `bringup.sh --mujoco` '
+        "therefore lets all nodes follow the emulator's slower clock"
     )
     return SLOW
 
@@ -195,7 +195,8 @@ def arm_verdict(comparison: Comparison) -> str:
 
 def check_verdict(check: RobotCheck) -> str:
     """Return a line with the verdict of `check_robot`."""
-    shares = f'held {100 * check.held.mean():.0f} %, stiff {100 * check.stiff.mean():.0f} %'
+    held, stiff = (f'{100 * share.mean():.0f} %' for share in (check.held, check.stiff))
+    shares = f'{held} of postures are held, {stiff} are stiff'
     kinds = Counter(fault.kind for fault in check.faults)
     faults = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
     return f'check_robot: {f"not sound: {faults}" if faults else "sound"}; {shares}'

@@ -27,7 +27,7 @@ def learner_report(learner: Learner) -> Report:
     elif not learner.enabled:
         message = 'stopped by learner/enable; call it with true to resume'
     elif not learner.body.offsets.known:
-        message = 'waiting for the length calibration by the estimator'
+        message = 'waiting for a length calibration; if none is in progress, call estimator/zero'
     elif not learner.offset_check.is_believed:
         message = 'checking new length offsets against muscle_states'
     elif learner.collector.is_anomaly:

@@ -275,11 +275,11 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
             raise CheckpointError(problem)
     if (most := np.abs(tensors.get('touch.friction', np.zeros(1))).max()) > LARGEST_FRICTION:
         value_text, limit = distinct(most, LARGEST_FRICTION)
-        problem = f'tensor touch.friction has a value of ±{value_text}; legal: at most {limit}'
+        problem = f'tensor touch.friction has a value of ±{value_text}; legal: -{limit} to {limit}'
         raise CheckpointError(problem)
     if (most := np.abs(tensors.get('touch.drive', np.zeros((3, 1)))[0]).max()) > LARGEST_GAIN:
         value_text, limit = distinct(most, LARGEST_GAIN)
-        problem = f'tensor touch.drive has a gain of ±{value_text}; legal: at most {limit}'
+        problem = f'tensor touch.drive has a gain of ±{value_text}; legal: -{limit} to {limit}'
         raise CheckpointError(problem)
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:

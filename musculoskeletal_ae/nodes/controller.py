@@ -29,7 +29,7 @@ from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.method_choice import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import StopMemory
-from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.control.stops import LAST, StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
@@ -44,6 +44,7 @@ from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.reception import Stamps, Streams
+from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
@@ -265,8 +266,12 @@ class Controller(Shell):
     def _reset(self, _: Trigger.Request) -> str:
         present = self.core.reset(time.monotonic())
         if present is not None:
-            again = f'call controller/reset again {LIMITS.settled:g} s after the cause is removed'
-            raise MusculoskeletalError(f'refused: {present}: {present.cause.remedy}; {again}')
+            if present.cause is StopCause.ANOMALY:
+                remedy = 'take the steps that the estimator reports as `remedy` on /diagnostics'
+            else:
+                remedy = sentence(step for step in present.cause.steps if step not in LAST)
+            again = f'call controller/reset again {LIMITS.settled:g} s after the cause has ended'
+            raise MusculoskeletalError(f'refused: {present}; {remedy}; {again}')
         return 'moving to the last target, if there is one; call controller/explore to explore'
 
     def _watch(self) -> None:

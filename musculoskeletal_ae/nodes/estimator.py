@@ -135,8 +135,11 @@ class Estimator(Shell):
         self.core.calibrate_lengths(self.posture)
         self._publish_offsets()
         self._reset(request)
-        doing = 'stands in zero_posture' if self.posture else 'moves gently'
-        return f'calibrating length offsets while the arm {doing}; /diagnostics shows the progress'
+        if self.posture:
+            doing = 'hold the arm still in zero_posture'
+        else:
+            doing = 'call controller/explore, unless the arm explores already'
+        return f'calibrating length offsets: {doing}; /diagnostics shows the progress'
 
     def _isolate(self, muscles: set[int]) -> str:
         self.core.isolate(muscles)

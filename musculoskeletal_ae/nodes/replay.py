@@ -247,7 +247,8 @@ def parse(arguments: list[str]) -> Namespace:
     )
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
     parser.add_motors()
-    add('--keep-names', action='store_true', help='keep the recorded namespace')
+    keep = 'publish on the recorded names, of all arms of the bag unless --from-namespace is given'
+    add('--keep-names', action='store_true', help=keep)
     arm = 'namespace of the arm to play, if the bag has several arms'
     add('--from-namespace', metavar='NS', help=arm)
     rate = 'playback speed as a multiple of the recorded speed; needs --clock'

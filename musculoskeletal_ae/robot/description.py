@@ -319,7 +319,7 @@ def _read_couplings(
             source = 'couplings' if slave in listed else 'its <mimic> in robot.urdf'
             raise fail(
                 f'$.joints: joint {slave!r} follows {coupling.master!r} by {source}; '
-                'under joints, list only joints that follow no other joint'
+                '`joints` may list only joints that follow no other joint'
             )
 
     def refused(slave: str, problem: str) -> RobotDescriptionError:

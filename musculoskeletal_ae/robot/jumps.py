@@ -77,7 +77,7 @@ def jump_warning(robot: Robot) -> str:
     problem = (
         'no network can represent lengths that jump where a tendon slips over a wrapped object'
     )
-    return f'{problem}: {", ".join(each)}; see check_robot'
+    return f'{problem}: {", ".join(each)}; `check_robot` prints where they jump'
 
 
 def jump_choices(robot: Robot) -> list[str]:

@@ -206,8 +206,8 @@ class MuscleFile(Strict, frozen=True):
                 )
         elif self.drive is not None or owners:
             raise ValueError(
-                f'drive needs tension_source: current, but it is {self.tension_source!r}; remove '
-                'drive, or set tension_source: current'
+                f'drive needs tension_source: current, but tension_source is '
+                f'{self.tension_source!r}; remove drive, or set tension_source: current'
             )
 
     def _check_actuation(self) -> None:

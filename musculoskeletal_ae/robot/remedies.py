@@ -74,7 +74,7 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
     if share > max(alone)[0]:
         texts.append(f'even all of these together are not enough: {text}')
     texts = texts or [f'none of these helps: {", ".join(CHANGES)}']
-    return [*texts, 'other routes may help: see --suggest']
+    return [*texts, 'other routes may help: try `check_robot --suggest`']
 
 
 def rounded(values: Array) -> Array:

@@ -117,17 +117,17 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
 
     Raises:
         MessageError: If a joint exceeds its range by more; the text names the joint, its angle and
-            its limits.
+            the legal angles.
     """
     share = share_outside(robot, theta)
     if not (share > outside).any():
         return
     j = int(np.nanargmax(share))
-    low, high, unit = robot.lower[j], robot.upper[j], robot.units[j].theta
-    value, least, most = distinct(theta[j], low, high)
+    margin, unit = outside * (robot.upper - robot.lower)[j], robot.units[j].theta
+    value, least, most = distinct(theta[j], robot.lower[j] - margin, robot.upper[j] + margin)
     raise MessageError(
         'θ far outside the joint limits',
-        f'{robot.joints[j]} is {value} {unit}; limits: {least} to {most} {unit}',
+        f'{robot.joints[j]} is {value} {unit}; legal: {least} to {most} {unit}',
     )
 
 

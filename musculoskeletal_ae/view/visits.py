@@ -116,5 +116,5 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
     if not served:
         raise MusculoskeletalError(
             'this version of viser serves its page in an unknown way, so requests of other web '
-            'sites could not be refused; install the version in .ci/requirements-view.txt'
+            'sites could not be refused; install the version of viser in requirements.txt'
         )

@@ -117,7 +117,7 @@ def test_topics_are_chosen_by_relative_or_recorded_name(tmp_path):
 
 def test_a_namespace_that_is_not_there_is_refused_with_those_that_are(tmp_path):
     bag = make(tmp_path, *ours(('/left/anomaly', 'anomaly')))
-    with pytest.raises(BagError, match=r"no topic under '/right/'.* in it: /left"):
+    with pytest.raises(BagError, match=r"no topic under '/right/'.* --from-namespace: /left"):
         select(bag, ['default'], 'right', False)
 
 

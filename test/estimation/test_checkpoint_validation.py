@@ -113,7 +113,7 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
             CheckpointValidator(robot).check(initial_mae(robot, steps=1).mae)
         reported = 'no network can represent lengths that jump'
         assert (reported in str(refusal.value)) == (name == 'jumps')
-    assert re.search(r': straightener \(\d+ mm\); see check_robot', str(refusal.value))
+    assert re.search(r': straightener \(\d+ mm\); `check_robot` prints', str(refusal.value))
 
 
 def test_a_network_is_validated_in_many_steps_and_refused_at_the_last(trained):

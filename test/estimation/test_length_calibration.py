@@ -213,7 +213,7 @@ def test_lengths_that_no_posture_explains_call_for_joint_sensors_or_a_known_post
         if not calibration.problem:
             run(calibration, reversed_signs, 3.0, sees=False, begin=float(begin))
     assert not calibration.is_done
-    assert 'provide joint sensors, or hold the arm in zero_posture' in calibration.progress
+    assert 'provide joint sensors; or set zero_posture, hold the arm' in calibration.progress
 
 
 @pytest.mark.parametrize('dt', [0.005, 0.02, 0.05])

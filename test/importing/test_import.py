@@ -315,7 +315,7 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
         in result.notes
     )
     cardsflow.write_text('<cardsflow/>')
-    with pytest.raises(SourceError, match=r'it has no muscle with a route$'):
+    with pytest.raises(SourceError, match=r'has no muscle with a route$'):
         read_source(cardsflow)
 
 

@@ -500,7 +500,7 @@ def test_a_limit_is_no_remedy_where_no_limit_holds_the_arm(tmp_path):
     # Premise of this test: even huge limits do not hold the arm.
     assert check_robot(Robot.load(directory), 60).held.mean() < 0.95
     assert all('not enough' in line for line in lines[:-1])
-    assert lines[-1] == 'other routes may help: see --suggest'
+    assert lines[-1] == 'other routes may help: try `check_robot --suggest`'
 
 
 def test_the_report_states_if_no_remedy_helps(tmp_path):
@@ -510,7 +510,7 @@ def test_the_report_states_if_no_remedy_helps(tmp_path):
 
     lines, _ = remedies_of(change(write_robot(tmp_path), idle), 'not_held', 10)
     assert lines[0].startswith('none of these helps: limits, moment arms, mass, series_elastic')
-    assert lines[1:] == ['other routes may help: see --suggest']
+    assert lines[1:] == ['other routes may help: try `check_robot --suggest`']
 
 
 def test_stiffness_is_no_remedy_if_the_elastic_element_is_too_soft(tmp_path):
