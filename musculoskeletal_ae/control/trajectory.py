@@ -192,11 +192,12 @@ class Trajectory:
         if (beyond > BEYOND).any():
             j = int(beyond.argmax())
             excess, legal = distinct(out[j], BEYOND * robot.kinematics.radian[j])
-            detail = f'between the points, joint {robot.joints[j]} exceeds its limits by {excess}'
-            remedy = (
-                f'at most {legal} {robot.units[j].theta}; send more points or smaller velocities'
+            joint, unit = robot.joints[j], robot.units[j].theta
+            raise MessageError(
+                'leaves the joint limits',
+                f'between the points, joint {joint} exceeds its limits by {excess} {unit}; legal: '
+                f'at most {legal} {unit}; send more points or smaller velocities',
             )
-            raise MessageError('leaves the joint limits', f'{detail}; legal: {remedy}')
 
     @property
     def path(self) -> tuple[Array, Array]:
