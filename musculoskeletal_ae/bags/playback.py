@@ -156,7 +156,8 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
         raise _no_motion(bag, topic)
     gaps = np.diff(time)
     if (gap := float(gaps.max())) > LONGEST_GAP:
-        problem = f'{topic} has a gap of {gap:.1f} s, which begins at {time[gaps.argmax()]:.1f} s'
+        begin = f'which begins {time[gaps.argmax()]:.1f} s after the start of this part of the bag'
+        problem = f'{topic} has a gap of {gap:.1f} s, {begin}'
         raise BagError(bag.path, problem, 'choose a part without gaps with --start and --duration')
     longest = SPACING * (MOST_ENTRIES // joint_count - 2)
     if span > longest:

@@ -195,7 +195,8 @@ class Listening:
                 )
                 verdict.notes.append(
                     f'sign, zero and order of l were not checked, because {reason}; publish '
-                    'joint_states of all joints, or hold the arm still and pass --posture'
+                    'joint_states of all joints, or hold the arm still and use --posture of '
+                    'check_driver'
                 )
         return verdict
 
@@ -380,8 +381,10 @@ class Listening:
 
         fit = np.array([misfit(column[:, None] - model) for column in length.T])
         if not moved.any():
-            better = robot.actuation.choose('move the arm by hand', 'pass --move')
-            verdict.notes.append(f'{better} for a better check of sign and order')
+            better = robot.actuation.choose('moving the arm by hand', '`check_driver --move`')
+            verdict.notes.append(
+                f'sign and order were checked at rest only; {better} checks them more reliably'
+            )
             fit = np.maximum(fit, fit.T)  # at rest, only pairwise exchanges can be recognised
         rows, best = linear_sum_assignment(fit)
         inverse = misfit(length + model)

@@ -35,7 +35,7 @@ WARM_UP, PLAYED = 0.1, 1.0  # simulated times before and during the speed test [
 REAL_TIME = 0.5
 SLOW = 3  # exit status for a model that is slower than real time
 OPENSIM = (
-    'OpenSim models are not read; convert it to MJCF with MyoConverter '
+    'OpenSim models are not read; convert this model to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
 )
 #: reader of each format, by the root element of its files

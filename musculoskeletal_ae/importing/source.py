@@ -354,7 +354,8 @@ def cut(
         source.end_effector = end
     if not wanted:
         held = [note for note in source.notes if note.startswith('held fixed')]
-        raise SourceError('; '.join(['no movable joint remains', *held[:3]]))
+        remedy = 'keep at least one by --joints, --base and --end'
+        raise SourceError('; '.join(['no movable joint remains', *held[:3], remedy]))
 
 
 def _choose_end(source: Source) -> None:

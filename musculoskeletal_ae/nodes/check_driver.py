@@ -248,7 +248,7 @@ def _parse(arguments: list[str]) -> Namespace:
         type=number(1.0, 1000.0),
         default=100.0,
         metavar='HZ',
-        help='expected rate of muscle_states [Hz]',
+        help='expected rate of muscle_states or of the states of the motors [Hz]',
     )
     text = 'posture [rad or m] in which the arm is held, if it has no joint sensors'
     add('--posture', type=numbers, metavar='θ,…', help=text)

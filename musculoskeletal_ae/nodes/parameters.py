@@ -219,7 +219,7 @@ def check_names(names: Iterable[str], node: str = '') -> None:
         problem = ''
         if name.split('.')[0] not in every:
             legal = [key for one in own for key in PARAMETERS[one]] or every
-            near = get_close_matches(name, legal, 1) or ['none, see --help']
+            near = get_close_matches(name, legal, 1) or ['none, see doc/reference/parameters.md']
             problem = f'no node has a parameter {name!r}; nearest: {near[0]}'
         elif own and len(users) == 1 and users[0] not in own:
             problem = f'{node} has no parameter {name!r}; only {users[0]} has one of this name'

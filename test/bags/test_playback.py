@@ -111,7 +111,10 @@ def test_a_demonstration_contains_the_joints_that_most_messages_name(tmp_path):
 @pytest.mark.parametrize(
     ('times', 'problem'),
     [
-        ([0.1 * k for k in range(20)] + [14.0, 14.1], 'has a gap of 12.1 s, which begins at 1.9 s'),
+        (
+            [0.1 * k for k in range(20)] + [14.0, 14.1],
+            'has a gap of 12.1 s, which begins 1.9 s after',
+        ),
         ([0.9 * k for k in range(600)], 'lasts 539 s; legal: at most 500 s'),
         ([0.1, 0.2], 'no motion of at least'),
     ],

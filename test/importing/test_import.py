@@ -454,7 +454,7 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
 def test_an_opensim_model_is_refused_with_the_way_to_convert_it(tmp_path):
     # Tags such as <A::B/> occur in files of OpenSim, although they are not valid XML.
     text = '<?xml version="1.0"?><OpenSimDocument Version="40000"><A::B/></OpenSimDocument>'
-    with pytest.raises(SourceError, match='convert it to MJCF with MyoConverter'):
+    with pytest.raises(SourceError, match='convert this model to MJCF with MyoConverter'):
         read_source(put(tmp_path, 'own.osim', text))
 
 
