@@ -246,9 +246,9 @@ class Learner:
         if has_changed:
             self.offset_check.use(offsets)
             if offsets.is_suspect:
-                # The samples held back stay on disk until the offsets have been calibrated again.
                 self.offset_history.revoke(self._time)
                 self.collector.healthy.forget_newest(HELD_TIME)
+                self.keeper.store()  # also saves which samples are held back
             elif self.offset_check.is_believed:
                 self._believe_offsets()
         self.keeper.isolate(body.isolated)

@@ -22,7 +22,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.offset_check import CALIBRATION_SPREAD
-from musculoskeletal_ae.learning.samples import SampleStore, StoredSample
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.limits import LIMITS
 
 HELD_TIME = 5.0  # time before a finding in which samples may be wrong [s]
@@ -39,13 +39,17 @@ class OffsetHistory:
     """
 
     def __init__(self, samples: SampleStore, offset: Array) -> None:
-        """Start with the offsets under which `samples` were taken [m], (M,)."""
-        self._samples, self._offset = samples, offset
+        """Start with the present offsets [m], (M,).
+
+        The store may hold back samples since before a restart of the learner. They are judged by
+        the offsets under which they were taken.
+        """
+        self._samples = samples
+        self._offset = samples.held_offset if samples.held else offset
         #: number of the first sample that was taken under the present offsets
         self._first = samples.accepted + 1
         self._recent: deque[tuple[float, int]] = deque()  # times [s] and numbers of recent samples
-        self._held: list[StoredSample] = []
-        self._is_revoked = False
+        self._is_revoked = bool(samples.held)
         self._is_continuous = True  # whether no jump or gap has occurred since `_first`
         self.dropped = self.corrected = 0
 
@@ -63,22 +67,21 @@ class OffsetHistory:
         """Hold back recent samples, because a finding at `now` [s] has revoked the offsets."""
         if not self._is_revoked:
             recent = {number for at, number in self._recent if 0.0 <= now - at <= HELD_TIME}
-            self._held += self._samples.take_out(recent)
+            self._samples.hold(recent, self._offset)
         self._is_revoked = True
 
     def use(self, offset: Array) -> None:
         """Use plausible offsets [m] (M,) from now on, and put back, drop or correct samples."""
         change = self._offset - offset
-        size = float(np.abs(change).max())
+        size = float(np.nanmax(np.abs(change)))  # NaN: a muscle that was added at a restart
         if size <= CALIBRATION_SPREAD:
-            self._samples.put_back(self._held)
+            self._samples.put_back_held()
         else:
-            self.dropped += len(self._held)
+            self.dropped += self._samples.drop_held()
             if self._is_continuous and not self._is_revoked and size > DETECTED_JUMP:
                 self.corrected += self._samples.lengthen(change, self._first)
             else:
                 self._first = self._samples.accepted + 1
-        self._held = []
         if size > CALIBRATION_SPREAD or self._is_revoked:
             self._recent.clear()
             self._is_continuous = True

@@ -12,7 +12,7 @@ tensions so far, and the newest sample always stays.
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -136,6 +136,9 @@ class SampleStore:
         self._settings, self._radian = settings, radian
         self.capacity = capacity
         self.accepted = 0  # number of samples ever accepted
+        #: samples that are held back because their length offsets are in doubt, and these offsets
+        self.held: list[StoredSample] = []
+        self.held_offset: Array = NOTHING
         self.clear()
 
     def __len__(self) -> int:
@@ -162,26 +165,44 @@ class SampleStore:
             worst = self._dispensable()
             del self.samples[worst], self.known[worst], self.numbers[worst]
 
+    def all(self) -> list[Sample]:
+        """Return all samples, including the held ones."""
+        return [*self.samples, *(each.sample for each in self.held)]
+
     def forget(self, muscle: int, newest: int = 0) -> None:
         """Mark a muscle as unknown in all samples except the `newest` ones."""
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
+        for held in self.held:
+            held.known[muscle] = False
 
-    def take_out(self, numbers: Set[int]) -> list[StoredSample]:
-        """Remove and return the samples with these numbers."""
+    def hold(self, numbers: Set[int], offset: Array) -> None:
+        """Hold back the samples with these numbers until it is decided whether they are right.
+
+        Args:
+            numbers: Numbers of the samples.
+            offset: Length offsets under which they were taken [m], (M,).
+        """
         stored = [*map(StoredSample, self.samples, self.known, self.numbers)]
         for place in reversed(range(len(stored))):
             if stored[place].number in numbers:
                 del self.samples[place], self.known[place], self.numbers[place]
-        return [each for each in stored if each.number in numbers]
+        self.held += [each for each in stored if each.number in numbers]
+        self.held_offset = offset
 
-    def put_back(self, stored: Iterable[StoredSample]) -> None:
-        """Reinsert samples that `take_out` removed, at their original positions."""
-        for each in stored:
+    def put_back_held(self) -> None:
+        """Reinsert the held samples at their original positions."""
+        for each in self.held:
             place = bisect(self.numbers, each.number)
             self.samples.insert(place, each.sample)
             self.known.insert(place, each.known)
             self.numbers.insert(place, each.number)
+        self.held = []
+
+    def drop_held(self) -> int:
+        """Forget the held samples; return their number."""
+        count, self.held = len(self.held), []
+        return count
 
     def lengthen(self, by: Array, first: int) -> int:
         """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.
@@ -208,6 +229,7 @@ class SampleStore:
         self.samples: list[Sample] = []  # the oldest first
         self.known: list[Bools] = []  # whether each sample describes each muscle, (M,)
         self.numbers: list[int] = []  # position of each among all samples ever accepted, from 1
+        self.held = []
         self.accepted = 0
 
     def observations(self) -> Observations:

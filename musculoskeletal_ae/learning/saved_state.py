@@ -2,13 +2,14 @@
 """The content of a state file: samples and network as MessagePack after a checksum."""
 
 import zlib
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import Sample, SampleStore, StoredSample
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -37,35 +38,51 @@ class SavedSample(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The samples, oldest first, and the newest network as the content of a checkpoint."""
+    """The samples, oldest first, and the newest network as the content of a checkpoint.
+
+    `held` are the samples that the store holds back, and `held_offset` the length offsets [m] under
+    which they were taken; empty without such samples. `accepted` counts all samples ever accepted.
+    """
 
     joints: tuple[str, ...]
     muscles: tuple[str, ...]
     tension_source: str
     samples: tuple[SavedSample, ...]
+    held: tuple[SavedSample, ...]
+    held_offset: Values
+    accepted: Annotated[int, msgspec.Meta(ge=0)]
     network: bytes | None
 
 
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
     """Return the state to be saved: the samples of a store, and a checkpoint's content."""
-    stored = zip(samples.numbers, samples.samples, samples.known, strict=True)
-    saved = tuple(_saved(number, sample, known) for number, sample, known in stored)
-    return SavedState(robot.joints, robot.muscles, robot.tension_source.kind, saved, network)
+    stored = map(StoredSample, samples.samples, samples.known, samples.numbers)
+    return SavedState(
+        robot.joints,
+        robot.muscles,
+        robot.tension_source.kind,
+        tuple(map(_saved, stored)),
+        tuple(map(_saved, samples.held)),
+        tuple(samples.held_offset.tolist()) if samples.held else (),
+        samples.accepted,
+        network,
+    )
 
 
-def _saved(number: int, sample: Sample, known: Bools) -> SavedSample:
+def _saved(stored: StoredSample) -> SavedSample:
+    sample = stored.sample
     theta, tension, length, direction, spread, gravity = (
         tuple(part.tolist()) for part in sample[:6]
     )
     return SavedSample(
-        number,
+        stored.number,
         theta,
         tension,
         length,
         direction,
         spread,
         gravity,
-        tuple(known.tolist()),
+        tuple(stored.known.tolist()),
         sample.body_version,
         sample.isolated,
     )
@@ -102,9 +119,14 @@ def from_bytes(data: bytes, robot: Robot) -> SavedState:
             f'the state was learned with tension_source {state.tension_source!r}; this robot has '
             f'{robot.tension_source.kind!r}'
         )
-    for sample in state.samples:
+    for sample in (*state.samples, *state.held):
         if not _fits(sample, robot, len(state.muscles)):
             raise StateError(f'sample {sample.number} does not fit the robot')
+    if state.held and len(state.held_offset) != len(state.muscles):
+        raise StateError(
+            f'held_offset has {len(state.held_offset)} values; legal: one for each of the '
+            f'{len(state.muscles)} muscles'
+        )
     return state
 
 
@@ -125,28 +147,38 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
 
 
 def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
-    """Add the saved samples to a store.
+    """Add the saved samples to an empty store, and hold back those that were held back.
 
     The saved samples do not describe muscles that were added to the robot after the save.
     """
-    places = list(robot.muscle_indices(state.muscles))
     for saved in state.samples:
-        theta = np.array(saved.theta)
-        # Fill in the unmeasured values of added muscles from the geometric model.
-        tension = robot.tension.bias.copy()
-        length = robot.muscle_lengths(np.nan_to_num(theta), tension)
-        direction = np.zeros(robot.muscle_count)
-        known: Bools = np.zeros(robot.muscle_count, dtype=bool)
-        tension[places] = saved.tension
-        length[places] = saved.length
-        direction[places] = saved.direction
-        known[places] = saved.known
-        spread, gravity = np.array(saved.spread), np.array(saved.gravity)
-        isolated = tuple(sorted(places[muscle] for muscle in saved.isolated))
-        sample = Sample(
-            theta, tension, length, direction, spread, gravity, saved.body_version, isolated
-        )
-        samples.add(sample, known, saved.number)
+        stored = _restored(saved, state, robot)
+        samples.add(stored.sample, stored.known, stored.number)
+    samples.held = [_restored(saved, state, robot) for saved in state.held]
+    if samples.held:
+        samples.held_offset = np.full(robot.muscle_count, np.nan)
+        samples.held_offset[list(robot.muscle_indices(state.muscles))] = state.held_offset
+    samples.accepted = max(samples.accepted, state.accepted)
+
+
+def _restored(saved: SavedSample, state: SavedState, robot: Robot) -> StoredSample:
+    places = list(robot.muscle_indices(state.muscles))
+    theta = np.array(saved.theta)
+    # Fill in the unmeasured values of added muscles from the geometric model.
+    tension = robot.tension.bias.copy()
+    length = robot.muscle_lengths(np.nan_to_num(theta), tension)
+    direction = np.zeros(robot.muscle_count)
+    known: Bools = np.zeros(robot.muscle_count, dtype=bool)
+    tension[places] = saved.tension
+    length[places] = saved.length
+    direction[places] = saved.direction
+    known[places] = saved.known
+    spread, gravity = np.array(saved.spread), np.array(saved.gravity)
+    isolated = tuple(sorted(places[muscle] for muscle in saved.isolated))
+    sample = Sample(
+        theta, tension, length, direction, spread, gravity, saved.body_version, isolated
+    )
+    return StoredSample(sample, known, saved.number)
 
 
 def restore_network(state: SavedState, robot: Robot) -> Mae | None:

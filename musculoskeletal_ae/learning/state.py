@@ -128,7 +128,7 @@ class StateStore:
         if state is None:
             return None
         saved_state.restore_samples(state, self._robot, samples)
-        self._saved_samples = list(samples.samples)
+        self._saved_samples = samples.all()
         try:
             return saved_state.restore_network(state, self._robot)
         except StateError as error:
@@ -196,7 +196,7 @@ class StateStore:
         if not self._problem:
             return ''
         on_disk = {id(sample) for sample in self._saved_samples}
-        count = sum(id(sample) not in on_disk for sample in samples.samples)
+        count = sum(id(sample) not in on_disk for sample in samples.all())
         return (
             f'samples and network cannot be saved ({self._problem}); samples not on disk yet: '
             f'{count}; free disk space or make {self.directory} writable, then saving succeeds'
@@ -240,7 +240,7 @@ class StateStore:
     def _save(self, samples: SampleStore, network: bytes | None) -> None:
         state = saved_state.collect(self._robot, samples, network)
         write_whole(self._newest, saved_state.to_bytes(state), self._previous)
-        self._saved_samples, self._is_saved = list(samples.samples), True
+        self._saved_samples, self._is_saved = samples.all(), True
 
     def _write_backup(self, state: SavedState) -> Path:
         backup = self._free_name()

@@ -94,6 +94,31 @@ def test_samples_of_the_last_seconds_before_a_finding_are_put_back_if_it_was_fal
     np.testing.assert_array_equal(lengths(learner)[:2], before)
 
 
+@pytest.mark.parametrize(('found', 'kept'), [(0.002, 2), (0.09, 1)])
+def test_a_learner_that_is_killed_after_a_finding_judges_the_same_samples(
+    arm26, initial, stage, tmp_path, found, kept
+):
+    learner = Learner(arm26, initial, trainer=IdleTrainer, directory=tmp_path)
+    arm = ArmWithOffsets(learner, stage)
+    arm.rest(POSTURE)
+    use(learner, np.full(6, 0.001))
+    arm.rest(2.0 * POSTURE)
+    before, accepted = lengths(learner), learner.samples.accepted
+    assert len(before) == 2
+    revoke(learner)
+    assert len(learner.samples) == 1
+    learner.keeper.close()  # all that remains of a killed learner is what it has saved
+    learner = Learner(arm26, initial, trainer=IdleTrainer, directory=tmp_path)
+    assert len(learner.samples) == 1
+    assert learner.samples.accepted == accepted
+    arm = ArmWithOffsets(learner, stage)
+    use(learner, np.zeros(6), known=False)
+    arm.off = np.full(6, found - 0.002)
+    use(learner, np.full(6, found))
+    arm.rest(3.0)
+    np.testing.assert_array_equal(lengths(learner)[:kept], before[:kept])
+
+
 def test_they_are_dropped_if_other_zeros_are_found(learner, arm):
     (first, *_), numbers = lengths(learner), learner.samples.accepted
     revoke(learner)
