@@ -21,7 +21,7 @@ from typing import Any
 from musculoskeletal_ae.experiments import NAMES, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study, round_numbers
 from musculoskeletal_ae.presets.registry import PRESETS
-from musculoskeletal_ae.stop_signals import interrupts_blocked
+from musculoskeletal_ae.stop_signals import STOP, Reaction, interrupts_blocked
 
 EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES
@@ -161,12 +161,15 @@ class _Workers:
         if name in PRESETS:
             task = _train, online_learning.train_initial, self._study, name
         try:
-            with interrupts_blocked():  # this starts the fork server, or a worker
+            # This may start a worker and the fork server. A worker whose start is interrupted could
+            # not be ended, and would print a traceback.
+            with interrupts_blocked(), STOP.reacting(Reaction.REMEMBER):
                 future = self._pool.submit(*task)
         except BrokenProcessPool as error:  # the pool broke after the last check
             future = Future()
             future.set_exception(error)
         self._running[future] = part
+        STOP.raise_if_received()
 
     def ended(self) -> list[tuple[Part, Future[Any]]]:
         """Wait for a moment; return the parts that have ended.

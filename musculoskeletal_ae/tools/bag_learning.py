@@ -29,6 +29,8 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 
+LEAST_OFFSET = 0.002  # smallest joint-sensor offset that is shown [rad]
+
 
 def train(args: Namespace) -> None:
     """Learn from recordings in order; print the errors on these and on held-out recordings."""
@@ -64,11 +66,19 @@ def train(args: Namespace) -> None:
         raise KeyboardInterrupt(_keep(learner, args)) from interrupt
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
+    zero = (
+        np.zeros(robot.joint_count) if learner.trainer.body is None else learner.trainer.body.zero
+    )
+    if offsets := offset_text(robot, zero):
+        print(f'estimated joint-sensor offsets: {offsets}')
     for path, pairs in recordings.items():
         kind = 'held out' if path in args.hold_out else 'learned from'
-        after = error(learner.mae, pairs)
-        change = f'{before[path]:.4f} → {after:.4f} {robot.kinematics.distance_unit}'
+        unit, after = robot.kinematics.distance_unit, error(learner.mae, pairs)
+        change = f'{before[path]:.4f} → {after:.4f} {unit}'
         note = 'before → after learning; reference: the recorded joint sensors'
+        if offsets:
+            corrected = error(learner.mae, pairs._replace(theta=pairs.theta - zero))
+            note += f'; after learning without their estimated offsets: {corrected:.4f} {unit}'
         print(f'{path} ({kind}): joint-angle error {change} ({note})')
         if path not in args.hold_out:
             continue
@@ -77,6 +87,12 @@ def train(args: Namespace) -> None:
     print(f'checkpoint: {args.out}')
     sys.stdout.flush()
     _warn(warnings)
+
+
+def offset_text(robot: Robot, zero: Array) -> str:
+    """Return the joint-sensor offsets [rad or m] (D,) that are worth showing, by joint."""
+    shown = np.flatnonzero(np.abs(zero) >= LEAST_OFFSET * robot.kinematics.radian)
+    return ', '.join(f'{robot.joints[j]} {zero[j]:.4f} {robot.units[j].theta}' for j in shown)
 
 
 def _keep(learner: Learner, args: Namespace) -> str:

@@ -133,6 +133,31 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     assert f'sign of these joint sensors is reversed: {arm26.joints[0]}. Publish θ' in warning
 
 
+def test_estimated_joint_sensor_offsets_are_shown_and_the_error_without_them(
+    arm26, trained_file, initial, monkeypatch, tmp_path, capsys
+):
+    theta = np.tile(0.5 * (arm26.lower + arm26.upper), (500, 1))
+    tension = np.full((500, arm26.muscle_count), 60.0)
+    unknown = np.full(tension.shape, -1)
+    read = theta + [0.03, 0.0]  # the sensor of the first joint has an offset
+    time = 0.01 * np.arange(500)
+    recording = Pairs(time, read, initial.lengths(theta, tension), tension, unknown)
+
+    def learned(learner, *_):
+        learner.trainer.body.zero[:] = [0.03, 0.0]
+
+    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(bag_learning, 'learn', learned)
+    arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(tmp_path / 'x.safetensors')]
+    assert main([*arguments, '--checkpoint', trained_file]) == 0
+    printed = capsys.readouterr().out
+    assert f'estimated joint-sensor offsets: {arm26.joints[0]} 0.0300 rad\n' in printed
+    mae = load(Path(trained_file), arm26)
+    corrected = error(mae, recording._replace(theta=theta))
+    assert f'without their estimated offsets: {corrected:.4f} rad' in printed
+    assert corrected != error(mae, recording)
+
+
 def test_ctrl_c_keeps_what_was_learned_and_leaves_the_earlier_network(
     arm26, trained_file, initial, monkeypatch, tmp_path, capsys
 ):
