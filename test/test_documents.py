@@ -137,17 +137,21 @@ def test_parameters_that_the_documents_name_exist():
 
 
 #: part of a command that names the new file or directory which it makes
-MAKES = re.compile(r'(?:\brecord (?!-)|\bcp -r \S+ |--record |--out |-o )([\w./]+)')
+MAKES = re.compile(
+    r'(?:\brecord (?!-)|\bcp (?:-r )?\S+ |\bgit clone .*\S+ |\bmkdir (?:-p )?'
+    r'|--(?:record|recover \S+|out|plot|keep|page) |-o |state_directory:=| > )([\w./]+)'
+)
 
 
 def test_no_two_commands_of_the_documents_write_to_the_same_place():
     makers = {}
-    for page in PAGES:
-        for command in commands(ROOT / page):
+    folders = DOC, *(ROOT / name for name in ('bags', 'bench', 'config', 'examples'))
+    for page in (*ROOT.glob('*.md'), *(file for each in folders for file in each.rglob('*.md'))):
+        for command in commands(page):
             if command.line.startswith('[ -d '):  # this command does not replace what exists
                 continue
             for made in MAKES.findall(command.line):
-                makers.setdefault(made.rstrip('/'), []).append((page, command.line))
+                makers.setdefault(made.rstrip('/'), []).append((page.name, command.line))
     assert {place: pages for place, pages in makers.items() if len(pages) > 1} == {}
 
 
