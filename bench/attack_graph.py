@@ -68,6 +68,7 @@ SERVICES = {
 OWN = QoSProfile(depth=1000)
 JUDGE_PERIOD = 0.25  # time between two checks of the status line [s]
 PATIENCE = 90.0  # longest wait for an expected event [s]
+COOLING = 900.0  # longest additional wait for overheated windings to cool [s]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)

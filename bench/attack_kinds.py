@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from bench.attack_graph import NODES, OWN, PATIENCE, Attack, digest, set_request
+from bench.attack_graph import COOLING, NODES, OWN, PATIENCE, Attack, digest, set_request
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
@@ -87,13 +87,18 @@ class Scene:
     def recover(self, moment: str) -> None:
         """Follow the advice until nothing is wrong and the arm is in its previous state."""
         attack, end, trouble = self.attack, time.monotonic() + PATIENCE, ''
+        longest = end + COOLING
         while time.monotonic() < end:
+            begun = time.monotonic()
             attack.spin(1.0)
             level = attack.situation.level()
             trouble = attack.situation.trouble()
             if level != 'error' and self._goes_on(moment):
                 return
+            waits_for_cooling = Step.WAIT_UNTIL_COOL.identifier in attack.situation.steps()
             self.follow_advice()
+            if waits_for_cooling:  # a hot winding cools by about 0.1 °C per second
+                end = min(end + time.monotonic() - begun, longest)
         attack.found(
             'the remedy helps', f'{self.what}: no recovery in {PATIENCE:g} s; status: {trouble}'
         )
@@ -103,11 +108,11 @@ class Scene:
 
     def _goes_on(self, moment: str) -> bool:
         mode = self.attack.modes[-1][1] if self.attack.modes else ''
-        if moment == 'exploring' and mode in ('idle', 'holding'):
+        if moment == 'exploring' and mode in ('idle', 'holding', 'torque'):
             request = SetBool.Request(data=True)
             self.attack.call(SetBool, 'controller/explore', request)
             return False
-        return mode in ('idle', 'holding', 'moving', 'exploring')
+        return mode in ('idle', 'holding', 'moving', 'torque', 'exploring')
 
     def follow_advice(self) -> None:
         """Take all steps that the reports on /diagnostics advise, in order."""

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 #: key of the names of the isolated muscles with their faults, such as 'biceps (ruptured)'
 ISOLATION = 'isolated muscles with faults'
+CALIBRATION = 'calibration'  # key of what a length calibration needs, one of the next two
+GENTLE_MOTION, STANDING = 'gentle_motion', 'standing'
 SILENCE = 1.0  # time without a message after which the status is a warning [s]
 
 
@@ -46,6 +48,7 @@ def report(core: Estimator, now: float) -> Report:
     if core.calibration is not None:
         progress = core.calibration.progress
         text = f'calibrating the lengths: {progress}'
+        values[CALIBRATION] = STANDING if core.calibration.is_standing else GENTLE_MOTION
         if core.calibration.problem:
             values['calibration problem'] = core.calibration.problem
         return Report('warn', text, {**values, 'state': 'calibrating'})

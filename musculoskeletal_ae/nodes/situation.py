@@ -19,8 +19,8 @@ from musculoskeletal_ae import remedy
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control import stops
 from musculoskeletal_ae.control.stops import StopCause
-from musculoskeletal_ae.control.supervisor import StopState
-from musculoskeletal_ae.estimation.status import ISOLATION
+from musculoskeletal_ae.control.supervisor import Activity, StopState
+from musculoskeletal_ae.estimation.status import CALIBRATION, GENTLE_MOTION, ISOLATION
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
@@ -44,6 +44,9 @@ REPORTS = 3
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value
 #: remedy for a length calibration that does not end
 CALIBRATION_STEPS = Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS
+#: activities in which the arm does not move while the length offsets are unknown, and in which
+#: controller/explore is not refused
+STANDING_STILL = Activity.IDLE, Activity.HOLDING, Activity.MOVING, Activity.TORQUE
 
 
 def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
@@ -305,8 +308,19 @@ class Situation:
             steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
             if values.get('state') == 'calibrating':
                 steps = CALIBRATION_STEPS if values.get('calibration problem') else ()
+                if not steps and values.get(CALIBRATION) == GENTLE_MOTION and self._stands_still:
+                    steps = (Step.EXPLORE_GENTLY,)
             troubles.append(_with_remedy(text, *steps) if steps else Trouble(text))
         return troubles
+
+    @property
+    def _stands_still(self) -> bool:
+        """Whether the controller is not stopped, but does not explore either.
+
+        While the length offsets are unknown, the arm then stands still, also in mode `moving`.
+        """
+        mode = self._values('controller').get('mode')
+        return mode in [activity.value for activity in STANDING_STILL]
 
     @property
     def is_stopped(self) -> bool:

@@ -214,6 +214,17 @@ def test_a_calibration_that_runs_is_not_to_be_started():
     assert situation.trouble() == 'length offsets unknown: biceps'
 
 
+@pytest.mark.parametrize('mode', ['idle', 'holding', 'moving', 'torque', 'calibrating'])
+def test_the_arm_is_to_explore_while_a_calibration_waits_for_gentle_motion(mode):
+    situation = Situation('/left')
+    lengths = {'state': 'calibrating', 'unknown_length_offsets': 'biceps'}
+    situation.diagnosed(diagnostics('/left/controller', mode=mode))
+    situation.diagnosed(diagnostics('/left/estimator', **lengths, calibration='standing'))
+    assert situation.steps() == []
+    situation.diagnosed(diagnostics('/left/estimator', **lengths, calibration='gentle_motion'))
+    assert situation.steps() == ([] if mode == 'calibrating' else ['explore_gently'])
+
+
 def test_a_calibration_that_cannot_end_is_shown_with_its_remedy():
     situation = Situation('/left')
     lengths = {'state': 'calibrating', 'unknown_length_offsets': 'biceps'}

@@ -23,5 +23,6 @@ def finding_of(jumped: tuple[int, ...]) -> Finding:
     """Return the finding for one or several muscles whose lengths have jumped."""
     if len(jumped) == 1:
         return Finding(jumped[0], Kind.LENGTH_JUMP, 'its length jumped')
-    evidence = f'its length and {len(jumped) - 1} other lengths jumped'
+    others = '1 other length' if len(jumped) == 2 else f'{len(jumped) - 1} other lengths'
+    evidence = f'its length and {others} jumped'
     return Finding(jumped[0], Kind.LENGTHS_JUMPED, evidence)
