@@ -57,7 +57,7 @@ class InfeasibleError(MusculoskeletalError):
 
 
 class MessageError(MusculoskeletalError):
-    """A received message is invalid; `reason` is the short text under which it is counted."""
+    """A received message is invalid or refused; it is counted under the short text `reason`."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f'{reason}: {detail}')

@@ -5,7 +5,9 @@ Settings that a user may choose are a frozen dataclass whose fields are paramete
 
     @dataclass(frozen=True)
     class Settings:
-        hold_time: float = Parameter(0.5, 'minimum duration of a stop', 's', (0.0, 60.0)).field()
+        hold_time: float = Parameter(
+            0.5, 'time for which a stop holds the last command', 's', (0.0, 60.0)
+        ).field()
 
 `nodes/parameters.py` assembles the parameters of each node from such classes.
 """

@@ -31,7 +31,7 @@ class Losses:
         self._last[topic] = number
 
     def settle(self, publishers: Callable[[str], int]) -> None:
-        """Add gaps since the last call to `lost`, for topics with at most one publisher.
+        """Count the gaps since the last call as `lost`, for topics with at most one publisher.
 
         Args:
             publishers: Function that returns the number of publishers of a topic.

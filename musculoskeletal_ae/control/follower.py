@@ -9,7 +9,7 @@ At each message, for the desired θ, θ̇, θ̈ (`trajectory`),
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
-slides, and μ is learned or a typical value (`control/friction.py`).
+slides, and μ is learned or a typical value (`control/assumed_friction.py`).
 
 Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
 dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is

@@ -13,8 +13,8 @@ Four checks compare a candidate with the geometric model, the arm and the networ
 The first network is only subject to the first and the last check, because its error on a body that
 differs from its model cannot be predicted. A network that a user has chosen is not subject to
 the third check. All limits leave a margin to the values of healthy networks: initial and learned
-networks of both presets, on both shipped robots and both emulator models. `python -m bench gate`
-prints these values, and the values of networks that must be rejected.
+networks of both presets, on arm26 and musashi_left_arm, with both emulator models. `python -m
+bench gate` prints these values, and the values of networks that must be rejected.
 
 A candidate without a calibrated detector inherits the detector in use, which would otherwise be
 switched off. A muscle that was repaired within the last RELEARNING_TIME seconds may be relearned,

@@ -5,8 +5,9 @@
 
 Candidates arrive on the topic `mae_checkpoint`, or from the file that the parameter `checkpoint`
 names. The estimator uses an accepted network and publishes it latched. If an anomaly is detected
-soon after a network was accepted, the estimator returns to the previous network and publishes the
-previous network again. No other node validates the candidates of the learner.
+soon after a network was accepted, the estimator returns to the newest network that was in use long
+enough without an anomaly, and publishes this network again. As soon as there is
+an accepted network, controller and simulator use only accepted networks.
 """
 
 import time
@@ -58,7 +59,7 @@ class Candidates:
         """Handle the beginning or the end of an anomaly.
 
         A network that was accepted shortly before the anomaly may be its cause, and is replaced by
-        the previous network.
+        the newest network that was in use long enough without an anomaly.
         """
         if detected and self.validator.mae is not None:
             self.queue.give_up()

@@ -3,8 +3,8 @@
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
 muscle_states, anomaly_detected, isolated_muscles → muscle_length_command, or muscle_tension_command
-with method `tension`; controller_state, controller_mode. Action follow_joint_trajectory, where
-control_msgs is installed.
+with the methods `tension` and `float`; controller_state, controller_mode. Action
+follow_joint_trajectory, where control_msgs is installed.
 """
 
 import time

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `hardware_emulator`: emulates an arm with muscle modules, and faults on request.
 
-muscle_length_command, muscle_tension_command → joint_states, muscle_states, marker_pose,
-markers; on request imu.
+muscle_length_command, muscle_tension_command → joint_states, muscle_states, markers; on request
+marker_pose and imu.
 """
 
 import time

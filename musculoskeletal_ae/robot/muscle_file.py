@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The format of muscles.yaml (doc/reference/topics_and_services.md describes it for users).
+"""The format of muscles.yaml (doc/reference/file_formats.md describes it for users).
 
 `description` then checks what depends on robot.urdf or on the values of several muscles.
 """

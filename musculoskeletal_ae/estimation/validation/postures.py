@@ -13,8 +13,8 @@ factor.
 
 A further check is the *scale*. It removes the elongations and fits one factor between all route
 lengths by ① and those of the model. Errors of single muscles average out: the scale was 0.84 to
-1.11 for healthy networks of both presets, on both shipped robots and both emulator models. The
-error of the scale is its distance from 1.
+1.11 for healthy networks of both presets, on arm26 and musashi_left_arm, with both emulator models.
+The error of the scale is its distance from 1.
 
 The relative error of a joint or muscle is its root mean square error divided by the standard
 deviation of the true values. A network with a constant output has a relative error of 1. The *mean
