@@ -5,6 +5,7 @@ muscle_states, joint_states or vision_joint_states (or neither), imu, anomaly_de
 isolated_muscles, muscle_length_zeros → mae_checkpoint.
 """
 
+import time
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.trainer import TrainerProcess
@@ -20,11 +21,13 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
 from musculoskeletal_ae.nodes.node_parameters import naming_parameter
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.sources import SEVERAL, LinkSensors, publishers_of
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 
+IMU = 'imu'  # topic of the accelerometers
 POLL_PERIOD = 0.05  # time between checks of the training process [s]
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
@@ -62,7 +65,8 @@ class Learner(Shell):
             self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
-        self.listen(Imu, 'imu', self._take_imu, SENSOR)
+        self.accelerometers = LinkSensors()
+        self.listen(Imu, IMU, self._take_imu, SENSOR)
         self.needed.add('muscle_states')
         self.follow_offsets(self._use_offsets)
         self.follow_muscle_messages(self._take_muscle_states)
@@ -106,7 +110,11 @@ class Learner(Shell):
 
     def _take_imu(self, message: Imu) -> None:
         prefix = self.parameter('frame_prefix')
-        self.core.imu(self.now(), *read_imu(message, self.links, prefix))
+        link, acceleration = read_imu(message, self.links, prefix)
+        self.accelerometers.take(link, time.monotonic())
+        if self.accelerometers.problem:
+            raise MessageError(SEVERAL, self.accelerometers.problem)
+        self.core.imu(self.now(), link, acceleration)
 
     def _take_muscle_states(self, message: Float64MultiArray, _: float, delay: float) -> None:
         self.core.take(message, self.now(), delay)
@@ -149,9 +157,15 @@ class Learner(Shell):
         """Discard messages that have not become part of a sample yet."""
         self.core.reset()
 
+    def on_intruders(self, _: str) -> None:
+        """Check the publishers of `imu`."""
+        publishers = publishers_of(self, self.full_name(IMU))
+        self.accelerometers.look(publishers, time.monotonic())
+
     def report(self) -> Report:
         """Return the diagnostic report."""
-        return self.core.report()
+        report, problem = self.core.report(), self.accelerometers.problem
+        return report.with_warning(f'{IMU} is not used: {problem}') if problem else report
 
     def destroy_node(self) -> None:
         """End the training process with the node."""

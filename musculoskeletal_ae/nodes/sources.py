@@ -54,6 +54,8 @@ TURNS = 3  # number of decreases within LOOKS checks that proves two publishers 
 LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
 NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
 TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]
+LINK_SILENCE = 3.0  # time without a message after which a link counts as having no sensor [s]
+LINK_PATIENCE = 3.0  # time for which there may be more publishers than links [s]
 UNNAMED = '_NODE_NAME_UNKNOWN_'  # name that the graph returns for a node that it does not know
 
 
@@ -147,6 +149,49 @@ class Twins:
         return now - self._heard_at > TWIN_SILENCE
 
 
+class LinkSensors:
+    """Detects two publishers that publish the sensor of one link.
+
+    Each link may have one sensor, and each sensor a publisher of its own, so a topic may have as
+    many publishers as there are links whose messages arrive.
+
+    Attributes:
+        problem: The publishers if there are more of them than links; else ''.
+    """
+
+    def __init__(self) -> None:
+        self.problem = ''
+        self._heard_at: dict[str, float] = {}  # time of the last message [s], by link
+        self._too_many_since = math.inf  # [s]
+
+    def take(self, link: str, now: float) -> None:
+        """Note a message of a link that arrived at `now` [s]."""
+        self._heard_at[link] = now
+
+    def look(self, publishers: Iterable[Publisher], now: float) -> None:
+        """Process a check of the graph at `now` [s]."""
+        nodes = sorted(each.node for each in publishers)
+        links = sorted(link for link, at in self._heard_at.items() if now - at <= LINK_SILENCE)
+        self.problem = ''
+        if not links or len(nodes) <= len(links):
+            self._too_many_since = math.inf
+            return
+        self._too_many_since = min(self._too_many_since, now)
+        if now - self._too_many_since >= LINK_PATIENCE:
+            what = f'{" and ".join(nodes)} publish messages of {", ".join(links)} only'
+            self.problem = f'{what}; stop all but one publisher for each link'
+
+
+def publishers_of(node: Node, topic: str) -> list[Publisher]:
+    """Return the publishers of a topic (full name), or nothing if there is at most one."""
+    if node.count_publishers(topic) < 2:
+        return []
+    return [
+        Publisher(f'{each.node_namespace.rstrip("/")}/{each.node_name}', bytes(each.endpoint_gid))
+        for each in node.get_publishers_info_by_topic(topic)
+    ]
+
+
 class Sources:
     """Watches the publishers of all topics that a node uses."""
 
@@ -226,10 +271,5 @@ class Sources:
         return self._resolve(topic).removeprefix(f'{self._node.get_namespace().rstrip("/")}/')
 
     def _look(self, topic: str) -> None:
-        full, publishers = self._resolve(topic), list[Publisher]()
-        if self._node.count_publishers(full) > 1:
-            for each in self._node.get_publishers_info_by_topic(full):
-                name = f'{each.node_namespace.rstrip("/")}/{each.node_name}'
-                publishers.append(Publisher(name, bytes(each.endpoint_gid)))
-        now = time.monotonic()
-        self._authorships[topic].look(publishers, self._turns[topic], now)
+        publishers = publishers_of(self._node, self._resolve(topic))
+        self._authorships[topic].look(publishers, self._turns[topic], time.monotonic())

@@ -87,6 +87,17 @@ def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained
     assert controller.core.supervisor.is_running
 
 
+def test_a_second_publisher_of_the_motors_is_named(graph):
+    estimator = host(graph, Estimator)
+    graph.publisher(JointState, STATES)
+    stranger = Node('stranger', context=graph.context, namespace=graph.namespace)
+    stranger.create_publisher(JointState, STATES, 10)
+    graph.wait(lambda: estimator.intruders, 'the second publisher')
+    nodes = ' and '.join(f'{graph.namespace}/{name}' for name in ('stranger', 'test'))
+    assert f'{STATES} come from {nodes}' in estimator.intruders
+    stranger.destroy_node()
+
+
 def test_check_driver_passes_the_robot_and_moves_it(graph):
     start_fake_robot(graph)
     options = ['--seconds', '2', '--wait', '--move', '--muscles', 'brachialis']
