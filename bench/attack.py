@@ -43,7 +43,7 @@ JITTER = 0.03  # longest delay from computing to publishing a command on a loade
 RELIEF = 0.3  # paying out may exceed the rate limit for this time after an excess tension [s]
 SILENT = 10.0  # longest legal time between two reports of a node under attack [s]
 GROWTH = 1.2  # largest legal ratio of a node's memory to its memory at the age YOUNG
-YOUNG = 300.0  # age of a node from which on its memory must not grow [s]
+YOUNG = 300.0  # age of a node at which its memory is measured for GROWTH [s]
 #: A tension may exceed ABOVE times tension.limit for at most MOMENT [s].
 ABOVE, MOMENT = 1.1, 0.5
 STILL = 0.002  # largest length by which a muscle of a stopped arm may be wound in [m]

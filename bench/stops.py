@@ -23,7 +23,8 @@ from musculoskeletal_ae.options import Parser, whole
 LATEST = 3.0  # longest time from the start of the process to the signal [s]
 LONGEST_END = 60.0  # longest legal time from the signal to the end of the process [s]
 ENDED_BY_SIGNAL = (-signal.SIGINT, -signal.SIGTERM)
-PACKAGE = 'site-packages/musculoskeletal_ae'  # a traceback with this path: the package had started
+#: path of the package in a traceback; it shows that the signal came while the package ran
+PACKAGE = 'site-packages/musculoskeletal_ae'
 SIGNS_OF_A_CRASH = ('Traceback', 'Exception ignored', 'error', 'Fatal')
 
 

@@ -45,10 +45,10 @@ USUAL = 10.0, 60.0  # usual temperatures of modules at rest [°C]
 UNIT_TOLERANCE = 0.3
 TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
 HOTTEST_AT_REST = 55.0  # highest temperature of modules without commands [°C]; it is 131 °F
-# Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of both shipped
-# arms (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by 0.31 to 1.55
-# times the model's changes. If another muscle fits a column 2.5 times better than its own muscle,
-# the misfit to its own muscle is below 8.5 mm.
+# Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
+# musashi_left_arm (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by
+# 0.31 to 1.55 times the model's changes. If another muscle fits a column 2.5 times better than its
+# own muscle, the misfit to its own muscle is below 8.5 mm.
 ZERO_TOLERANCE = 0.045  # largest length offset of a healthy arm [m]
 SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
 MISPLACED = 0.012  # misfit of a column to its own muscle above which it can be misplaced [m]

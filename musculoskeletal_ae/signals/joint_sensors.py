@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.robot import Robot
 
 LEAST_MOTION = 0.05  # smallest range of θ of a joint that is judged [rad]
-#: smallest |a_j| by which a sign is judged. On the emulated individuals 0–4 of both shipped arms
+#: smallest |a_j| by which a sign is judged. On the emulated individuals 0–4 of two shipped arms
 #: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
 BEYOND = 0.3  # distance by which a correct θ may exceed the joint limits [rad]

@@ -17,8 +17,8 @@ from musculoskeletal_ae.bags.topics import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-# The section "Bags" of doc/reference/topics_and_services.md lists these topics as recorded by
-# default, and those in LEFT_OUT as not recorded.
+# By default, `replay` plays the topics in DEFAULT, and `record` leaves out those in LEFT_OUT
+# (doc/reference/file_formats.md).
 DEFAULT = {
     'joint_states',
     'muscle_states',
