@@ -416,7 +416,8 @@ class Controller:
         if points is None:
             self._follow(self.planner.to_rest(start))
         else:
-            plan = self.planner.through(mae, start, points, max(-delay, 0.0))
+            lag = self.activities.follower.winches.lag
+            plan = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
             self._follow(plan, max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:

@@ -7,6 +7,7 @@ stays within the joint limits, ends in a holdable posture, and respects the spee
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.slowness import slowness
+from musculoskeletal_ae.control.slowness import exertion_slowness, slowness
 from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
@@ -72,19 +73,32 @@ class Planner:
             start: Setpoint from which the motion starts.
             theta: Target posture [rad], (D,).
             duration: Shortest time for each segment of the path [s]. The motion takes longer if the
-                muscles that are not isolated cannot accelerate the arm enough.
+                muscles cannot accelerate the arm enough.
             lag: Lag λ of the muscle modules [s].
         """
         way = reach.way(self._robot, mae, start.theta, theta)
         planned = self._within_limits(mae, Trajectory.to(start, way, duration))
-        slower = reach.exertion_slowness(self._robot, mae, planned, lag)
+        slower = exertion_slowness(self._robot, mae, planned, lag)
         return Plan(planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower)))
 
-    def through(self, mae: Mae, start: Setpoint, points: Points, passed: float) -> Plan:
-        """Plan a motion through points; the time 0 of the points was `passed` [s] ago."""
+    def through(self, mae: Mae, start: Setpoint, points: Points, passed: float, lag: float) -> Plan:
+        """Plan a motion through points.
+
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the motion starts.
+            points: The points.
+            passed: How long ago the time of the points was 0 [s].
+            lag: Lag λ of the muscle modules [s].
+        """
         points = self._clipped(points)
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
+        slower = exertion_slowness(self._robot, mae, planned, lag)
+        # If slowing a trajectory that starts in motion would take it beyond the joint limits, the
+        # arm follows the trajectory as requested and deviates from it.
+        with suppress(MessageError):
+            planned = self._slowed(mae, planned.scaled(slower)) if slower > 1.0 else planned
         return Plan(planned)
 
     def to_rest(self, start: Setpoint) -> Plan:

@@ -16,8 +16,7 @@ keep it, the path minimises the missing torque. On an edge, tendon friction oppo
 roadmap. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and
 Kavraki 2000); until then its cost is approximated from the postures at its ends.
 
-The motion along the path must not be faster than the muscles can accelerate the arm
-(`exertion_slowness`).
+`slowness` slows the motion along the path until the muscles can accelerate the arm.
 """
 
 from itertools import pairwise
@@ -26,7 +25,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.assumed_friction import tendon_friction
-from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -42,13 +41,8 @@ POSTURES = 300  # number of random postures of the roadmap
 NEIGHBOURS = 12  # number of neighbours of each posture to which the roadmap has edges
 LOOKS = 40  # largest number of paths of which all edges are evaluated
 SPACING = 0.15  # distance between the evaluated postures of an edge [rad]
-#: factors by which a motion may be slowed until its tensions suffice, in ascending order
-SLOWER = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: change of a muscle's length per angle above which its sliding direction is certain [m/rad]
 CERTAIN = 0.005
-#: smallest lag λ for which a motion is planned [s]; λ is measured only after the motion has begun
-LEAST_LAG = 0.02
-MOMENT_SPACING = 0.06  # distance between the evaluated moments of a motion [rad]
 AT_STOP = 0.05  # distance from a stop below which a joint rests at it [rad]
 STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
 
@@ -95,57 +89,22 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     return _shortened(path, cost)[1:]
 
 
-def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float) -> float:
-    """Return the factor by which to slow a motion so that the muscles can exert its torque.
-
-        τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
-        T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
-
-    The factor s is the smallest of `SLOWER` for which the missing torque, at every moment of the
-    motion, is at most NOTABLE above that of a very slow motion. Tensions are limited as on a path;
-    `Limits` defines loss. Without isolated muscles, the factor is 1.
-
-    Args:
-        robot: The robot; isolated muscles have no tension.
-        mae: The network in use.
-        trajectory: The motion.
-        lag: λ, time by which the muscle modules lag behind [s].
-    """
-    time, theta = trajectory.path
-    is_still = (theta == theta[0]).all()
-    if robot.used.all() or not robot.actuation.knows_tension or is_still:
-        return 1.0
-    limits, bias, lag = Limits(robot, mae), robot.tension.bias, max(lag, LEAST_LAG)
-    travelled = np.linalg.norm(np.diff(theta, axis=0) / robot.kinematics.radian, axis=1).cumsum()
-    marks = np.arange(0.0, travelled[-1], MOMENT_SPACING)
-    moments = trajectory.sample(time[np.unique(np.searchsorted(travelled, marks)) + 1])
-    jacobians = mae.muscle_jacobian(moments.theta, np.tile(bias, (len(moments.theta), 1)))
-    number = 0
-    for at, jacobian in zip(map(Setpoint._make, zip(*moments)), jacobians):
-        if limits.missing_in_motion(jacobian, at, lag, SLOWER[number]) <= NOTABLE:
-            continue
-        legal = limits.missing_in_motion(jacobian, at, lag, np.inf) + NOTABLE
-        while limits.missing_in_motion(jacobian, at, lag, SLOWER[number]) > legal:
-            number += 1
-            if number == len(SLOWER) - 1:
-                return SLOWER[number]
-    return SLOWER[number]
-
-
 class Limits:
     """The bone-side tensions that a moving arm may use.
 
-        T_bias/loss ≤ T_end ≤ (T_bias + USED (T_limit − T_bias))/loss,   loss = e^{μ s}
+        T_bias/loss ≤ T_end ≤ (T_bias + used (T_limit − T_bias))/loss,   loss = e^{μ s}
 
-    Tendon friction opposes the motion: it weakens a tendon that is wound in (s = 1), and a tendon
-    that is drawn out (s = −1) resists with more than T_bias.
+    Here `used` is USED, unless a caller needs no reserve. Tendon friction opposes the motion: it
+    weakens a tendon that is wound in (s = 1), and a tendon that is drawn out (s = −1) resists with
+    more than T_bias.
     """
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
+    def __init__(self, robot: Robot, mae: Mae, used: float = USED) -> None:
+        """Describe the limits; `used` is the usable fraction of the tension range above T_bias."""
         limits = robot.tension
         self._robot, self._radian = robot, robot.kinematics.radian
         self._low = limits.bias
-        self._high = limits.bias + USED * (limits.limit - limits.bias)
+        self._high = limits.bias + used * (limits.limit - limits.bias)
         self._friction = tendon_friction(robot, mae)
 
     def of(
