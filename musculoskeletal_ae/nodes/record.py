@@ -238,7 +238,11 @@ def _work(options: Namespace, arguments: list[str]) -> int:
     if options.recover:
         bag = options.recover
         target = options.out or bag.with_name(f'{bag.stem}_recovered')
-        count, left_out = recover(bag, target, options.compression)
+        try:
+            count, left_out = recover(bag, target, options.compression)
+        except KeyboardInterrupt as stop:
+            incomplete = f'{target} is incomplete; remove it, and repeat the command'
+            raise KeyboardInterrupt(incomplete) from stop
         print(f'{count} messages recovered to {target}')
         if left_out:
             problem = f'topics that are not in CDR were not recovered: {", ".join(left_out)}'

@@ -36,6 +36,15 @@ def test_a_killed_recording_is_read_but_for_its_last_chunk_and_says_so(killed, c
     assert any('unfinished' in fault and '--recover' in fault for fault in check_bag(killed).faults)
 
 
+def test_an_interrupted_recovery_says_that_its_result_is_incomplete(killed, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(record, 'recover', interrupt)
+    with pytest.raises(KeyboardInterrupt, match='bag_recovered is incomplete; remove it'):
+        recover(killed)
+
+
 @pytest.mark.parametrize('options', [[], ['-o', 'new'], ['new', '--compression', 'none']])
 def test_recovery_writes_a_finished_bag_and_leaves_the_original_alone(
     killed, content, options, tmp_path, monkeypatch, capsys
