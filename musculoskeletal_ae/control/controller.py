@@ -254,7 +254,7 @@ class Controller:
         Raises:
             RejectionError: If the message cannot be used.
         """
-        with self._relieving(now):
+        with self._relieving(now, delay):
             self._use_sample(self.stream.take(message, now, delay=delay), now)
 
     def muscles(self, states: Array, now: float) -> None:
@@ -267,14 +267,14 @@ class Controller:
             self._use_sample(self.stream.take_states(np.asarray(states), now), now)
 
     @contextmanager
-    def _relieving(self, now: float) -> Iterator[None]:
+    def _relieving(self, now: float, delay: float = 0.0) -> Iterator[None]:
         """Relieve muscles whose tension is too high, even if their message is rejected."""
         try:
             yield
         except RejectionError as error:
             if error.pull is not None:
                 self.rejected_pull = error.pull
-                self.watchdog.take_rejected(error.pull[1], self.stream.body.used, now)
+                self.watchdog.take_rejected(error.pull[1], self.stream.body.used, now, delay)
             raise
 
     def _use_sample(self, sample: MuscleSample, now: float) -> None:

@@ -112,20 +112,31 @@ class DataAge:
 
 
 class Overload:
-    """Detects muscles with tensions above OVERLOAD times `tension.limit`."""
+    """Detects muscles with tensions above OVERLOAD times `tension.limit`.
+
+    The duration of an overload is the time between the sendings of its messages, plus the age of
+    the newest message, up to LONGEST_STEP. Hence neither a late message nor a pause of the
+    controller turns a short peak into an overload.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._level: Array = OVERLOAD * robot.tension.limit
-        #: time since when each muscle exceeds the level [s]; ∞ if it does not
+        #: time of sending since when each muscle exceeds the level [s]; ∞ if it does not
         self._since: Array = np.full(robot.muscle_count, math.inf)
+        self._received_at = self._sent_at = -math.inf  # times of the newest message [s]
 
-    def take(self, tension: Array, awake: float) -> None:
-        """Record which filtered tensions T [N], (M,), exceed the level at the time `awake` [s].
+    def take(self, tension: Array, now: float, delay: float) -> None:
+        """Record which filtered tensions exceed the level.
 
-        Where T is not finite, nothing changes.
+        Args:
+            tension: T [N], (M,). Where it is not finite, nothing changes.
+            now: Time of reception by the steady clock [s].
+            delay: How late the message is (`MessageDelay`) [s].
         """
-        since = np.where(tension > self._level, np.minimum(self._since, awake), math.inf)
+        self._received_at, self._sent_at = now, now - delay
+        earliest = np.minimum(self._since, self._sent_at)
+        since = np.where(tension > self._level, earliest, math.inf)
         self._since = np.where(np.isfinite(tension), since, self._since)
 
     @property
@@ -134,10 +145,11 @@ class Overload:
         each = zip(self._robot.muscles, self._level, self._since, strict=True)
         return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
 
-    def conditions(self, awake: float) -> list[Condition]:
+    def conditions(self, now: float) -> list[Condition]:
         """Return the overload if it has lasted longer than OVERLOAD_TIME."""
         m = int(self._since.argmin())
-        if awake - self._since[m] <= OVERLOAD_TIME:
+        age = min(now - self._received_at, LONGEST_STEP)
+        if self._sent_at + age - self._since[m] <= OVERLOAD_TIME:
             return []
         level = f'{self._level[m]:.0f} N for {OVERLOAD_TIME:g} s'
         detail = f'tension of {self._robot.muscles[m]} above {level}'
@@ -209,17 +221,18 @@ class Watchdog:
     def take_sample(self, sample: MuscleSample, now: float) -> None:
         """Record that plausible muscle states were received; check them for overload and heat."""
         self.heat.take(self._robot, sample, self.age.received(MUSCLE_STATES, now))
-        self.overload.take(sample.motor_tension * sample.usable, self.age.awake(now))
+        self.overload.take(sample.motor_tension * sample.usable, now, sample.delay)
 
-    def take_rejected(self, tension: Array, used: Bools, now: float) -> None:
+    def take_rejected(self, tension: Array, used: Bools, now: float, delay: float) -> None:
         """Check the filtered tensions [N], (M,), of a rejected message for overload.
 
         Args:
             tension: T; −∞ where it is implausible.
             used: Which muscles are not isolated, (M,).
-            now: Time of the steady clock [s].
+            now: Time of reception by the steady clock [s].
+            delay: How late the message is (`MessageDelay`) [s].
         """
-        self.overload.take(np.where(used, tension, 0.0), self.age.awake(now))
+        self.overload.take(np.where(used, tension, 0.0), now, delay)
 
     def take_estimate(self, now: float) -> None:
         """Record that a plausible estimate was received."""
@@ -235,7 +248,7 @@ class Watchdog:
         if self.second_publisher:
             present.append(Condition(StopCause.SECOND_PUBLISHER, self.second_publisher))
         settings = self._settings
-        present += self.overload.conditions(self.age.awake(now))
+        present += self.overload.conditions(now)
         present += self.heat.conditions(self._robot, settings.temperature_limit)
         present += self.age.stale(now, settings.max_age)
         return present

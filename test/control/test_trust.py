@@ -9,7 +9,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control.supervisor import RESUME
-from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, OWN_PAUSE
+from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, OWN_PAUSE, Overload
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.validity import QUANTITIES
 
@@ -188,6 +188,25 @@ def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_t
     bench.tension = None
     bench.step(120)
     assert bench.core.reset(bench.now) is None
+
+
+@pytest.mark.parametrize(
+    ('peak', 'is_overload'),
+    [
+        ([(0.00, 0.00), (0.01, 0.01), (0.02, 0.02), (0.03, 0.03)], False),  # then a pause
+        ([(0.00, 0.00), (0.25, 0.01), (0.25, 0.02), (0.25, 0.03)], False),  # a pause in the middle
+        ([(0.10 * n, 0.10 * n) for n in range(4)], True),
+        ([(0.00, 0.00), (0.29, 0.28), (0.29, 0.29)], True),
+    ],
+)
+def test_a_peak_of_tension_is_no_overload_because_the_controller_pauses(peak, is_overload):
+    overload, tension = Overload(ROBOT), np.full(ROBOT.muscle_count, 60.0)
+    tension[3] = 230.0
+    for received, sent in peak:
+        overload.take(tension, 100.0 + received, received - sent)
+    assert bool(overload.conditions(100.29)) == is_overload
+    overload.take(np.full(ROBOT.muscle_count, 60.0), 100.3, 0.0)
+    assert not overload.conditions(100.3)
 
 
 # -- late messages, and no messages ---------------------------------------------------------------
