@@ -23,6 +23,8 @@ individual's hour ends with its first finding or stop. Exit status 1 if there wa
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -216,19 +218,19 @@ class BusyLoop:
         for use in self._reliable:
             use()
         self._reliable.clear()
-        for received, delay, (muscles, _) in self.controlling.receive(now):
-            try:
-                core.take(muscles, received, delay)
-            except MessageError:
-                continue
-        estimates, self._estimates = self._estimates[-QUEUE:], []
         was_running = core.supervisor.is_running
-        for theta in estimates:
-            core.estimated(theta, now)
+        if now - core.watchdog.age.stepped_at > 1.5 * SAMPLE_TIME:  # the timer of the node
             self._command_by(core, now)
-            now += HANDLING
-        if not estimates and now - core.watchdog.age.stepped_at > 1.5 * SAMPLE_TIME:
-            self._command_by(core, now)
+        estimates, self._estimates = self._estimates[-QUEUE:], []
+        for message, theta in zip_longest(self.controlling.receive(now), estimates):
+            with suppress(MessageError):  # the nodes count and drop bad messages
+                if message is not None:
+                    now, delay, (muscles, _) = message
+                    core.take(muscles, now, delay)
+            with suppress(MessageError):
+                if theta is not None:
+                    core.estimated(theta, now)
+                    self._command_by(core, now)
         self.pauses += was_running and not core.supervisor.is_running
         if core.supervisor.is_running and not core.supervisor.explores:
             core.explore(True)
