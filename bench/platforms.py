@@ -166,7 +166,8 @@ def _sourced(site: Site) -> None:
     )  # fmt: skip
     if base == Path('/usr'):
         raise MusculoskeletalError(
-            'Python 3.12 is installed in /usr, which cannot be copied; install it with pyenv'
+            'Python 3.12 is installed in /usr, which cannot be copied; install another one with '
+            'pyenv'
         )
     packages = 'lib/python3.12/site-packages'
     system_python = system / 'bin' / 'python3.12'

@@ -167,4 +167,4 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
 
 def _no_motion(bag: Bag, topic: str) -> BagError:
     problem = f'{topic} contains no motion of at least {SHORTEST_MOTION:g} s'
-    return BagError(bag.path, problem, 'record it while you demonstrate a motion')
+    return BagError(bag.path, problem, 'record this topic while you demonstrate a motion')

@@ -100,7 +100,7 @@ class Winding(MotionTest):
                 needed, limit = distinct(least, most)
                 raise MusculoskeletalError(
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, but '
-                    f'tension.max is {limit} N; name only other muscles with --muscles'
+                    f'tension.max is {limit} N; check only the other muscles, with --muscles'
                 )
             if self._highest[m] < least:
                 needed, limit = distinct(least, self._highest[m])

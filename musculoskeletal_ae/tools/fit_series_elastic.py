@@ -79,7 +79,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
         raise ValueError('a testbed table needs several tensions at several muscle lengths')
     if elongation @ (tension - tension.mean()) <= 0.0:
-        raise ValueError('elongation does not grow with tension; check its zero and sign')
+        raise ValueError('elongation does not grow with tension; check the sign of elongation')
 
     def model(log_constants: Array) -> SeriesElastic:
         return SeriesElastic(*np.exp(log_constants)[:, None])

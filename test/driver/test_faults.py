@@ -521,8 +521,8 @@ def test_a_sound_driver_is_found_sound_above_the_tension_limit():
     ('robot', 'highest', 'reported'),
     [
         (ROBOT, 35.0, 'needs at least 50 N, but it may command 35 N at most'),
-        (with_tension(35.0, 45.0), None, 'tension.max is 45 N; name only other muscles'),
-        (with_tension(35.0, 45.0), 60.0, 'tension.max is 45 N; name only other muscles'),
+        (with_tension(35.0, 45.0), None, 'tension.max is 45 N; check only the other muscles'),
+        (with_tension(35.0, 45.0), 60.0, 'tension.max is 45 N; check only the other muscles'),
     ],
 )
 def test_too_little_tension_to_judge_a_muscle_is_refused(robot, highest, reported):
