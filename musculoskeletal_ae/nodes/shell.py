@@ -49,6 +49,7 @@ from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import reason
 from musculoskeletal_ae.nodes.sources import (
     AUTHORS,
+    CLOCK,
     LOOK_PERIOD,
     MOTOR_COMMAND,
     SEVERAL,
@@ -368,8 +369,11 @@ class Shell(Node):
         """Return the full name of a topic.
 
         On a ros2_control robot, this is the name of the topic of the motors that replaces `topic`.
-        The result is '' for `motor_command` if the robot has no topic for commands to motors.
+        The result is '' for `motor_command` if the robot has no topic for commands to motors, and
+        for `/clock` if this node does not use it.
         """
+        if topic == CLOCK and not self.get_parameter('use_sim_time').value:
+            return ''
         name = self._wires.get(topic, topic)
         return self.resolve_topic_name(name) if name else ''
 
@@ -434,6 +438,7 @@ class Shell(Node):
 
     def _look_around(self) -> None:
         self._awake.tick(time.monotonic())
+        self.sources.watch(CLOCK)  # `use_sim_time` may be set at any time
         self.sources.look()
         self.on_intruders(self.intruders)
 

@@ -30,8 +30,10 @@ from musculoskeletal_ae.exceptions import MessageError
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
 MOTOR_COMMAND = 'motor_command'  # stands for the topic of the parameter motor_command_topic
+CLOCK = '/clock'
 #: topics that must have one publisher, with the node that publishes them. A ros2_control robot has
-#: other topics for some of these, which `Shell.full_name` returns.
+#: other topics for some of these, which `Shell.full_name` returns. Messages on /clock go to rclpy,
+#: so they cannot be rejected, but the controller stops.
 AUTHORS = {
     'muscle_states': _DRIVER,
     'joint_states': _DRIVER,
@@ -44,6 +46,7 @@ AUTHORS = {
     'isolated_muscles': _ESTIMATOR,
     'accepted_checkpoint': _ESTIMATOR,
     'mae_checkpoint': 'the learner',
+    CLOCK: 'the source of time',
 }
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
 SEVERAL = 'several publishers'  # rejection reason
@@ -183,8 +186,8 @@ class LinkSensors:
 
 
 def publishers_of(node: Node, topic: str) -> list[Publisher]:
-    """Return the publishers of a topic (full name), or nothing if there is at most one."""
-    if node.count_publishers(topic) < 2:
+    """Return the publishers of a topic (full name, or ''), or nothing if there is at most one."""
+    if not topic or node.count_publishers(topic) < 2:
         return []
     return [
         Publisher(f'{each.node_namespace.rstrip("/")}/{each.node_name}', bytes(each.endpoint_gid))

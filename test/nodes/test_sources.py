@@ -6,12 +6,15 @@ import pytest
 from builtin_interfaces.msg import Time
 from controlled_arm import ControlledArm
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
 from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, joint_message
 from musculoskeletal_ae.nodes.sources import (
     LEASE,
@@ -155,6 +158,20 @@ def test_messages_in_the_name_of_the_estimator_stop_the_arm_and_change_nothing(
         assert not core.watchdog.has_anomaly
     arm.goes_to([-0.5, -1.2])
     arm.never_jumped()
+
+
+def test_a_second_clock_stops_the_nodes_that_use_it(graph):
+    follower = graph.host(Controller, robot='arm26', use_sim_time=True)
+    other = graph.host(Estimator, robot='arm26')
+    stranger = Node('stranger', context=graph.context, namespace=graph.namespace)
+    for node in (graph.node, stranger):
+        node.create_publisher(Clock, '/clock', 10)
+    nodes = ' and '.join(f'{graph.namespace}/{name}' for name in ('stranger', 'test'))
+    stopped = f'/clock come from {nodes}'
+    graph.wait(lambda: stopped in follower.core.watchdog.second_publisher, 'the second clock')
+    assert other.intruders == ''
+    stranger.destroy_node()
+    graph.wait(lambda: not follower.intruders, 'the end of the second clock')
 
 
 @pytest.mark.parametrize('confirmed', [False, True])
