@@ -12,6 +12,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.body import Layout
 from musculoskeletal_ae.learning.joint_stops import sensor_zeros
 from musculoskeletal_ae.learning.posture_model import PostureModel
+from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
 #: Errors of the body model are common to all samples. Therefore all samples together count as at
@@ -28,8 +29,8 @@ LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
 class Prior:
     """Means and standard deviations σ of the differences between a body and its geometric model."""
 
-    attachment: float = 0.007  # σ of each coordinate of each route point [m]
-    elastic: float = 0.2  # σ of the logarithm of each elastic constant
+    attachment: float = ATTACHMENT  # σ of each coordinate of each route point [m]
+    elastic: float = ELASTIC  # σ of the logarithm of each elastic constant
     friction: float = 0.05  # σ of μ around `friction_mean`
     friction_mean: float = 0.05  # mean of μ
     offset: float = 0.001  # σ of the offset of the length sensor [m]

@@ -10,35 +10,38 @@ has wound in `slack_length`. Changes of length that are due to the motion of the
 A position-controlled module maintains no tension, so a healthy tendon is slack if a long length is
 commanded. For these modules, the rule is that a tendon is stretched, but has no tension:
 
-    T < slack_share · T_bias for DEAD_TIME, and x and x − x₀ > STRETCH · L_e(T_bias)
-    x = l(θ, 0) − l,   x₀ = x − L_e(T) when the tendon was last taut
+    T < T_slack for DEAD_TIME, and d − d̄ > SIGMAS · σ,   d = l(θ, T_slack) − l
+    T_slack = slack_share · T_bias
 
-θ is estimated from the tendons that are not slack. x contains the error of the network, which may
-be centimetres before the network has learned the arm. The readings just before the tension was lost
-reveal this error, x₀. Both x and x − x₀ must be large. If a tendon ruptures while it carries no
-load, the rupture is detected as soon as the tendon should carry load.
+θ is estimated from the tendons that are not slack. d contains errors of the network, which may be
+centimetres before the network has learned the arm. Mean d̄ and standard deviation σ of these errors
+follow from the readings with which the tendon was last taut, and from the covariance of the
+network's errors (`estimation/length_errors.py`). Just after a loss of tension, σ is small. The
+farther the arm moves from the posture in which the tendon was taut, the larger σ becomes. If a
+tendon ruptures while it carries no load, the rupture is detected as soon as the tendon should carry
+load.
 """
 
 from collections import deque
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.estimation.length_errors import LengthErrors, Prediction
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: stretch of a tendon without tension above which it is ruptured, relative to the stretch at T_bias
-STRETCH = 1.5
-#: STRETCH without calibrated statistics: a network that has not learned the arm can estimate a
-#: stretch of up to 1.5 for a healthy slack tendon
-UNCALIBRATED_STRETCH = 3.0
-#: STRETCH with motor currents, whose tensions are uncertain because of drive friction
-CURRENT_STRETCH = 2.0
-#: number of messages that are kept; the oldest one precedes a loss of tension in the newest one
+#: number of standard deviations by which a tendon without tension is stretched if it is ruptured
+SIGMAS = 3.0
+#: Standard deviations by which a tension has to exceed T_slack for a tendon that is surely taut.
+#: Motor currents have such a standard deviation.
+SURE = 2.0
+#: number of messages without a break in which a tendon has to be taut, so that the first of them is
+#: no part of the loss of tension
 RECENT = 5
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
@@ -63,7 +66,7 @@ class SlackTendon(Detector):
 
     def use(self, mae: Mae) -> None:
         """Monitor the muscles that are not isolated in this network."""
-        self._mae, self._reduced = mae, dict[tuple[int, ...], Mae]()
+        self._mae = mae
         self._robot = self._complete_robot.without(mae.isolated)
 
     def configure(self, settings: Detection) -> None:
@@ -136,61 +139,83 @@ class StretchedTendon(SlackTendon):
     def __init__(self, robot: Robot, settings: Detection) -> None:
         super().__init__(robot, settings)
         self._recent: deque[MuscleSample] = deque(maxlen=RECENT)
-        #: the last message in which each slack tendon was taut, by muscle
+        self._taut_count: Ints = np.zeros(robot.muscle_count, dtype=int)  # messages without a break
+        #: the newest message that preceded RECENT messages in which each tendon was taut, by muscle
         self._taut = dict[int, MuscleSample]()
-        self._is_slack: Bools = np.zeros(robot.muscle_count, dtype=bool)
+        #: predictions from the messages of `_taut` without the slack muscles, by muscle
+        self._taut_predictions = dict[int, tuple[MuscleSample, Bools, Prediction]]()
+
+    def use(self, mae: Mae) -> None:
+        """Monitor the muscles that are not isolated in this network."""
+        super().use(mae)
+        self._errors = LengthErrors(self._complete_robot, mae)
+        self._taut_predictions.clear()
 
     def reset(self) -> None:
         """Restart the measurement of how long tendons have been stretched without tension."""
         super().reset()
         self._recent.clear()
+        self._taut_count[:] = 0
         self._taut.clear()
-        self._is_slack[:] = False
+        self._taut_predictions.clear()
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle that has been stretched without tension for DEAD_TIME seconds."""
-        sample, bias = observation.sample, self._robot.tension.bias
-        is_slack = (sample.motor_tension < LIMITS.slack_share * bias) & self._robot.used
-        if self._recent:
-            for m in np.flatnonzero(is_slack & ~self._is_slack).tolist():
-                self._taut[m] = self._recent[0]
+        sample, used = observation.sample, self._robot.used
+        lowest = self._slack_tension
+        is_slack = (sample.motor_tension < lowest) & used
         self._recent.append(sample)
-        self._is_slack = is_slack
+        is_taut = sample.motor_tension - SURE * sample.tension_spread >= lowest
+        self._taut_count = np.where(is_taut & used, self._taut_count + 1, 0)
+        for m in np.flatnonzero(self._taut_count >= RECENT).tolist():
+            self._taut[m] = self._recent[0]
         is_dead = is_slack & observation.lengths_known
         if np.count_nonzero(is_dead):
-            is_dead &= self._is_stretched(sample, tuple(np.flatnonzero(is_slack).tolist()))
+            is_dead &= self._is_stretched(sample, is_slack, observation.estimate.state.theta)
         self._slack_time = np.where(is_dead, self._slack_time + observation.dt, 0.0)
         if self._slack_time.max() < DEAD_TIME - 1e-9:
             return None
         muscle = int(self._slack_time.argmax())
         return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched, but has no tension')
 
-    def _is_stretched(self, sample: MuscleSample, slack: tuple[int, ...]) -> Bools:
-        """Return a mask (M,) of slack muscles so short that a healthy tendon would have tension."""
-        robot, mae = self._robot, self._mae
-        isolated = tuple(sorted({*robot.isolated, *slack}))
-        if robot.muscle_count - len(isolated) <= robot.joint_count:
-            return np.zeros(robot.muscle_count, dtype=bool)  # the other muscles do not determine θ
-        if isolated not in self._reduced:
-            self._reduced[isolated] = mae.without(isolated)
-        is_calibrated = mae.anomaly is not None and mae.anomaly.calibrated
-        share = STRETCH if is_calibrated else UNCALIBRATED_STRETCH
-        if is_calibrated and robot.tension_source.is_current:
-            share = CURRENT_STRETCH
-        enough = share * robot.elongation(robot.description.tension.bias)
-        stretch = self._stretch(sample, isolated)
-        is_stretched: Bools = stretch > enough
-        for m in np.flatnonzero(is_stretched & self._is_slack).tolist():
-            if (taut := self._taut.get(m)) is None:
-                continue
-            error = self._stretch(taut, isolated)[m] - robot.elongation(taut.bone_tension)[m]
-            is_stretched[m] = stretch[m] - error > enough[m]
+    @property
+    def _slack_tension(self) -> Array:
+        """T_slack [N], (M,)."""
+        tension: Array = LIMITS.slack_share * self._complete_robot.tension.bias
+        return tension
+
+    def _is_stretched(self, sample: MuscleSample, is_slack: Bools, start: Array) -> Bools:
+        """Return a mask (M,) of slack muscles so short that a healthy tendon would have tension.
+
+        Args:
+            sample: The readings.
+            is_slack: The muscles without tension, (M,).
+            start: An estimate of θ with which the fit of a posture starts [rad], (D,).
+        """
+        used = self._robot.used & ~is_slack
+        tension = np.where(is_slack, self._slack_tension, sample.bone_tension)
+        now = self._errors.predict(sample.length, tension, sample.tension_spread, used, start)
+        is_stretched = np.zeros(len(is_slack), dtype=bool)
+        for m in np.flatnonzero(is_slack).tolist():
+            prediction = now
+            if m in self._taut:
+                taut = self._taut_prediction(m, used, now.theta)
+                prediction = self._errors.given(now, taut, m)
+            is_stretched[m] = prediction.excess[m] > prediction.limit(m, SIGMAS)
         return is_stretched
 
-    def _stretch(self, sample: MuscleSample, isolated: tuple[int, ...]) -> Array:
-        """Return x [m] (M,), for which θ is estimated without the `isolated` muscles."""
-        theta = self._reduced[isolated].estimate(sample.bone_tension, sample.length).theta
-        tension = sample.bone_tension.copy()
-        tension[list(isolated)] = 0.0
-        stretch: Array = self._mae.lengths(theta, tension) - sample.length
-        return stretch
+    def _taut_prediction(self, muscle: int, used: Bools, start: Array) -> Prediction:
+        """Return the prediction from the readings with which a slack tendon was last taut.
+
+        It uses the lengths of the same muscles as the prediction with which it is compared.
+        """
+        sample = self._taut[muscle]
+        if muscle in self._taut_predictions:
+            stored, used_then, prediction = self._taut_predictions[muscle]
+            if stored is sample and (used_then == used).all():
+                return prediction
+        prediction = self._errors.predict(
+            sample.length, sample.bone_tension, sample.tension_spread, used, start
+        )
+        self._taut_predictions[muscle] = sample, used, prediction
+        return prediction

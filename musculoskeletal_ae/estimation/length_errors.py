@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the lengths that a network predicts, and whether they explain a measured length.
+
+The lengths l(θ, T) of a network have errors with the covariance Σ. A posture is fitted to the
+lengths of some muscles (generalised least squares with a prior of θ, index o), and then predicts
+the length of every muscle:
+
+    θ = argmin eᵀ W e + (θ − θ̄)ᵀ P (θ − θ̄),   e = l_o − l_o(θ, T),   W = (Σ_oo + N_oo)⁻¹
+    d = l(θ, T) − l,   covariance of d = A (Σ + N) Aᵀ + G H P H Gᵀ
+    A = I − G H G_oᵀ W,   H = (G_oᵀ W G_o + P)⁻¹
+
+N is the variance of errors that are independent in every posture: sensor noise, and the elongation
+at an uncertain tension. θ̄ and P are mean and precision of θ in the training data. If few tendons
+are taut, θ is uncertain and so is d.
+
+Errors of a network vary smoothly with the posture. If d was known at another posture, where the
+tendon was taut, a large part of its error is therefore known:
+
+    d | d₀ has the mean k d₀ and the variance s² − k ρ s s₀ + n²,   k = ρ s s₀ / (s₀² + n₀²)
+    ρ = exp(−‖(θ − θ₀) / range‖² / (2 SMOOTHNESS²))
+
+s² is the part of the variance of d that stems from Σ, and n² is the rest.
+
+Σ. Without learning, it is the variance of the geometric model (`robot/model_errors.py`). After
+learning, it is the second moment of the residuals on the healthy arm, plus the variance by which
+the error of θ displaces each length, g C gᵀ on average over random postures. C is the covariance of
+the estimate. Residuals alone are too small, because the network has learned from the same messages.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, scale_vector
+from musculoskeletal_ae.robot.model_errors import ELASTIC, length_variances
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES = 300  # number of random postures over which variances are averaged
+SENSOR_NOISE = 0.0003  # standard deviation of the noise of a length [m]
+#: Width of the correlation ρ, as a share of the joint ranges. It is the width with which the
+#: learner's residual model varies (`learning/body.py`).
+SMOOTHNESS = 0.35
+STEPS = 15  # largest number of Newton steps
+SETTLED = 1e-4  # step below which the fit ends [rad]
+HALVINGS = 6  # number of times that a step is halved if it does not lower the cost
+
+
+class Prediction(NamedTuple):
+    """Lengths of all muscles, as predicted from some of them."""
+
+    theta: Array  # the fitted posture [rad], (D,)
+    excess: Array  # d, predicted minus measured length [m], (M,)
+    smooth: Array  # s², part of the variance of d that varies smoothly with the posture [m²], (M,)
+    noise: Array  # n², the rest of the variance of d [m²], (M,)
+
+    def limit(self, muscle: int, sigmas: float) -> float:
+        """Return the d [m] of one muscle that is `sigmas` standard deviations above 0."""
+        return sigmas * math.sqrt(self.smooth[muscle] + self.noise[muscle])
+
+
+class LengthErrors:
+    """Predicts lengths with a network, and how far the prediction may be wrong.
+
+    Attributes:
+        covariance: Σ [m²], (M, M).
+    """
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        """Compute the covariance of one network's errors.
+
+        Args:
+            robot: The nominal body.
+            mae: The network.
+        """
+        self._robot, self._mae = robot, mae
+        self._range = robot.upper - robot.lower
+        joints, muscles = robot.joint_count, robot.muscle_count
+        scale = scale_vector(joints, muscles)
+        self._mean = (mae.mean / scale)[:joints]
+        self._precision: Array = np.diag(np.square((scale / mae.std)[:joints]))
+        theta = robot.random_postures(POSTURES, np.random.default_rng(0))
+        if mae.covariance is None:
+            self.covariance: Array = np.diag(length_variances(robot, theta).mean(axis=0))
+            return
+        tension = np.broadcast_to(robot.description.tension.bias, (POSTURES, muscles))
+        slopes = mae.muscle_jacobian(theta, tension)
+        by_posture = np.einsum('nij,jk,nik->ni', slopes, mae.covariance, slopes)
+        self.covariance = np.diag(by_posture.mean(axis=0))
+        if mae.anomaly is not None:
+            mean = mae.anomaly.mean[muscles:]
+            moment = mae.anomaly.covariance[muscles:, muscles:] + np.outer(mean, mean)
+            self.covariance = self.covariance + moment / LENGTH_SCALE**2
+
+    def predict(
+        self, length: Array, tension: Array, spread: Array | float, used: Bools, start: Array
+    ) -> Prediction:
+        """Fit a posture to the lengths of some muscles, and predict the lengths of all.
+
+        Args:
+            length: l [m], (M,).
+            tension: T_end at which the lengths are predicted [N], (M,).
+            spread: Standard deviation of T_end [N], (M,) or scalar.
+            used: The muscles whose lengths are used, (M,).
+            start: Posture with which the fit starts [rad], (D,).
+        """
+        robot, tension = self._robot, np.maximum(tension, 0.0)
+        compliance = robot.series_elastic.compliance(robot.routes.length_at_zero, tension)
+        elastic = np.hypot(ELASTIC * robot.elongation(tension), compliance * spread)
+        noise = np.square(elastic) + SENSOR_NOISE**2
+        rows: Ints = np.flatnonzero(used)
+        weight = np.zeros_like(self.covariance)
+        among = np.ix_(rows, rows)
+        weight[among] = np.linalg.inv((self.covariance + np.diag(noise))[among])
+        theta = self._fit(length, tension, weight, start)
+        slope = self._mae.muscle_jacobian(theta, tension)
+        excess: Array = self._mae.lengths(theta, tension) - length
+        spread_of_theta = np.linalg.inv(slope.T @ weight @ slope + self._precision)
+        moves = slope @ spread_of_theta
+        kept = np.eye(len(length)) - moves @ slope.T @ weight
+        smooth = np.einsum('ij,jk,ik->i', kept, self.covariance, kept)
+        rest = np.square(kept) @ noise
+        rest += np.einsum('ij,jk,ik->i', moves, self._precision, moves)
+        return Prediction(theta, excess, smooth, rest)
+
+    def _fit(self, length: Array, tension: Array, weight: Array, start: Array) -> Array:
+        def cost_at(theta: Array) -> tuple[float, Array]:
+            error = length - self._mae.lengths(theta, tension)
+            away = theta - self._mean
+            return float(error @ weight @ error + away @ self._precision @ away), error
+
+        theta, (cost, error) = start, cost_at(start)
+        for _ in range(STEPS):
+            slope = self._mae.muscle_jacobian(theta, tension)
+            pull = slope.T @ (weight @ error) + self._precision @ (self._mean - theta)
+            step = np.linalg.solve(slope.T @ weight @ slope + self._precision, pull)
+            for _ in range(HALVINGS):
+                tried = theta + step
+                new_cost, new_error = cost_at(tried)
+                if new_cost <= cost:
+                    break
+                step = 0.5 * step
+            else:
+                break
+            theta, cost, error = tried, new_cost, new_error
+            if np.abs(step).max() < SETTLED:
+                break
+        return theta
+
+    def given(self, now: Prediction, taut: Prediction, muscle: int) -> Prediction:
+        """Return the prediction with the error that one muscle had while it was taut removed.
+
+        Args:
+            now: The prediction to correct.
+            taut: The prediction by the same muscles when this muscle was taut.
+            muscle: Index of the muscle; other muscles keep their values.
+        """
+        distance = np.square((now.theta - taut.theta) / self._range).sum()
+        correlation = math.exp(-0.5 * distance / SMOOTHNESS**2)
+        common = correlation * math.sqrt(now.smooth[muscle] * taut.smooth[muscle])
+        gain = common / (taut.smooth[muscle] + taut.noise[muscle])
+        excess, smooth = now.excess.copy(), now.smooth.copy()
+        excess[muscle] -= gain * taut.excess[muscle]
+        smooth[muscle] -= gain * common
+        return now._replace(excess=excess, smooth=smooth)
