@@ -5,21 +5,21 @@ The lengths l(θ, T) of a network have errors with the covariance Σ. A posture 
 lengths of some muscles (generalised least squares with a prior of θ, index o), and then predicts
 the length of every muscle:
 
-    θ = argmin eᵀ W e + (θ − θ̄)ᵀ P (θ − θ̄),   e = l_o − l_o(θ, T),   W = (Σ_oo + N_oo)⁻¹
+    θ = argmin eᵀ W e + (θ − θ̄)ᵀ P (θ − θ̄),   e = l_o − l_o(θ, T),   W = (Σ + N)_oo⁻¹
     d = l(θ, T) − l,   covariance of d = A (Σ + N) Aᵀ + G H P H Gᵀ
     A = I − G H G_oᵀ W,   H = (G_oᵀ W G_o + P)⁻¹
 
-N is the variance of errors that are independent in every posture: sensor noise, and the elongation
-at an uncertain tension. θ̄ and P are mean and precision of θ in the training data. If few tendons
-are taut, θ is uncertain and so is d.
+N is the variance of the elongation and of the sensor noise. θ̄ and P are mean and precision of θ in
+the training data. If few tendons are taut, θ is uncertain and so is d.
 
-Errors of a network vary smoothly with the posture. If d was known at another posture, where the
-tendon was taut, a large part of its error is therefore known:
+Errors of a network vary smoothly with the posture, and errors of an elastic constant persist. If d₀
+was known at another moment, where the tendon was taut, a part of the error of d is therefore known:
 
-    d | d₀ has the mean k d₀ and the variance s² − k ρ s s₀ + n²,   k = ρ s s₀ / (s₀² + n₀²)
-    ρ = exp(−‖(θ − θ₀) / range‖² / (2 SMOOTHNESS²))
+    d | d₀ has the mean c d₀ / s₀² and the variance s² − c² / s₀²
+    c = ρ aᵀ Σ a₀ + Σ_j a_j a₀_j ε_j ε₀_j,   ρ = exp(−‖(θ − θ₀) / range‖² / (2 SMOOTHNESS²))
 
-s² is the part of the variance of d that stems from Σ, and n² is the rest.
+s² is the variance of d, a the row of A that belongs to the muscle, and ε_j the standard deviation
+of the elongation of muscle j.
 
 Σ. Without learning, it is the variance of the geometric model (`robot/model_errors.py`). After
 learning, it is the second moment of the residuals on the healthy arm, plus the variance by which
@@ -55,12 +55,13 @@ class Prediction(NamedTuple):
 
     theta: Array  # the fitted posture [rad], (D,)
     excess: Array  # d, predicted minus measured length [m], (M,)
-    smooth: Array  # s², part of the variance of d that varies smoothly with the posture [m²], (M,)
-    noise: Array  # n², the rest of the variance of d [m²], (M,)
+    variance: Array  # s², variance of d [m²], (M,)
+    shares: Array  # A, how errors of the lengths change d, (M, M)
+    elastic: Array  # ε, standard deviation of the elongations [m], (M,)
 
     def limit(self, muscle: int, sigmas: float) -> float:
         """Return the d [m] of one muscle that is `sigmas` standard deviations above 0."""
-        return sigmas * math.sqrt(self.smooth[muscle] + self.noise[muscle])
+        return sigmas * math.sqrt(self.variance[muscle])
 
 
 class LengthErrors:
@@ -110,22 +111,22 @@ class LengthErrors:
         """
         robot, tension = self._robot, np.maximum(tension, 0.0)
         compliance = robot.series_elastic.compliance(robot.routes.length_at_zero, tension)
-        elastic = np.hypot(ELASTIC * robot.elongation(tension), compliance * spread)
-        noise = np.square(elastic) + SENSOR_NOISE**2
+        elastic = ELASTIC * robot.elongation(tension)
+        noise = np.square(elastic) + np.square(compliance * spread) + SENSOR_NOISE**2
+        total = self.covariance + np.diag(noise)
         rows: Ints = np.flatnonzero(used)
         weight = np.zeros_like(self.covariance)
         among = np.ix_(rows, rows)
-        weight[among] = np.linalg.inv((self.covariance + np.diag(noise))[among])
+        weight[among] = np.linalg.inv(total[among])
         theta = self._fit(length, tension, weight, start)
         slope = self._mae.muscle_jacobian(theta, tension)
         excess: Array = self._mae.lengths(theta, tension) - length
         spread_of_theta = np.linalg.inv(slope.T @ weight @ slope + self._precision)
         moves = slope @ spread_of_theta
-        kept = np.eye(len(length)) - moves @ slope.T @ weight
-        smooth = np.einsum('ij,jk,ik->i', kept, self.covariance, kept)
-        rest = np.square(kept) @ noise
-        rest += np.einsum('ij,jk,ik->i', moves, self._precision, moves)
-        return Prediction(theta, excess, smooth, rest)
+        shares = np.eye(len(length)) - moves @ slope.T @ weight
+        variance = np.einsum('ij,jk,ik->i', shares, total, shares)
+        variance += np.einsum('ij,jk,ik->i', moves, self._precision, moves)
+        return Prediction(theta, excess, variance, shares, elastic)
 
     def _fit(self, length: Array, tension: Array, weight: Array, start: Array) -> Array:
         def cost_at(theta: Array) -> tuple[float, Array]:
@@ -161,9 +162,11 @@ class LengthErrors:
         """
         distance = np.square((now.theta - taut.theta) / self._range).sum()
         correlation = math.exp(-0.5 * distance / SMOOTHNESS**2)
-        common = correlation * math.sqrt(now.smooth[muscle] * taut.smooth[muscle])
-        gain = common / (taut.smooth[muscle] + taut.noise[muscle])
-        excess, smooth = now.excess.copy(), now.smooth.copy()
+        own, own_taut = now.shares[muscle], taut.shares[muscle]
+        common = correlation * (own @ self.covariance @ own_taut)
+        common += (own * now.elastic) @ (own_taut * taut.elastic)
+        gain = common / taut.variance[muscle]
+        excess, variance = now.excess.copy(), now.variance.copy()
         excess[muscle] -= gain * taut.excess[muscle]
-        smooth[muscle] -= gain * common
-        return now._replace(excess=excess, smooth=smooth)
+        variance[muscle] -= gain * common
+        return now._replace(excess=excess, variance=variance)

@@ -47,7 +47,7 @@ def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, i
 LENGTHS_WRONG = 0.02 * np.array([1, -1, 1, -1, 1, -1])  # errors of the network's lengths [m]
 
 
-def findings_after_tension(mae, before, after, spread=0.0, theta=THETA):
+def findings_after_tension(mae, before, after, spread=0.0):
     """Return what the detector finds in a second of slack, after a moment with tension.
 
     Every length of the arm differs from that of the network by 20 mm.
@@ -57,7 +57,6 @@ def findings_after_tension(mae, before, after, spread=0.0, theta=THETA):
         before: T of MUSCLE before the loss of tension [N].
         after: By how much MUSCLE is longer after it [m].
         spread: Standard deviation of the tensions [N].
-        theta: Posture after the loss of tension [rad].
     """
     detector = StretchedTendon(ROBOT, Detection())
     detector.use(mae)
@@ -65,7 +64,7 @@ def findings_after_tension(mae, before, after, spread=0.0, theta=THETA):
     for is_taut in (True, False):
         tension = np.full(ROBOT.muscle_count, 60.0)
         tension[MUSCLE] = before
-        length = mae.lengths(THETA if is_taut else theta, tension) + LENGTHS_WRONG
+        length = mae.lengths(THETA, tension) + LENGTHS_WRONG
         if not is_taut:
             tension[MUSCLE] = 0.0
             length[MUSCLE] += after
@@ -76,15 +75,15 @@ def findings_after_tension(mae, before, after, spread=0.0, theta=THETA):
 
 
 def test_a_rupture_under_load_is_found_at_once_although_the_network_has_not_learned(mae):
-    findings = findings_after_tension(mae, before=60.0, after=0.0)
+    findings = findings_after_tension(mae, before=120.0, after=0.0)
     assert {finding.muscle for finding in findings} == {MUSCLE}
     assert len(findings) >= DEAD_TIME / DT
 
 
 def test_a_tendon_that_is_paid_out_until_it_is_slack_is_healthy(mae):
-    stretch = elongation(60.0)
-    assert not findings_after_tension(mae, before=60.0, after=stretch)
-    assert not findings_after_tension(mae, before=60.0, after=stretch + 0.03)
+    stretch = elongation(120.0)
+    assert not findings_after_tension(mae, before=120.0, after=stretch)
+    assert not findings_after_tension(mae, before=120.0, after=stretch + 0.03)
 
 
 def test_an_error_of_an_unlearned_network_is_no_stretch(mae):
@@ -97,8 +96,8 @@ def test_an_error_of_an_unlearned_network_is_no_stretch(mae):
 
 
 def test_a_motor_current_that_does_not_exclude_tension_is_no_evidence_of_a_rupture(mae):
-    assert findings_after_tension(mae, before=60.0, after=0.0, spread=1.0)
-    assert not findings_after_tension(mae, before=60.0, after=0.0, spread=20.0)
+    assert findings_after_tension(mae, before=120.0, after=0.0, spread=1.0)
+    assert not findings_after_tension(mae, before=120.0, after=0.0, spread=30.0)
 
 
 def test_tendons_that_do_not_determine_the_posture_are_no_evidence_of_a_rupture(mae):
