@@ -102,7 +102,7 @@ def test_the_example_learns_without_ros(tmp_path):
     options = ['--postures', '6', '--steps', '200', '--out', str(tmp_path / 'a.safetensors')]
     done = subprocess.run(
         [sys.executable, '-c', program, *options],
-        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+        cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False,
         env={**os.environ, 'PYTHONPATH': str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
