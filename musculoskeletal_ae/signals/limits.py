@@ -132,16 +132,21 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
 
 
 class Persistence:
-    """Distinguishes a lasting fault from a glitch. Times are of a steady clock [s]."""
+    """Distinguishes a lasting fault from a glitch. Times are of a steady clock [s].
+
+    A fault lasts from its first message to its newest one, and for up to half of a glitch
+    afterwards. A pause of this process therefore does not turn a glitch into a lasting fault.
+    """
 
     def __init__(self) -> None:
-        self._problem, self._since = '', math.inf
+        self._problem, self._since, self._newest = '', math.inf, math.inf
 
     def note(self, problem: str, now: float) -> None:
         """Record the fault of the newest message, '' if it has none."""
         self._since = min(self._since, now) if problem else math.inf
-        self._problem = problem
+        self._problem, self._newest = problem, now
 
     def lasting(self, now: float) -> str:
         """Return the newest fault if faults have lasted for longer than a glitch, else ''."""
-        return self._problem if now - self._since > LIMITS.glitch else ''
+        until = min(now, self._newest + 0.5 * LIMITS.glitch)
+        return self._problem if until - self._since > LIMITS.glitch else ''

@@ -282,6 +282,15 @@ def test_implausible_messages_are_a_fault_once_they_outlast_a_glitch():
     assert stream.implausible(20 * PERIOD) == ''
 
 
+def test_a_glitch_is_no_lasting_fault_because_the_next_message_is_late():
+    stream = MuscleStream(ROBOT)
+    for received, delay in ((0.0, 0.0), (0.3, 0.29)):
+        with pytest.raises(RejectionError):
+            stream.take_states(resting(temperature=(0, 500.0)), received, delay=delay)
+        assert stream.implausible(received) == ''
+        assert stream.implausible(received + 0.25) == ''
+
+
 def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
     stream = MuscleStream(ROBOT, window=3)
     tension = ROBOT.tension.bias[0]
