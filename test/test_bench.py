@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import false_stops, sim_pictures
+from bench import covariance, false_stops, sim_pictures
 from bench.__main__ import benches, main
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
@@ -71,3 +71,13 @@ def test_pictures_of_an_arm_at_rest_and_loaded_are_written(trained, tmp_path):
     files = sim_pictures.save_both(Robot.load('arm26'), trained['default'], tmp_path / 'new')
     assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
     assert all(file.read_bytes().startswith(b'\x89PNG') for file in files)
+
+
+def test_honesty_of_a_covariance_is_0_95_inside_and_nees_1_if_the_errors_follow_it():
+    rng, root = np.random.default_rng(0), np.array([[0.03, 0.0], [0.02, 0.01]])
+    error = rng.standard_normal((20_000, 2)) @ root.T
+    assert covariance.honesty(root @ root.T, error) == pytest.approx(
+        (np.linalg.norm(error, axis=1).mean(), 0.95, 1.0), abs=0.02
+    )
+    too_large = covariance.honesty(4.0 * root @ root.T, error)
+    assert too_large.inside > 0.99 and too_large.nees == pytest.approx(0.25, abs=0.01)
