@@ -5,11 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
 #: duration of the exploration [min], long enough for updates of both presets
 MINUTES = 0.25
+KEPT = 'experiments_kept'
 
 
 @pytest.fixture(scope='session')
@@ -18,10 +20,17 @@ def quick(alone) -> Path:
     with alone('experiments') as common:
         folder, done = common / 'experiments', common / 'experiments_done'
         if not done.exists():
-            options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2 --out {folder}'
-            assert experiment.main(options.split()) == 0
+            options = f'all --robot arm26 --quick --minutes {MINUTES} --jobs 2'
+            files = f'--out {folder} --keep {common / KEPT}'
+            assert experiment.main([*options.split(), *files.split()]) == 0
             done.touch()
     return folder
+
+
+@pytest.fixture(scope='session')
+def study(quick, arm26) -> Study:
+    """Return access to the networks and streams that the quick run has kept."""
+    return Study(arm26, 'default', (0,), MINUTES, True, quick.parent / KEPT)
 
 
 @pytest.fixture(scope='session')

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conditions of a fair comparison: same motion, same stream, same seeds."""
 
+import json
 import math
+import shutil
+from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.experiments.online_learning import (
@@ -21,46 +23,34 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.experiments.sensors import SIGHTED, sighted
-from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample
-from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.presets.registry import PRESETS
 
 
-@pytest.fixture(scope='module')
-def twice(tmp_path_factory, arm26, trained):
-    """Return two measurements of the same individual, in different folders."""
-    measured = []
-    for _ in range(2):
-        study = Study(arm26, 'default', (0,), 0.25, True, tmp_path_factory.mktemp('study'))
-        for preset, mae in trained.items():
-            checkpoint.save(mae, study.network_file(preset, None))
-        measured.append((study, measure(study, 0)))
-    return measured
-
-
-def test_the_same_seed_gives_the_same_numbers_and_networks(twice):
-    (one, first), (two, second) = twice
-    assert first.numbers == second.numbers
+def test_the_same_seed_gives_the_same_numbers_and_networks_in_another_process(study, tmp_path):
+    again = replace(study, folder=tmp_path)
     for preset in PRESETS:
-        networks = [study.network(0, preset) for study in (one, two)]
+        shutil.copy(study.network_file(preset, None), tmp_path)
+    numbers = measure(again, 0).numbers
+    assert numbers == json.loads(study.numbers_file(0).read_text('utf-8'))
+    for preset in PRESETS:
+        networks = [each.network(0, preset) for each in (study, again)]
         for layer in range(len(networks[0].decoder)):
             weights = [network.decoder[layer][0] for network in networks]
             np.testing.assert_array_equal(*weights)
 
 
-def test_both_presets_learn_each_from_its_own_exploration(twice):
-    (study, measured), _ = twice
-    assert min(measured.numbers[f'{prefix}samples'] for prefix in ('', 'paper_')) > 0
-    assert measured.numbers['updates'] > 0
+def test_both_presets_learn_each_from_its_own_exploration(study):
+    numbers = json.loads(study.numbers_file(0).read_text('utf-8'))
+    assert min(numbers[f'{prefix}samples'] for prefix in ('', 'paper_')) > 0
+    assert numbers['updates'] > 0
     changed = study.network(0).decoder[0][0] - study.network(None).decoder[0][0]
     assert np.abs(changed).max() > 0.0
 
 
-def test_exploration_goes_through_the_controller_with_the_network_being_learned(twice):
+def test_exploration_goes_through_the_controller_with_the_network_being_learned(study):
     """No command jumps, and the targets follow the network as it learns."""
-    (study, _), _ = twice
     taken = study.stream(0, 'exploring')
     step = np.abs(np.diff(taken.command, axis=0)).max()
     assert 0.0 < step <= Settings().rate_limit * SAMPLE_TIME + 1e-9
@@ -70,8 +60,7 @@ def test_exploration_goes_through_the_controller_with_the_network_being_learned(
     assert apart[0] == 0.0 and apart[-1] > 1e-4
 
 
-def test_the_held_out_motion_has_the_same_commands_for_every_individual(twice):
-    (study, _), _ = twice
+def test_the_held_out_motion_has_the_same_commands_for_every_individual(study):
     other = record(study.arm(1), study.network(None), HELD_OUT_STREAM, study.held_out_time)
     one = study.stream(0, 'held_out')
     # Each arm starts its first ramp from another posture. From the second target on (sample 500),
@@ -81,8 +70,7 @@ def test_the_held_out_motion_has_the_same_commands_for_every_individual(twice):
     assert np.abs(one.theta - other.theta).max() > 1e-3  # the arms differ
 
 
-def test_the_held_out_motion_is_not_the_one_learned_from(twice):
-    (study, _), _ = twice
+def test_the_held_out_motion_is_not_the_one_learned_from(study):
     learned, held_out = (study.stream(0, name).command for name in ('exploring', 'held_out'))
     assert np.abs(learned[499] - held_out[499]).max() > 1e-3
 
