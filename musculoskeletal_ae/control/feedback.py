@@ -130,18 +130,27 @@ class RestFeedback:
 class MotionFeedback:
     """Shifts the posture along a trajectory by k_p e + c, with dc/dt = k_i e.
 
-    c is the correction of the rest feedback. It is thus kept from one motion to the next.
+    c is the correction of the rest feedback. It is thus kept from one motion to the next. No entry
+    of c grows while `is_held_back`, so that c does not wind up.
     """
 
     def __init__(self, rest: RestFeedback) -> None:
         self._rest = rest
         self._shift: Array = np.zeros_like(rest.correction)  # shift of θ [rad], (D,)
 
-    def step(self, error: Array, dt: float) -> Array:
-        """Return the shift of θ [rad], (D,), for an error [rad], (D,), that lasted for dt [s]."""
+    def step(self, error: Array, is_held_back: bool, dt: float) -> Array:
+        """Return the shift of θ [rad], (D,).
+
+        Args:
+            error: Desired − estimated θ [rad], (D,).
+            is_held_back: Whether the limiter holds a muscle of the whole arm back.
+            dt: Time for which the error lasted [s].
+        """
         rest = self._rest
-        correction = rest.correction + INTEGRAL * dt * error
-        rest.correction = np.clip(correction, -rest.largest, rest.largest)
+        change = INTEGRAL * dt * error
+        if is_held_back:
+            change = np.where(change * rest.correction >= 0.0, 0.0, change)
+        rest.correction = np.clip(rest.correction + change, -rest.largest, rest.largest)
         rest.moving()
         # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
         shift = rest.correction + PROPORTIONAL * error

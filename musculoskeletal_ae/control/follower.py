@@ -51,6 +51,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
 SETTLING = 0.8  # time after the end for which the feedback of the motion continues [s]
+#: The limiter holds a muscle back if its published command is longer than desired by more [m].
+HELD_BACK = 1e-4
 
 
 class HeldPosture(NamedTuple):
@@ -78,6 +80,7 @@ class Follower(ActivityControl):
         self._held: HeldPosture | None = None  # None while the arm moves or settles
         #: ramp that reduces the difference between the last command and the present plan to 0
         self._blend: Ramp | None = None
+        self._desired: Array | None = None  # the last desired command [m], (M,)
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings.
@@ -141,7 +144,7 @@ class Follower(ActivityControl):
 
     def enter(self, _: Inputs) -> None:
         """Start, or continue after a pause, from the present tensions."""
-        self._held = self._blend = None
+        self._held = self._blend = self._desired = None
         self.progress.return_to_end()  # plan the tensions of the held posture again
         self.plan.reset()
         self.feedback.reset()
@@ -176,14 +179,25 @@ class Follower(ActivityControl):
         if self._blend is None:
             rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
             self._blend = Ramp(sent - length, np.zeros_like(length), BLENDING, rate_limit)
-        return Command(LENGTH, length + self._blend.step(dt))
+        self._desired = length + self._blend.step(dt)
+        return Command(LENGTH, self._desired.copy())
 
     def _moving(self, trajectory: Trajectory, inputs: Inputs) -> Array:
         """Return l_target [m], (M,), during the motion and while the arm settles."""
         error = self.progress.error
         error = np.zeros_like(error) if self.plan.is_stiff else error
-        shift = self._motion_feedback.step(error, inputs.dt)
+        shift = self._motion_feedback.step(error, self._is_held_back(inputs), inputs.dt)
         return self.plan.step(trajectory, self.progress.time, shift, self.winches.lag, inputs)
+
+    def _is_held_back(self, inputs: Inputs) -> bool:
+        """Return whether the limiter did not let a muscle of the whole arm wind in as desired.
+
+        With isolated muscles, some of the others are often at their limit. The integral may then
+        still grow, because it lets the remaining muscles hold up the arm.
+        """
+        if self._desired is None or not self._robot.used.all():
+            return False
+        return bool((inputs.length - self._desired > HELD_BACK).any())
 
     def _resting(self, inputs: Inputs) -> Array:
         """Return l_target [m], (M,), at rest."""

@@ -333,6 +333,17 @@ def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
     assert bench.cause == ''
 
 
+def test_the_feedback_of_a_blocked_arm_does_not_wind_up_against_the_tension_limit(bench):
+    """Someone holds the arm, so that its muscles reach their limit; then the arm is let go."""
+    bench.core.trajectory(points(OTHER))
+    wound_up = []
+    for _ in range(170):
+        bench.step()
+        wound_up.append(np.abs(bench.follower.feedback.correction).max())
+    assert bench.follower.progress.error.max() > 0.3
+    assert max(wound_up) < 0.5 * bench.follower.feedback.largest.max()
+
+
 def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch):
     # The trajectory starts at a speed. When it is slowed for slow winches, the arm takes longer to
     # brake, and overshoots the joint limits.
