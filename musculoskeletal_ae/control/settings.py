@@ -49,8 +49,8 @@ class Settings:
     target_duration: float = settable(
         1.2,
         'duration of a movement to a target with method `stiffness`, or with method `proposed` of '
-        'preset `default`; it is extended if the muscle modules are too slow, or if the muscles '
-        'that are not isolated are too weak (0: first_duration)',
+        'preset `default`; it is extended if the muscle modules are too slow or the muscles too '
+        'weak (0: first_duration)',
         's',
         0.0,
         60.0,

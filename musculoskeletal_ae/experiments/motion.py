@@ -5,15 +5,16 @@ Paper (§IV-C). Postures are approached in 5 s. The paper shows no fast motion.
 
 Here. After learning, the arm follows minimum-jerk trajectories in 1 s and in 2 s between random
 postures that the true body can hold, and rests for 0.6 s after each. Inverse dynamics computes the
-commands. Three other methods approach the same postures in the same time with ramps (`proposed`,
-`first`, `second`), and `tension` receives the desired posture in every message. The controller may
-use the full speed of the emulated winches. Where they cannot follow, a trajectory is slowed, and
-errors refer to the slowed trajectory. Afterwards, `target_pose` moves the hand along circles of 10
-cm diameter at 0.1 m/s, with 50 poses a second; a planar arm draws them in its plane. Then forces of
-10 to 50 N in random directions act on the hand of the resting arm for 1.5 s, and of the exploring
-arm. At rest, a joint stop may carry a part of the force. In method `float` the arm is first left
-alone, and then guided with 15 to 20 N. If the controller stops on a trajectory, the individual
-fails. If another method stops, or if no circle is reachable, the number is missing.
+commands. Three other methods receive the same postures as targets and approach them in the same
+time: `proposed` by a trajectory of its own, `first` and `second` by ramps of the lengths. `tension`
+receives the desired posture in every message. The controller may use the full speed of the emulated
+winches. Where they cannot follow, a trajectory is slowed, and errors refer to the slowed
+trajectory. Afterwards, `target_pose` moves the hand along circles of 10 cm diameter at 0.1 m/s,
+with 50 poses a second; a planar arm draws them in its plane. Then forces of 10 to 50 N in random
+directions act on the hand of the resting arm for 1.5 s, and of the exploring arm. At rest, a joint
+stop may carry a part of the force. In method `float` the arm is first left alone, and then guided
+with 15 to 20 N. If the controller stops on a trajectory, the individual fails. If another method
+stops, or if no circle is reachable, the number is missing.
 
 - tracking: mean of ‖θ_desired − θ_true‖ over the motion
 - settled: the same distance 0.5 s after the end of the motion
@@ -109,7 +110,7 @@ def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> C
     loop.go(start, STARTING)
     if method != OURS:
         other = Settings(
-            method=method, rate_limit=SPEED_LIMIT, target_duration=0.0,
+            method=method, rate_limit=SPEED_LIMIT, target_duration=duration,
             first_duration=first_part, second_duration=0.5 * ramp,
         )  # fmt: skip
         loop.core.configure(other)
