@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """config/security_policy.xml grants exactly the rights that the running nodes use."""
 
-import importlib
+import importlib.util
 import os
 import subprocess
 import xml.etree.ElementTree as ET
@@ -17,6 +17,14 @@ NODES = ['controller', 'estimator', 'hardware_emulator', 'learner', 'sim']
 def rights(node: str, kind: str, action: str) -> set[str]:
     path = f".//profile[@node='{node}']/{kind}[@{action}='ALLOW']/*"
     return {entry.text for entry in ET.parse(POLICY).findall(path)}
+
+
+def of_actions(node: str, *parts: str) -> set[str]:
+    """Return the topics or services that a node's actions consist of, if they are installed."""
+    if importlib.util.find_spec('control_msgs') is None:
+        return set()
+    actions = rights(node, 'actions', 'execute')
+    return {f'{action}/_action/{part}' for action in actions for part in parts}
 
 
 @pytest.mark.parametrize('name', NODES)
@@ -39,6 +47,7 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     own = name, graph.namespace
     used = names(node.get_publisher_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'publish')}
+    allowed |= of_actions(name, 'feedback', 'status')
     assert used == allowed - {'/tf'}  # published only with tf2_msgs and the parameter publish_tf
     used = names(node.get_subscriber_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'subscribe')}
@@ -46,7 +55,8 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     # camera is the source of joint angles.
     assert allowed - {'/clock', 'vision_joint_states'} <= used <= allowed
     used = names(node.get_service_names_and_types_by_node(*own))
-    assert used == rights(name, 'services', 'reply')
+    of_goals = of_actions(name, 'cancel_goal', 'get_result', 'send_goal')
+    assert used == rights(name, 'services', 'reply') | of_goals
     used = names(node.get_client_names_and_types_by_node(*own))
     assert used == rights(name, 'services', 'request')
 
