@@ -44,7 +44,7 @@ def check_bag(
     namespace: str | None = None,
     motors: MotorSettings = NO_MOTORS,
 ) -> BagCheck:
-    """Read every message of a recording, and return a report on the recording.
+    """Read a recording, and return a report on it. Errors become faults in the report.
 
     Args:
         path: The bag.

@@ -60,7 +60,7 @@ class McapFile:
         """Read the whole file and verify its checksums.
 
         Raises:
-            BagError: If the file is damaged.
+            BagError: If the file is damaged, or its messages are not in chronological order.
         """
         self.path = path
         self.topics: dict[str, BagTopic] = {}

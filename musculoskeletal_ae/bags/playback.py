@@ -43,6 +43,9 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
         bag: The recording.
         start: Where to begin, from the start of the bag [s].
         duration: How long to play [s], or None to play to the end.
+
+    Raises:
+        BagError: If `start` is beyond the end of the bag.
     """
     length = (bag.end - bag.start) / 1e9
     if start > length:
@@ -86,8 +89,8 @@ class Timeline:
     def wait(self, recorded: int, now: float) -> float:
         """Return the time until a recorded time [ns] is due [s].
 
-        The result is negative if the recorded time has passed, and infinite while playback is
-        paused before the recorded time.
+        The result is at most 0 if the recorded time has been reached, and infinite while playback
+        is paused before the recorded time.
         """
         if self.paused:
             return math.inf if recorded > self._recorded else 0.0

@@ -83,7 +83,8 @@ class Bag:
     ) -> Iterator[BagMessage]:
         """Yield messages of topics, by default all, from start to stop [ns, log time], inclusive.
 
-        The messages are sorted by log time. Messages of equal time keep the order of the file.
+        The messages are sorted by log time, as far as `_in_order` can sort them. Messages of equal
+        time keep the order of the file.
         """
         wanted = frozenset(self.topics if topics is None else topics)
         ordered = (_in_order(file.messages(wanted, start, stop)) for file in self.files)
@@ -122,7 +123,11 @@ def _open_file(path: Path) -> StorageFile:
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Yield messages sorted by log time; they may be out of order by at most LONGEST_PAUSE."""
+    """Yield messages sorted by log time; they may be out of order by at most LONGEST_PAUSE.
+
+    At most MOST_HELD bytes are held to sort them. Messages whose order would require more remain
+    out of order.
+    """
     waiting: list[tuple[int, int, BagMessage]] = []
     newest = held = 0
     for number, message in enumerate(messages):

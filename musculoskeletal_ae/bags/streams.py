@@ -195,7 +195,8 @@ def read_streams(
         motors: How the motors of a ros2_control robot are connected.
 
     Raises:
-        BagError: If no message of a topic fits the robot, or the bag is damaged.
+        BagError: If no message of a topic fits the robot, the bag is damaged, or `interface_topics`
+            raises an error.
     """
     recorded = interface_topics(bag, namespace, motors)
     labels = _labels(recorded)

@@ -224,7 +224,10 @@ def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
 
 
 def _compare_type(bag: Bag, name: str, expected: str, leave_out: str = '') -> None:
-    """Raise a BagError if a topic has another type; `leave_out` is appended to the remedy."""
+    """Raise a BagError if a topic has another type, or if its messages cannot be decoded.
+
+    `leave_out` is appended to the remedy.
+    """
     topic = bag.topics[name]
     if topic.type != expected:
         problem = f'topic {name} has the type {topic.type[:80]!r}, but the interface uses this '

@@ -11,8 +11,8 @@ passes the limiter before it is published.
 
 Plans assume that isolated muscles have no tension, and the modules of isolated muscles are
 commanded to keep the tendons slack. A muscle that is isolated during an anomaly is the suspect.
-While the arm is stopped, the suspect is wound in slightly to verify the fault; the arm resumes when
-the anomaly is over.
+While the arm is stopped, the suspect is wound in slightly to verify the fault. The arm resumes when
+the verification has ended the anomaly, unless another stop cause needs a reset.
 
 `now` is the time of a steady clock [s], and `time` is the time of the messages' clock [s].
 """
@@ -73,7 +73,8 @@ class Target:
     Attributes:
         theta: Posture [rad], (D,); None before the first target.
         effort: Torque in addition to gravity compensation [N·m], (D,).
-        clamped: Joints whose target was beyond the joint limits.
+        clamped: Joints whose target was changed, because it was beyond the joint limits or because
+            the posture was not holdable.
         unreachable_reason: Why the arm goes to another posture than requested, or ''.
         approaches_left: Number of further attempts if the arm falls on the way.
     """
@@ -268,7 +269,10 @@ class Controller:
 
     @contextmanager
     def _relieving(self, now: float, delay: float = 0.0) -> Iterator[None]:
-        """Relieve muscles whose tension is too high, even if their message is rejected."""
+        """Keep the tensions of a message that is rejected.
+
+        The limiter and the watchdog then still react to a tension that is too high.
+        """
         try:
             yield
         except RejectionError as error:
@@ -365,7 +369,10 @@ class Controller:
             self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
-        """Restart all measurements of time and the filter after the messages' clock jumped back."""
+        """Restart the comparison of the clocks and the stream of muscle states.
+
+        This is needed after the messages' clock has jumped back.
+        """
         self.watchdog.age.clock_jumped_back()
         self.stream.reset()
 
@@ -373,6 +380,9 @@ class Controller:
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
         """Set θ_target [rad] and effort [N·m] of some joints; other joints keep their targets.
+
+        If there is no target yet, other joints keep their estimated angles. Targets beyond the
+        joint limits are clamped.
 
         Raises:
             MessageError: If the target is refused.
@@ -489,7 +499,7 @@ class Controller:
     # -- time -----------------------------------------------------------------------------------
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the stop causes that are present, the most severe first."""
+        """Return the stop causes that are present, in the order of `StopCause`."""
         present = self.watchdog.conditions(now)
         if detail := self.stream.implausible(now):
             present.append(Condition(StopCause.IMPLAUSIBLE_MUSCLE_STATES, detail))
@@ -550,7 +560,11 @@ class Controller:
         return limited or self.limiter.command
 
     def _desired(self, dt: float) -> Command | None:
-        """Return the activity's command; any exception stops the arm."""
+        """Return the activity's command, or None if it has none.
+
+        An exception stops the arm. Only an exploration without enough holdable postures merely
+        ends.
+        """
         if self.estimate is None:  # wait for the next estimate, which a length calibration provides
             self.activities.leave()
             return self.limiter.command
@@ -668,7 +682,7 @@ class Controller:
         self.supervisor.on_request(activity)
 
     def _approach(self, duration: float) -> None:
-        """Start a trajectory to the target through holdable postures."""
+        """Start a trajectory to the target, along the path of `Planner.to_posture`."""
         state = self.target_state
         assert state.theta is not None
         start, mae = self._ready()

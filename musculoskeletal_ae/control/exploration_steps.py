@@ -39,7 +39,9 @@ def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_
 
 
 def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:
-    """Return random tensions that press the joints that are at a limit against their stops.
+    """Return the random tensions that press joints most strongly against their stops.
+
+    They are the best of PRESSES draws. If no joint is at a limit, there is only one draw.
 
     Args:
         robot: The robot.

@@ -22,7 +22,7 @@ DEADBAND = 0.03
 RELIEF_INTERVAL = 0.1  # time between two computations of the needless tension [s]
 PROPORTIONAL = 0.7  # proportional gain k_p in motion
 INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
-SETTLING = 0.5  # time after a movement until the arm counts as resting [s]
+SETTLING = 0.5  # time after the end of the feedback in motion until the arm counts as resting [s]
 
 
 def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
@@ -51,11 +51,12 @@ class RestFeedback:
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
     Friction and network errors leave the arm away from its target; the estimate contains most of
-    this error (arXiv 2405.11808). Friction and network errors also cause antagonistic muscles to
-    pull against each other, because a length error causes a tension error of K_stiff times the
-    length error. T* exerts the same joint torque as T_end, so that the relief moves no joint. A
-    tendon that was wound in is paid out until friction no longer retains tension in it. A tendon
-    that was paid out is not paid out further, because friction already supports the arm there.
+    this error (arXiv 2405.11808). Errors below DEADBAND count as 0. Friction and network errors
+    also cause antagonistic muscles to pull against each other, because a length error causes a
+    tension error of K_stiff times the length error. T* exerts the same joint torque as T_end, so
+    that the relief moves no joint. A tendon that was wound in is paid out until friction no longer
+    retains tension in it. A tendon that was paid out is not paid out further, because friction
+    already supports the arm there.
 
     Position-controlled modules do not hold T_bias. For them K_stiff is the stiffness of the
     series elastic element, and T may be below T_bias. R is larger, so that slack tendons are wound
@@ -93,7 +94,7 @@ class RestFeedback:
     def step(
         self, error: Array, jacobian: Array, pull: Pull, limit: Array, gain: float, dt: float
     ) -> bool:
-        """Integrate the errors over dt [s] if the arm rests; return whether it rests.
+        """Integrate the errors over dt [s] if the arm rests; return whether this was done.
 
         Args:
             error: θ_target − θ_estimated [rad], (D,).

@@ -3,12 +3,13 @@
 
 Inverse kinematics converts a pose into joint angles. The search starts from the present setpoint,
 so that it finds the nearest of several solutions. The solution has to be within the joint limits
-and holdable with the learned G; otherwise the pose is refused. With `unreachable: nearest` the hand
-moves as close to the pose as the joint limits and the muscles allow.
+and holdable with the learned G; otherwise the pose is refused. With `unreachable: nearest`, the
+target is the posture within the joint limits in which the hand is nearest to the pose. If this
+posture is not holdable, the arm stops on the straight path to it (`reach.nearest_held`).
 
-The hand moves to a single pose at `hand_speed`. Poses in quick succession form a path, which the
-hand follows at the speed at which they arrive. A pose is reached when the next pose is due, and
-the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT.
+The hand moves to a single pose at `hand_speed` or more slowly. Poses in quick succession form a
+path, which the hand follows at the speed at which they arrive. A pose is reached when the next pose
+is due, and the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT.
 """
 
 import numpy as np

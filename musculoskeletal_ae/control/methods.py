@@ -202,9 +202,9 @@ def stiffness_command(
     L_e(T) = −l(θ, T) + const in K_θ come from ① of the network (paper, §III-E, third: variable
     stiffness).
     Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. T_low lies
-    above T_bias, because a muscle that muscle stiffness control (MSC) holds at T_bias is stiff in
-    one direction only. K is nearly linear in T, so a few quadratic programmes around the last
-    solution suffice.
+    above T_bias by the largest of MARGINS with which the torque is possible, because a muscle that
+    muscle stiffness control (MSC) holds at T_bias is stiff in one direction only. K is nearly
+    linear in T, so a few quadratic programmes around the last solution suffice.
 
     Args:
         robot: The body, in which isolated muscles have no tension.

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans trajectories that the arm can follow, from target postures, poses and twists.
 
-Each method returns a plan, or raises a MessageError with the reason and changes nothing. A plan
-stays within the joint limits, ends in a holdable posture, and respects the speed of the modules.
+The methods that plan return a `Plan`, or raise a MessageError with the reason. All plans except
+`to_rest` are slowed to the speed of the muscle modules, and stay within the joint limits (up to
+`trajectory.BEYOND`). `to_pose` and `by_twist` plan motions that end in a holdable posture. So does
+`through`, for an arm with isolated muscles. The caller of `to_posture` checks the target with
+`reachable`.
 """
 
 from __future__ import annotations
@@ -66,7 +69,9 @@ class Planner:
     def to_posture(
         self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
     ) -> Plan:
-        """Plan a motion to rest at θ [rad], (D,), through holdable postures.
+        """Plan a motion to rest at θ [rad], (D,).
+
+        With isolated muscles, the motion follows the cheapest path (`reach.way`).
 
         Args:
             mae: The network in use.
@@ -88,7 +93,7 @@ class Planner:
             mae: The network in use.
             start: Setpoint from which the motion starts.
             points: The points.
-            passed: How long ago the time of the points was 0 [s].
+            passed: Time elapsed since time 0 of the points [s].
             lag: Lag λ of the muscle modules [s].
         """
         points = self._clipped(points)
@@ -138,7 +143,10 @@ class Planner:
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return θ if it is holdable without the isolated muscles, else the nearest such posture.
+        """Return θ if it is holdable without the isolated muscles, else another posture.
+
+        The other posture is that of `reach.nearest_held`. Without isolated muscles, θ is not
+        checked.
 
         Args:
             mae: The network in use.

@@ -61,7 +61,10 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
-    """Return the last holdable posture on the straight path from `start` to θ [rad], (D,).
+    """Return a holdable posture on the straight path from `start` to θ [rad], (D,).
+
+    This is θ, or the end of a holdable part of the path, found by bisection. `start` itself is not
+    checked.
 
     Returns:
         The posture, and a text on the missing torque at θ, or '' if θ is holdable.
@@ -78,7 +81,7 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
-    """Return the postures of a path from `start` to θ [rad], (K, D); the last posture is θ."""
+    """Return the postures of a path after `start` [rad], (K, D); the last posture is θ."""
     if robot.used.all():
         return theta[None]
     cost = PathCost(robot, mae)
@@ -150,7 +153,7 @@ class PathCost:
         self._limits = Limits(robot, mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
-        """Return m, the largest missing torque [N·m] of each posture, (N,).
+        """Return m, the largest missing torque [N·m] of each posture, (N,); 0 up to NOTABLE.
 
         Args:
             postures: Postures θ [rad], (N, D).

@@ -68,7 +68,10 @@ class StopMemory:
         # ValueError: a NUL in the path. RuntimeError: the home directory is unknown.
         except (OSError, ValueError, RuntimeError) as error:
             self.close()
-            remedy = "set a writable directory, or '' to save no stop"
+            remedy = (
+                "set a writable directory, or '' to start without remembering stops (a latched "
+                'stop then ends with the controller)'
+            )
             raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error
         self._file = file
         if exists:

@@ -52,7 +52,10 @@ LAST = Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY
 
 
 class StopCause(Enum):
-    """All stop causes, the most severe first; the value contains the stable identifier."""
+    """All stop causes; the value contains the stable identifier.
+
+    If several causes begin together, the one that is declared first is reported.
+    """
 
     def __init__(self, identifier: str, declaration: Declaration) -> None:
         self.identifier = identifier
@@ -233,7 +236,9 @@ class Condition(NamedTuple):
 def remedy_of(
     causes: Iterable[StopCause], explored: bool, of_finding: Iterable[Step] = REPAIR
 ) -> list[Step]:
-    """Return the steps of the remedies of all causes, each step once, and the reset last.
+    """Return the steps of the remedies of all causes, each step once.
+
+    The reset comes after the other steps; only an exploration comes after the reset.
 
     Args:
         causes: The causes, in whose order the steps are returned.

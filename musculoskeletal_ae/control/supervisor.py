@@ -128,7 +128,7 @@ class Supervisor:
 
     @property
     def explores(self) -> bool:
-        """Whether random targets are being generated."""
+        """Whether the arm explores, or will continue to explore after a pause."""
         return self.activity in (Activity.EXPLORING, Activity.CALIBRATING)
 
     # -- activity -------------------------------------------------------------------------------
@@ -136,8 +136,9 @@ class Supervisor:
     def on_request(self, activity: Activity) -> None:
         """Change the activity; during a stop, the change takes effect after the stop.
 
-        At the end of a latched stop, the arm holds its last target; it does not start to move or
-        explore. A request during a stop also prevents an interrupted exploration from resuming.
+        During a latched stop, `AFTER_A_STOP` replaces activities that must not begin by themselves:
+        after the stop, the arm goes to its last target and holds it, but does not explore. A
+        request during a stop also prevents an interrupted exploration from resuming.
         """
         if self.is_latched:
             activity = AFTER_A_STOP.get(activity, activity)
@@ -171,7 +172,7 @@ class Supervisor:
         """Update the stop state from all causes that are present.
 
         Args:
-            present: The causes with their details, the most severe first.
+            present: The causes with their details, in the order of `StopCause`.
             elapsed: Time since the last call [s].
             released: Whether `hold_time` is over and the arm is released.
         """

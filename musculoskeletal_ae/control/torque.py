@@ -109,7 +109,7 @@ class GravityCompensation(TorqueControl):
     A spring holds the arm at θ_held. Once the spring is stretched by BAND, θ_held follows the arm.
     The spring thus acts like joint friction, so that errors of the gravity model do not make the
     arm creep. Near the joint limits, a wall pushes the arm back; clip(θ) limits θ to WALL_AT inside
-    the joint limits.
+    the joint limits. θ_held stays within the joint limits as well.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

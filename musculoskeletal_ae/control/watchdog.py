@@ -3,7 +3,8 @@
 
 `now` is the time of a steady clock [s], which determines ages. `time` is the time of the messages'
 clock [s], which determines the change of commands. If the messages' clock is slow, as in a slow
-simulator, the allowed age grows in proportion, up to 1/`SLOWEST`. A fast clock does not shorten it.
+simulator, the allowed age grows by the same factor, at most 1/`SLOWEST`. A fast clock does not
+shorten it.
 Pauses of the controller itself do not count as age (`AwakeClock`).
 """
 
@@ -39,9 +40,9 @@ MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMAT
 
 
 class Step(NamedTuple):
-    """Duration of one step of control."""
+    """Duration of one step of control; on both clocks, it counts as at most LONGEST_STEP."""
 
-    dt: float  # duration on the messages' clock [s]
+    dt: float  # duration on the messages' clock, if that clock is not too slow (SLOWEST) [s]
     elapsed: float  # duration on the steady clock [s]
     has_paused: bool  # whether control paused before the step, so that the arm may have moved
 
@@ -192,7 +193,11 @@ class HeatLimit:
         self.momentary = np.maximum(momentary, self.momentary - fall)
 
     def conditions(self, robot: Robot, highest: float) -> list[Condition]:
-        """Return overheating, if present; it ends when all windings are below `highest` [°C]."""
+        """Return overheating, if present.
+
+        It ends when no winding is above `highest` [°C], and at least one muscle may be planned with
+        more than T_bias.
+        """
         winding = np.fmax(self.heat.core, -np.inf)  # a temperature that is unknown is NaN
         m = int(winding.argmax())
         is_hot = bool(winding[m] > highest + (0.0 if self._is_overheated else OVERHEATED))
@@ -239,7 +244,7 @@ class Watchdog:
         self.age.received(ESTIMATE, now)
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the stop causes that are present, the most severe first."""
+        """Return the stop causes that are present, in the order of `StopCause`."""
         present = []
         if not self.has_checkpoint:
             present.append(Condition(StopCause.NO_CHECKPOINT))

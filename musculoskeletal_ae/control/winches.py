@@ -21,7 +21,8 @@ class Winches:
         l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
 
     Position-controlled modules have K_stiff = ∞, and the equation always holds for them. The fit
-    is by least squares over all muscles whose speed exceeds WINDING.
+    is by least squares over all muscles for which the equation holds and whose speed exceeds
+    WINDING. Isolated muscles are left out.
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the messages of a driver while nothing is commanded.
 
-The checks use the range of possible values. If θ is known, they also compare l with the geometric
-model (doc/explanation/control_and_safety.md, Judging a driver).
+The checks concern the rate, repeated readings, and the range of possible values. If θ is known,
+they also compare l with the geometric model (doc/explanation/control_and_safety.md, Judging a
+driver).
 """
 
 import math
@@ -111,7 +112,7 @@ class Listening:
 
     @property
     def count(self) -> int:
-        """Number of messages of muscle_states, valid or not."""
+        """Number of messages of muscle_states, or of the motors, valid or not."""
         return self._pace.count
 
     @property
@@ -323,8 +324,9 @@ class Listening:
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
         """Yield possible corrections of θ (N, D), each with its fault and joints.
 
-        Signs and order of joints that did not move are not questioned, because an arm at rest would
-        fit too many corrections.
+        Single signs and the order of joints that did not move are not questioned, because an arm at
+        rest would fit too many corrections. If several joints moved, one correction reverses the
+        signs of all joints.
         """
         robot, radian = self._robot, self._robot.kinematics.radian
         joints = range(robot.joint_count)
@@ -358,7 +360,7 @@ class Listening:
 
         Returns:
             The sum over muscles of the misfit [m] that remains if columns are exchanged or signs of
-            l are reversed.
+            l are reversed; ∞ if θ is beyond the joint limits.
         """
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)

@@ -105,7 +105,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _pay_out(self, m: int) -> None:
-        """Release muscle m, which has run away."""
+        """Release muscle m, which has run away, or all muscles."""
 
     # -- common parts ---------------------------------------------------------------------------
 
@@ -177,7 +177,7 @@ class MotionTest(ABC):
         return np.array([states for _, states in self._recent])
 
     def _noise(self) -> Array:
-        """Return the standard deviation of T over MEAN [N] (M,)."""
+        """Return the standard deviation [N] (M,) of T in the last MEAN seconds."""
         return np.std(self._readings()[:, 1], axis=0)
 
     def _go(self, m: int, goal: float) -> Wait:

@@ -10,8 +10,8 @@ demands a low tension at the measured l. The target then returns, and moves beyo
 stay at T_bias.
 
 The law amplifies an error of l by K. If K exceeds 50 kN/m, the resulting error of T exceeds
-TENSION_TOLERANCE. This error then replaces the tolerance, and all demanded tensions and detection
-thresholds grow by the same factor.
+TENSION_TOLERANCE. This error then replaces the tolerance, and detection thresholds and the default
+of the demanded tensions grow by the same factor.
 """
 
 from collections.abc import Generator, Sequence
@@ -73,7 +73,9 @@ class Winding(MotionTest):
         Args:
             verdict: Receives the results.
             muscles: Indices of the muscles to test. Without any, all muscles are tested.
-            highest: Highest demanded tension [N]; None: ABOVE_BIAS above T_bias.
+            highest: Highest demanded tension [N] of a muscle for which T_bias is demanded before
+                its test; the check of the clip demands more. None: ABOVE_BIAS above T_bias (more
+                if K is large), but at most tension.max.
 
         Raises:
             MusculoskeletalError: If the response to `highest` could not be distinguished from

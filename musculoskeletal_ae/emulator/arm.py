@@ -153,7 +153,8 @@ class EmulatedArm(modules.Arm):
     def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
         """Build an individual of a robot, at rest with its modules in the safe state.
 
-        `seed` selects the individual, unless `individual` is given, and seeds the sensor noise.
+        `seed` selects the individual, unless `individual` is given. It also seeds the sensor noise,
+        the faults, and the errors of motor currents and thermal constants.
         """
         self.individual = individual or Individual(robot, seed)
         super().__init__(robot, seed, self.individual.length_bias)

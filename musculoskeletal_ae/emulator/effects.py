@@ -5,8 +5,10 @@
     replace(Effects(), hysteresis=0.0)   one effect off; all other draws stay the same
     NONE                                 no effect: the body of the description or the MJCF file
 
-For an individual, each effect is drawn between 3/4 and all of its size, or normally distributed
-where the size is marked σ. doc/explanation/emulators.md lists the sources of the sizes.
+For an individual, most effects are drawn between 3/4 and all of their size, or normally distributed
+where the size is marked σ. The `stiffness` of an element is drawn from the whole range up to this
+deviation; `laws`, `spool_slip`, `jitter` and `dropouts` are not drawn. doc/explanation/emulators.md
+lists the sources of the sizes.
 """
 
 import zlib

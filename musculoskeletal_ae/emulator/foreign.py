@@ -104,7 +104,7 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
     A tendon jumps by centimetres if it slips over the end of a described object. No one would route
     a tendon there, so route points are redrawn until only those tendons jump that also jump in the
-    description.
+    description, but at most MOST_DRAWS times.
     """
     again = np.zeros(robot.muscle_count, dtype=np.int64)
     model = mjcf.from_directory(robot, draw, again).compile()
@@ -122,7 +122,10 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
 
 def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
-    """Change the model of a file into an individual, without adding tendons that jump."""
+    """Change the model of a file into an individual.
+
+    Attachment points are redrawn, at most MOST_DRAWS times, until no additional tendon jumps.
+    """
     smooth = ~jumping(ForeignBody(robot, copy.copy(model), draw).absolute_lengths, robot)
     attachments = deviation.Attachments(robot, model, draw)
     for _ in range(MOST_DRAWS):
@@ -134,7 +137,10 @@ def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
 
 
 def _route_warnings(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
-    """Warn of muscles whose lengths in the file differ from the robot's by `off` [m] (N, M)."""
+    """Warn of muscles whose lengths in the file differ from the robot's by over OTHER_ROUTE.
+
+    `off` are the differences in N postures [m], (N, M).
+    """
     largest = np.abs(off).max(axis=0)
     return tuple(
         f'reality {file}: muscle {robot.muscles[m]!r} is up to {1e3 * largest[m]:.0f} mm longer or '
@@ -144,7 +150,7 @@ def _route_warnings(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
 
 
 def _limit_warnings(robot: Robot, file: Path, model: Any) -> Iterator[str]:
-    """Warn of joints whose limits in the file differ from the robot's."""
+    """Warn of joints whose limits in the file differ clearly from the robot's (OTHER_LIMITS)."""
     for name, lower, upper in zip(robot.joints, robot.lower, robot.upper):
         joint = model.joint(name).id
         unlimited = np.array([-np.inf, np.inf])
@@ -185,7 +191,10 @@ class LateSensors:
         self._history[self._steps % HISTORY] = now
 
     def read(self, jitter: float) -> tuple[Array, Array, Array, Array]:
-        """Return the delayed θ, l, T and temperatures; `jitter` is added to the delays [s]."""
+        """Return the delayed θ, l, T and temperatures; `jitter` is added to the delays [s].
+
+        θ has the errors of the joint sensors.
+        """
         late = np.maximum(self._delays + jitter, 0.0) / STEP
         joints, muscles = (self._history[(self._steps - round(steps)) % HISTORY] for steps in late)
         half, span = 0.5 * self._backlash, self._span
@@ -239,8 +248,8 @@ class ForeignArm(Arm):
         Args:
             robot: The robot to emulate.
             seed: Selects the individual.
-            effects: Sizes of the effects; by default the calibrated ones. Ignored with `file`,
-                except that a `joint_friction` of 0 removes all friction of the file.
+            effects: Sizes of the effects; by default the calibrated ones. Ignored with `file`. Only
+                if `deviates` is false, a `joint_friction` of 0 removes all friction of the file.
             file: MJCF model of the arm, instead of a body that is built from the robot directory.
             deviates: Whether the arm is an individual that differs from `file`
                 (`emulator/deviation.py`).
@@ -305,7 +314,7 @@ class ForeignArm(Arm):
         self.reset()
 
     def _set_joint_friction(self) -> None:
-        """Set the friction of each joint in proportion to its load."""
+        """Add friction to each joint, in proportion to its load."""
         robot, draw, body = self.robot, self._draw, self.individual
         theta = robot.random_postures(200, draw.rng('load'))
         torque = robot.kinematics.holding_torque(theta)
@@ -373,7 +382,7 @@ class ForeignArm(Arm):
     def step(self, duration: float) -> None:
         """Advance the time by `duration` [s], in whole steps of `STEP`."""
         self._memory.longer[:] = self._ageing.longer(duration)
-        # The sensors drift until `set_length_offset` sets their offsets.
+        # The drift adds up, until `set_length_offset` sets the offsets anew.
         self._command.length_error[:] += self._ageing.drift * duration
         super().step(duration)
 

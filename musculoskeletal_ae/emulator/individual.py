@@ -106,6 +106,8 @@ class Individual:
     ) -> None:
         """Redraw route points until only those tendons jump that also jump in the model.
 
+        If all of `again` is used up, some tendons may still jump.
+
         A tendon jumps by centimetres if it slips over the end of an object that it wraps around. No
         one would route a tendon there.
 
@@ -149,10 +151,13 @@ def _objects(
 ) -> WrapObjects:
     """Return the object that each segment wraps around: a described one, or a bone's head.
 
-    A described object has a slightly different radius than in the description. A bone's head is
-    centred at the joint nearest to the tendon. The tendon touches the head in a share `quantile` of
-    the postures. The radius of the head is so small that the tendon cannot slip over to the other
-    side, and that the head encloses neither the described route points nor the true ones, `point`.
+    A described object has a slightly different radius than in the description, which is so small
+    that the object does not enclose the true route points `point`. With a `quantile` of 0,
+    described objects are unchanged, and bones have no heads.
+
+    A bone's head is centred at the revolute joint nearest to the tendon. The tendon touches the
+    head in about a share `quantile` of the postures. The head is smaller if the tendon could
+    otherwise slip over to the other side, or if the head would enclose the described route points.
     """
     kin, routes = robot.kinematics, robot.routes
     count = len(routes.first)

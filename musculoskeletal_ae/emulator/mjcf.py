@@ -148,8 +148,9 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
 
 
 def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[Any]) -> None:
-    """Add the tendons: route points with deviations, described wrap objects, and heads of bones.
+    """Add the tendons: route points with deviations, and objects that the tendons wrap around.
 
+    The objects are those of the description, and heads of bones or bellies of other muscles.
     `again` holds how often the deviations of each muscle's route points are redrawn, (M,).
     """
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
@@ -163,7 +164,8 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
             place, name, side = at.act(item.xyz), f'{muscle}, {n}', ''
             if isinstance(item, Wrap):
                 axis = None if item.axis is None else at.rotation @ item.axis
-                # Described objects deviate in size as well.
+                # Where the individual has random obstacles, wrap objects of the robot description
+                # get a random size, too.
                 scale = rng.uniform(0.9, 1.1) if draw.sizes.kinks > 0.0 else 1.0
                 _add_round(bodies[joint], name, place, axis, scale * item.radius)
                 if item.side is not None:
@@ -294,13 +296,13 @@ def _loading(file: Path) -> Iterator[None]:
 
 
 def from_file(robot: Robot, file: Path) -> Any:
-    """Return the model of a user's MJCF file; joints that the robot does not have are held.
+    """Return the compiled model of a user's MJCF file, with our motors.
 
-    They are held in the position that `import_robot` uses.
+    Joints that the robot does not have are held in the position that `import_robot` uses.
 
     Raises:
         MusculoskeletalError: If MuJoCo cannot load the file, or the file lacks a joint, tendon or
-            body that the robot directory names.
+            body that the robot directory names, or a joint has another type or cannot be renamed.
     """
     with _loading(file):
         spec = open_mjcf(file)

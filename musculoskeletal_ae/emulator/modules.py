@@ -243,8 +243,9 @@ class Arm(ABC):
         return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ, unloaded and at ambient temperature; mend ruptured tendons.
+        """Put the arm at rest at θ and at ambient temperature; mend ruptured tendons.
 
+        The external wrench ends, and the modules are in the safe state at T_bias.
         The default θ is 0, clipped to the joint limits. Payload, length offsets and `faults` are
         kept.
         """
@@ -306,7 +307,7 @@ class Arm(ABC):
 
     @property
     def safe(self) -> bool:
-        """Whether the modules are in the safe state because commands stopped."""
+        """Whether the modules are in the safe state, because no command has come recently."""
         return self._kind == SAFE
 
     def command_length(self, length: Array) -> None:
@@ -339,7 +340,9 @@ class Arm(ABC):
         self._wrench[:] = wrench
 
     def set_length_offset(self, offset: Array | Sequence[float]) -> None:
-        """Set the offsets of the length sensors [m]: one for all muscles, or one for each.
+        """Set offsets of the length sensors [m]: one for all muscles, or one for each.
+
+        They are added to the offsets of the individual, and replace earlier offsets and drift.
 
         Raises:
             MusculoskeletalError: If the number of offsets is neither 1 nor M; nothing changes then.

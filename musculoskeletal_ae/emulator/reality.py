@@ -30,13 +30,14 @@ def make_arm(
             that the learner can fit; 'foreign' has mechanics that the learner does not model.
             Any other value is the path of an MJCF file, whose joints and tendons have the names of
             the robot's joints and muscles.
-        friction: Whether the body has tendon friction and joint friction.
+        friction: False removes the friction of tendons and joints. It has no effect on an
+            individual of an MJCF file (`deviates`).
         deviates: Whether the body of an MJCF file is an individual that differs from the file
             (`emulator/deviation.py`). By default it equals the file.
 
     Raises:
-        MusculoskeletalError: If `reality` is neither an emulator model nor a file, or if a joint or
-            muscle of the robot is missing in the file.
+        MusculoskeletalError: If `reality` is neither an emulator model nor a file, or if the model
+            of the arm cannot be built, for example because the file lacks a joint of the robot.
     """
     if reality == KIN:
         individual = Individual(robot, seed)

@@ -63,7 +63,7 @@ class Placed(NamedTuple):
 
     @classmethod
     def empty(cls, routes: WrappedRoutes, muscles: int) -> Placed:
-        """Return uninitialised poses for an arm of M muscles."""
+        """Return arrays for an arm of M muscles, to be filled by `place`."""
         joints, points, segments = map(len, (routes.tree.parent, routes.point, routes.first))
         poses, ends = ((joints, 3, 3), (joints, 3), (joints, 3)), (segments, 3)
         placed = cls(*(np.zeros(shape) for shape in (*poses, (points, 3), muscles, ends, ends)))

@@ -306,7 +306,7 @@ def _hidden_motion(error: Array, jacobian: Array) -> Array:
     """Return the motion of joints that explains errors of lengths; 0 if it explains too little.
 
     Args:
-        error: l − l̂ without its mean [m], (N, M).
+        error: l − l̂ without a constant for each muscle, such as its mean [m], (N, M).
         jacobian: G of these joints [m/rad], (N, M, S).
     """
     hidden: Array = np.einsum('nsm,nm->ns', np.linalg.pinv(jacobian), error)

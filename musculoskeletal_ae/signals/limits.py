@@ -19,7 +19,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 class Limits(NamedTuple):
-    """Limits of plausible values; all parts of the package reject values beyond them."""
+    """Limits of plausible values of sensors and estimates, and of their changes.
+
+    Nodes and tools that process muscle states or estimates all use these limits.
+    """
 
     #: largest excess of a joint sensor over the joint's range, as a fraction of the range
     joint_outside: float = 0.1
@@ -79,6 +82,8 @@ def reading_range(robot: Robot) -> tuple[Array, Array]:
 
 def length_range(robot: Robot, outside: float = 0.0) -> tuple[Array, Array]:
     """Return the smallest and the largest length of every muscle within the joint ranges.
+
+    They are found among POSTURES random postures, with no tension and with tension.max.
 
     Args:
         robot: The nominal body.
