@@ -136,7 +136,11 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
 
 
 def read_metadata(directory: Path) -> Contents:
-    """Return the storage files that metadata.yaml names, or all if metadata.yaml is unusable."""
+    """Return the storage files that metadata.yaml names, or all if metadata.yaml is unusable.
+
+    Raises:
+        BagError: If there are no storage files, or they are compressed individually.
+    """
     try:
         metadata = convert(read_yaml(directory / FILE, _unusable), _Document)
     except ValueError as error:

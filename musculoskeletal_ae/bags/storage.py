@@ -129,7 +129,11 @@ def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
 
 
 def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTopic:
-    """Add a topic, or add its messages to the topic of the same name; return the topic."""
+    """Add a topic, or add its messages to the topic of the same name; return the topic.
+
+    Raises:
+        BagError: If the topic of the same name has another type or definition.
+    """
     first = topics.setdefault(topic.name, replace(topic, message_count=0))
     if (first.type, first.problem) != (topic.type, topic.problem):
         if first.type != topic.type:

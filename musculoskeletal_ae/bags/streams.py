@@ -186,7 +186,7 @@ def read_streams(
     implausible messages. Lengths are corrected by the length offsets that `muscle_length_zeros` had
     published at that time. The first offsets on this topic, if known, also correct earlier lengths.
     Messages received while offsets were unknown are rejected. For isolated muscles, lengths and
-    tensions that are not finite become 0, and temperatures that are not finite become NaN.
+    tensions that are not finite or absurdly large become 0, and such temperatures become NaN.
 
     Args:
         bag: The recording.

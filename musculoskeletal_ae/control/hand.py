@@ -58,8 +58,8 @@ class Hand:
             pose: The pose in the root link's frame.
             whole: Whether the orientation counts.
             start: Posture from which the search starts [rad], (D,).
-            nearest: Whether to return the nearest holdable posture if the hand cannot reach the
-                pose.
+            nearest: Whether to return another posture, as `unreachable: nearest` demands, if the
+                hand cannot reach or hold the pose.
 
         Returns:
             The posture θ [rad], (D,), and the reason, which is '' if the hand reaches the pose.

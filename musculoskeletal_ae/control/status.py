@@ -32,8 +32,8 @@ DOING = {
 def report(core: Controller, now: float) -> Report:
     """Return the status for /diagnostics: a stop, else why control waits, else all warnings.
 
-    The values `mode`, `stop cause`, `stop causes` and `remedy steps` are stable identifiers for
-    programs. The message and the values `stop` and `remedy` are texts for users.
+    The values `mode`, `stop cause`, `stop causes`, `waits for` and `remedy steps` are stable
+    identifiers for programs. The message and the values `stop` and `remedy` are texts for users.
     """
     supervisor = core.supervisor
     values = {
