@@ -25,7 +25,7 @@ def replace_unprintable() -> None:
 
 
 class MusculoskeletalError(Exception):
-    """Base class of every error that this package raises on purpose."""
+    """Base class of all errors that this package defines."""
 
     reason = 'cannot be used'  # short text under which rejected messages are counted
 
@@ -34,7 +34,10 @@ class MusculoskeletalError(Exception):
 
 
 class RobotDescriptionError(MusculoskeletalError):
-    """A robot directory cannot be used; the text names the file, the entry and the legal values."""
+    """A robot description is invalid, or cannot be used as requested.
+
+    For a wrong entry, the text names the file, the entry and the legal values.
+    """
 
 
 class CheckpointError(MusculoskeletalError):
@@ -53,7 +56,7 @@ class GateError(CheckpointError):
 
 
 class InfeasibleError(MusculoskeletalError):
-    """No muscle tensions within the limits achieve the request."""
+    """No muscle tensions within the limits achieve the request, or an input is not finite."""
 
 
 class MessageError(MusculoskeletalError):

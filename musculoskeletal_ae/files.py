@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read files that a user names, and write files atomically.
 
-Only regular files up to a size limit are read. The argument `refuse(file, problem)` of every
-reading function returns the exception to raise.
+Of a user's files, only regular ones up to a size limit are read. The argument
+`refuse(file, problem)` of the functions that read them returns the exception to raise.
 """
 
 import csv
@@ -20,7 +20,7 @@ import yaml
 T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
-LARGEST = 5_000_000  # size limit of any file [bytes]
+LARGEST = 5_000_000  # size limit of a file unless the caller states another one [bytes]
 LARGEST_YAML = 1 << 19  # size limit of a YAML file [bytes]; parsing YAML is slow
 LARGEST_CSV = 1 << 20  # size limit of a CSV file [bytes]; each cell takes fifty bytes of memory
 MOST_ENTRIES = 100_000  # largest number of entries of a YAML file after aliases are expanded
@@ -173,7 +173,8 @@ def _check(text: str) -> None:
 def new_directory(directory: Path, refuse: Refuse) -> Iterator[None]:
     """Create a directory, or take an empty one, and let a `with` block write files into it.
 
-    After an error or Ctrl-C, everything is removed again, so that no partial result remains.
+    After an error or Ctrl-C, the files and a new directory are removed again, so that no partial
+    result remains.
     """
     is_there = os.path.lexists(directory)
     if is_there and (not directory.is_dir() or any(directory.iterdir())):

@@ -69,6 +69,8 @@ class Parameter:
     def checked(self, value: Any) -> Any:
         """Return a value if it is legal; a list becomes a tuple without empty names.
 
+        The type and the range of a single number are not checked here, because ROS checks them.
+
         Raises:
             MusculoskeletalError: If the value is not legal.
         """

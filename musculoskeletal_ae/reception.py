@@ -18,7 +18,7 @@ REORDERING = 1_000_000_000  # [ns]
 
 
 class Reception:
-    """Counts received, rejected and ignored messages."""
+    """Counts used and rejected messages, and ignored parts of messages."""
 
     def __init__(
         self, warn: Callable[[str], object], clock: Callable[[], float] = time.monotonic

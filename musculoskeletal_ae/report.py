@@ -44,7 +44,7 @@ def whole(value: float, unit: str = '') -> str:
 def distinct(value: float, *limits: float, digits: int = 3) -> tuple[str, ...]:
     """Return a value and its limits as texts with enough digits to tell them apart.
 
-    Each text has at least `digits` significant digits. Equal numbers give equal texts.
+    The texts are rounded to `digits` significant digits or more. Equal numbers give equal texts.
     """
     numbers = [float(number) for number in (value, *limits)]
     for precision in range(digits, MOST_DIGITS + 1):

@@ -35,9 +35,9 @@ QUANTITIES = ('length', 'tension', 'temperature')
 
 
 def read_array(message: Any, rows: int, columns: int) -> Array:
-    """Return the finite data of a Float64MultiArray as (rows, columns), or (columns,) for one row.
+    """Return the data of a Float64MultiArray as (rows, columns), or (columns,) for one row.
 
-    The layout may be empty; otherwise it must match.
+    The data must be finite. The layout may be empty; otherwise it must match.
     """
     values = _values(message, rows, columns)
     finite = np.isfinite(values)
@@ -260,7 +260,7 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
     spans = [point.time_from_start for point in points]
     time = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     if not (np.diff(time, prepend=-1e-9) > 0.0).all() or time[0] < 0.0:
-        raise MessageError('times do not increase', str(time[:20].tolist()))
+        raise MessageError('times negative or not increasing', str(time[:20].tolist()))
     columns = {'position': position, 'velocity': velocity, 'acceleration': acceleration}
     for what, column in columns.items():
         if column is not None and not np.isfinite(column).all():
@@ -316,7 +316,8 @@ def without_orientation(message: Any) -> bool:
 def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
     """Return the pose of a PoseStamped, whose frame must be `frame`.
 
-    With `position_only`, the rotation in the message is ignored, and that of the result is 0.
+    With `position_only`, the rotation in the message is ignored, and that of the result is the
+    identity.
     """
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')

@@ -10,8 +10,9 @@
             friction makes the motor-side tension T differ from the tension at the elastic element
     o       offset of the length sensor
     r, a    creep of the tendon per sample, and the number of samples that came after this one
-    ψᵀ v    residual model: random Fourier features over the joints that the muscle crosses. It
-            represents what straight lines between route points miss, such as wrapping round bones
+    ψᵀ v    residual model: random Fourier features over the joints that the muscle crosses, minus
+            their values at θ = 0. It represents what straight lines between route points miss,
+            such as wrapping round bones
 
 If all parameters are zero, the calibrated body is the geometric model. The module `fit` estimates
 the parameters. The springs of the joints do not change lengths; `springs` describes their
@@ -41,7 +42,7 @@ WIDTH = 0.35  # width of the kernel that the features approximate, as a share of
 #: are about half of all directions, and change a length by less than 0.1 mm at the prior's spread.
 LEFT_OUT = 1e-3
 POSTURES = 500  # number of random postures over which the variance of the features is computed
-#: largest |μ|, at which the tension at the elastic element is twice the tension at the motor
+#: largest |μ|; the tensions at the motor and at the elastic element then differ by a factor of 2
 LARGEST_FRICTION = 0.7
 LARGEST_LOG = 1.5  # largest |κ|
 
@@ -103,7 +104,7 @@ class ResidualModel(NamedTuple):
         return every._replace(basis=kept.astype(np.float32))
 
     def at(self, theta: Array) -> Array:
-        """Return ψ(θ) − ψ(0), shape (N, F)."""
+        """Return ψ(θ), which is 0 at θ = 0, shape (N, F)."""
         angles = theta @ self.frequency.T + self.phase
         values = np.cos(angles.astype(self.phase.dtype)) - np.cos(self.phase)
         return (values @ self._scaled).astype(float)
@@ -225,9 +226,10 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return T_end [N] (N,) of one muscle, and its derivatives by μ, γ, b and F, (N, 4).
+        """Return T_end [N] (N,) of one muscle, and its derivatives by its parameters, (N, 4).
 
-        With tension sensors, only the derivative by μ is returned, (N, 1).
+        The parameters are μ, γ, b/T_limit and F/T_limit. With tension sensors, only the derivative
+        by μ is returned, (N, 1).
 
         Args:
             m: The muscle.
@@ -273,9 +275,11 @@ class CalibratedBody:
     def lengths(self, theta: Array, tension: Array, *direction: Array) -> tuple[Array, ...]:
         """Return muscle lengths l [m], (N, M), one array for each array in `direction`.
 
+        The lengths do not include creep (see `crept`).
+
         Args:
             theta: θ [rad], (N, D).
-            tension: Motor-side tension T [N], (N, M).
+            tension: T or T_read [N], (N, M).
             direction: Directions s of sliding in [−1, 1], (N, M) each. 0 lies midway between
                 winding in and paying out.
         """
@@ -301,9 +305,9 @@ class CalibratedBody:
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
         Args:
-            poses: Joint poses at the postures θ.
-            smooth: ψ(θ), (N, F).
-            tension: Motor-side tension T_i [N], (N,).
+            poses: Joint poses at the postures θ, from `poses`.
+            smooth: ψ(θ), from `ResidualModel.at`, (N, F).
+            tension: T_i or T_read,i [N], (N,).
             direction: Direction of sliding s_i, (N,).
             m: Index i of the muscle.
             age: Number of samples that came after each sample, (N,).

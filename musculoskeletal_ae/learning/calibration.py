@@ -117,7 +117,7 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Set the isolated muscles; forget all messages if some lack a muscle now in use."""
+        """Forget all messages if some lack a muscle that is not among the `isolated` ones."""
         if self._missing - frozenset(isolated):
             self.clear()
 
@@ -183,7 +183,7 @@ def is_learned(mae: Mae) -> bool:
 
 
 def is_calibrated(mae: Mae) -> bool:
-    """Return whether a network's statistics come from the real arm."""
+    """Return whether a network's statistics describe the real arm well enough."""
     return mae.anomaly is not None and mae.anomaly.calibrated
 
 

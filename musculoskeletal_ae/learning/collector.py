@@ -5,8 +5,8 @@
     θ, gravity ──────────────────────────────────┴► paired by time (`pairing`)
          ─► θ plausible ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
 
-Values of isolated muscles are replaced by 0 first. A sample carries the version of the body state
-and the isolated muscles under which it was taken.
+Values of isolated muscles are replaced by 0 before they are paired. A sample carries the version of
+the body state and the isolated muscles under which it was taken.
 """
 
 import math
@@ -181,7 +181,11 @@ class SampleCollector:
         return self._pairing.muscles(time, sample)
 
     def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
-        """Process a message of the healthy arm; return the new samples that it completes."""
+        """Process a message with its θ; return the samples that were stored.
+
+        A message is used only after it has been held back by `margin`; during an anomaly and
+        shortly after it, messages are ignored.
+        """
         dt = min(paired.dt + self._skipped, self._longest_pause)
         measured = self._unmeasured if paired.theta is None else paired.theta
         theta, gravity = np.split(measured, [self._robot.joint_count])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Expected covariances of a network's estimation errors, and of the learned motor currents."""
+"""Covariances of a network's estimation errors, and of the learned constants of motor currents."""
 
 import math
 
@@ -80,7 +80,7 @@ def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
     errors of the body model are common to all samples.
 
     Returns:
-        The covariances, in [N] for b and F; None for tension sensors.
+        The covariances, with b and F in [N]; None for tension sensors.
     """
     if body.drive is None:
         return None

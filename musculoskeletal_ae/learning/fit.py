@@ -44,7 +44,8 @@ LEAST_BEFORE_CHANGE = 8
 class Fit(NamedTuple):
     """Result of a fit."""
 
-    residual: Array  # l − l(θ, T; w) [m], (N, M)
+    #: l − l(θ, T; w) [m], (N, M), at the measured angles, or at fitted ones where there are none
+    residual: Array
     noise: Array  # σ of each muscle's length [m], (M,)
     weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
     theta: Array  # fitted postures [rad], (N, D)
@@ -60,9 +61,10 @@ def fit_body(
 ) -> Fit:
     """Fit the parameters of a body in place, together with the samples' postures.
 
-    The fit starts from the present parameters. A muscle counts as changed if some samples no
-    longer describe it although it was not isolated when they were taken. In that case the muscle is
-    first fitted to these samples, and the result is the prior mean of its new parameters.
+    The fit starts from the present parameters. A muscle counts as changed if at least
+    LEAST_BEFORE_CHANGE samples no longer describe it although it was not isolated when they were
+    taken. In that case the muscle is first fitted to these samples, and the result is the prior
+    mean of its new parameters.
 
     Args:
         body: The body.

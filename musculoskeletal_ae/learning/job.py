@@ -28,11 +28,13 @@ class Update(NamedTuple):
     loss: float  # training loss
     #: σ of the part of each length that the body does not explain [m], (M,)
     noise: Array = np.empty(0)
-    #: index of a muscle whose newest samples contradict all older ones, and the number of these
+    #: index of a muscle whose newest samples contradict the fitted body, and the number of these
     #: newest samples; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
     #: several muscles that the newest samples contradict at once, which indicates a wrong θ
     contradicted: tuple[int, ...] = ()
-    error: float = 0.0  # mean ‖θ_est − θ‖₂ over the newest samples before they were learned [rad]
+    #: mean ‖θ_est − θ‖₂ over the newest samples, with θ_est of the network before the update [rad];
+    #: NaN if none of them has measured angles
+    error: float = 0.0
     seconds: float = 0.0  # duration of the update [s]
     device: str = 'cpu'  # device of the training

@@ -39,8 +39,8 @@ SHARES = 0.03, 0.1, 0.3  # grid of π, if the stop is reached
 WIDTHS = 0.001, 0.002, 0.004  # grid of σ, if the stop is reached [rad]
 WIDTH_RATIO = 2.0  # σ beyond a limit, relative to σ within the range
 DENSITY_RATIO = 0.01  # density of readings beyond a limit, relative to that within the range
-# A joint without a sensor is at its stop if it is near a limit and the muscles push it there.
-NEAR_STOP = 0.05  # largest distance from the limit [rad]
+# A joint is at its stop if it is near a limit and the muscles push it there.
+NEAR_STOP = 0.05  # largest distance of a joint without a sensor from the limit [rad]
 LEAST_PUSH = 3.0  # smallest torque towards the limit, relative to the usual residual torque
 SMALL = 1e-6  # weight of every angle, relative to the weight of a stop
 NEAR_LIMIT = 0.3  # distance from a limit within which readings may belong to its cluster [rad]

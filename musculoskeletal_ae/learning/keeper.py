@@ -5,7 +5,8 @@
                                                        ▲
     anomaly ─► the last network that was in use long enough without an anomaly
 
-Every network is saved to disk before it is published.
+If there is a state directory, every network is saved before it is published. A failed save is
+retried, and does not prevent the publication.
 """
 
 import math

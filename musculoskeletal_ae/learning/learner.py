@@ -10,9 +10,9 @@
 Isolated muscles are not learned: samples do not describe them, and the published network lists
 them.
 
-The caller supplies the time: the ROS clock, recorded time or simulated time. All timing rules use
-this time. Therefore a recording is learned exactly as on a robot, except that training takes no
-time.
+The caller supplies the time: the ROS clock, recorded time or simulated time. All rules on what is
+learned and when use this time. Therefore a recording is learned exactly as on a robot, except that
+training takes no time.
 """
 
 import math
@@ -90,6 +90,7 @@ class Learner:
             MusculoskeletalError: If the preset does not exist, or if there are neither joint
                 angles nor tensions.
             StateError: If the directory cannot be used.
+            GateError: If the validation rejects `mae`.
         """
         if joint_source == NONE and not robot.tension_source.is_known:
             raise MusculoskeletalError(
@@ -294,7 +295,7 @@ class Learner:
     def enable(self, enabled: bool) -> None:
         """Stop or resume learning; samples and network are kept.
 
-        Stopping discards the result of an update that is under way.
+        The result of an update that arrives while learning is stopped is discarded.
         """
         if enabled and not self.enabled:
             self.reset()

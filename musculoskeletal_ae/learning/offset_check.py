@@ -4,7 +4,9 @@
     e = |l − o − ①(θ, T_end)|,   median over COUNT messages, for each muscle
 
 θ is measured, or else estimated by ②. New offsets o are accepted if e is at most LARGEST_RATIO
-times the error with the previous offsets and the same network, or at most LEARNED_ERROR. Learning
+times the error with the previous offsets and the same network, or at most LEARNED_ERROR. If there
+are no messages with the previous offsets, the limit of e is LEARNED_ERROR or UNLEARNED_ERROR.
+Offsets within CALIBRATION_SPREAD of the accepted ones are accepted without a comparison. Learning
 pauses while the published offsets disagree with the messages, whichever node published them.
 """
 
@@ -31,7 +33,7 @@ class OffsetCheck:
     """Decides whether length offsets are plausible.
 
     Attributes:
-        is_believed: Whether the offsets are accepted; False until enough messages were compared.
+        is_believed: Whether the offsets are accepted.
         problem: Why they are rejected, or ''.
     """
 

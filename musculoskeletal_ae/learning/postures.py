@@ -10,7 +10,7 @@ offsets z and the corrections e = (α, β) of the joints' springs (`springs`), b
 (`gauss_newton`). y are joint angles that a joint sensor (with offset z) or a camera measured, or
 that a user stated. u are directions of gravity in links that carry an IMU. Any of these
 measurements may be missing. ω are robust weights. z̄ and s_z are derived from the joints' stops
-(`stops`).
+(`joint_stops`).
 
 The problem can be solved because M > D. N rests give N (M − D) more length equations than there are
 angles, and N D torque equations. A joint that muscles push against its stop harder than friction

@@ -16,8 +16,9 @@ from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
 #: Errors of the body model are common to all samples. Therefore all samples together count as at
-#: most this number of independent ones, for joint-sensor offsets, for springs of the joints, and
-#: for the posterior uncertainty from the torque and the stops of joints without a sensor.
+#: most this number of independent ones, for joint-sensor offsets, for springs of the joints, for
+#: the constants of motor currents, and for the posterior uncertainty from the torque and the stops
+#: of joints without a sensor.
 INDEPENDENT_SAMPLES = 10.0
 # The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
 # RACK [m].

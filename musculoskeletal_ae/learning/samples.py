@@ -233,7 +233,7 @@ class SampleStore:
         self.accepted = 0
 
     def observations(self) -> Observations:
-        """Return all samples as arrays."""
+        """Return all samples as arrays, except those that are held back."""
         columns = [*zip(*self.samples, strict=True)]
         theta, tension, length, direction = map(np.array, columns[:4])
         spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)

@@ -99,7 +99,8 @@ def from_bytes(data: bytes, robot: Robot) -> SavedState:
 
     Raises:
         StateError: If the content is damaged or does not fit the robot. The robot must have the
-            same joints in the same order, and at least the muscles of the state.
+            same joints in the same order, the same tension source, and at least the muscles of the
+            state.
     """
     checksum, content = data[:CHECKSUM], data[CHECKSUM:]
     if checksum != _checksum(content):

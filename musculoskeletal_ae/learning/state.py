@@ -2,7 +2,7 @@
 """Saves the learner's state to disk, so that nothing is lost if the learner is killed.
 
     learner.state          the samples and the newest network
-    previous.state         the state before that, used if the newest one is unusable
+    previous.state         the state before that, used if the newest one is missing or unusable
     backup-N.state         states that the user replaced or that were unusable
     network.safetensors    the network of the last explicit save, as a checkpoint for other tools
     lock                   locked by the learner that uses the directory
@@ -93,7 +93,7 @@ class StateStore:
                 unfinished.unlink()
 
     def close(self) -> None:
-        """Release the directory without saving, because the newest state is on disk already."""
+        """Release the directory without saving, because each change was saved when it was made."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None
@@ -103,9 +103,9 @@ class StateStore:
     def load(self, samples: SampleStore) -> Mae | None:
         """Load the saved samples into an empty store; return the saved network, if there is one.
 
-        An unusable state is renamed to a backup, and the previous state is used. If muscles were
-        added to the robot after the save, only the samples are used; they do not describe those
-        muscles.
+        An unusable state is renamed to a backup, and the previous state is used. Only the samples
+        are used if the saved network is unusable, or if muscles were added to the robot after the
+        save; the samples do not describe those muscles.
 
         Raises:
             StateError: If a state cannot be kept as a backup.

@@ -94,8 +94,9 @@ LONGEST_ENDING = 2.0  # longest wait for a killed process to end [s]
 class TrainerProcess(Trainer):
     """Runs updates in a separate process, which is restarted if it dies or hangs.
 
-    A thread communicates with the process, so that no call blocks. A restarted process repeats the
-    job that was lost.
+    A thread communicates with the process, so that `submit` and `poll` do not wait for answers.
+    Only the end of a process is waited for, for LONGEST_ENDING at most. A restarted process repeats
+    the job that was lost.
     """
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0, device: str = 'cpu') -> None:

@@ -2,8 +2,8 @@
 """Checkpoints: a trained network as safetensors bytes, in files and on the topic `mae_checkpoint`.
 
 A checkpoint is checked completely before any part of it is used. Every fault raises a
-`CheckpointError` that names the source, the value, the legal values and the remedy. Pickle is never
-used, because unpickling can run arbitrary code.
+`CheckpointError` that names the source, the problem and the remedy. Pickle is never used, because
+unpickling can run arbitrary code.
 """
 
 import json

@@ -267,7 +267,7 @@ class Mae:
     decoder: tuple[Layer, ...]
     mean: Array  # mean by which scaled (θ, T, l) are standardised, (D+2M,)
     std: Array  # standard deviation by which scaled (θ, T, l) are standardised, (D+2M,)
-    version: int = 0  # rises with every checkpoint that the learner publishes
+    version: int = 0  # number that the learner gives to each new network; higher ones are newer
     training: str = ''  # description of the training, for people
     anomaly: AnomalyStatistics | None = None  # statistics of the residuals on healthy data
     #: tendon friction, and residual torques of the healthy arm; None if not yet learned
@@ -344,9 +344,10 @@ class Mae:
 
     @property
     def layer_sizes(self) -> tuple[int, ...]:
-        """Number of units of all layers from input to output, group by group.
+        """Number of units of each layer from input to output, one group after the other.
 
-        The latent layer in the middle has D+M units.
+        The middle layer of each group is its part of z, with one unit for each joint and each
+        muscle of the group.
         """
         each, depth = len(self.groups), len(self.encoder) // len(self.groups)
         stacks = ((*self.encoder[i : i + depth], *self.decoder[i : i + depth])

@@ -57,8 +57,8 @@ class AnomalyStatistics:
 
     mean: Array  # mean μ of e, (2M,)
     covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
-    calibrated: bool  # whether the residuals are those of the real arm, not the geometric model
-    samples: int  # number of samples
+    calibrated: bool  # whether they describe the real arm in its present state well enough
+    samples: int  # number of residuals e from which mean and covariance were computed
     #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)
     #: θ [rad] (K, D) of healthy postures far apart from each other; K may be 0

@@ -6,8 +6,8 @@
 Candidates arrive on the topic `mae_checkpoint`, or from the file that the parameter `checkpoint`
 names. The estimator uses an accepted network and publishes it latched. If an anomaly is detected
 soon after a network was accepted, the estimator returns to the newest network that was in use long
-enough without an anomaly, and publishes this network again. As soon as there is
-an accepted network, controller and simulator use only accepted networks.
+enough without an anomaly, and publishes this network again. As soon as there is an accepted
+network, controller and simulator use only accepted networks.
 """
 
 import time

@@ -125,7 +125,7 @@ class CheckDriver:
         return True
 
     def wind(self, verdict: Verdict) -> None:
-        """Wind each muscle in slightly, and add the faults of its response to the verdict."""
+        """Wind the tested muscles in slightly; add the faults of their responses to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
         read = partial(
             import_heavy('musculoskeletal_ae.validity').read_muscle_states,

@@ -4,6 +4,7 @@
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
 anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros,
 estimated/markers; on request muscle_joint_states and /tf.
+mae_checkpoint → accepted_checkpoint, the networks that have passed the validation.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
 joint_states are optional: the length calibration, the validation of checkpoints and the detector of
 lengths that disagree with them use them.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `hardware_emulator`: emulates an arm with muscle modules, and faults on request.
 
-muscle_length_command, muscle_tension_command → joint_states, muscle_states, markers; on request
-marker_pose and imu.
+muscle_length_command, muscle_tension_command, hardware_emulator/external_wrench → joint_states,
+muscle_states, robot_description, hardware_emulator/markers; on request marker_pose, imu and /clock.
 """
 
 import time

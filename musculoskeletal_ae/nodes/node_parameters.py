@@ -68,8 +68,8 @@ class NodeParameters:
         If one parameter of a request is refused, the setters that were already called for this
         request are called again with the previous values. A setter whose effect cannot be undone in
         this way needs `prepare`. Setters with `prepare` are called after all setters without it, in
-        the order of registration. A setter that several parameters share is called only once. Only
-        the first of the setters with `prepare` may raise an error.
+        the order of registration. Of these, a setter that several parameters share is called only
+        once. Only the first of the setters with `prepare` may raise an error.
 
         Args:
             name: Name of the parameter.

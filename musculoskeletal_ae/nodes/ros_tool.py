@@ -97,7 +97,8 @@ def run_tool(
         argv: Arguments, including those for ROS; by default the arguments of the process.
 
     Returns:
-        The status of `work`; 1 if an input cannot be used; 2 if an option is wrong.
+        The status of `work`; 1 if an input cannot be used; 2 if an option is wrong; INTERRUPTED
+        after a stop signal.
     """
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
     with _clear_ros_arguments(arguments):

@@ -3,7 +3,8 @@
 
 While nodes run, SIGINT and SIGTERM only set a flag (`stop_signals`). A timer checks the flag ten
 times a second and makes the executor return. Nodes are then destroyed, and after them the ROS
-context. The process ends itself after 10 s without progress (`progress`).
+context. The process ends itself after 10 s without progress (`progress`), unless one of its nodes
+is not watched (`Shell.is_watched`).
 """
 
 import gc

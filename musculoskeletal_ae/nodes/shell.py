@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of all nodes: parameters, checkpoints, subscriptions, diagnostics."""
+"""Base class of the nodes of an arm: parameters, checkpoints, subscriptions, diagnostics.
+
+Tools that are nodes, such as `replay` and `view`, do not use it.
+"""
 
 from __future__ import annotations
 

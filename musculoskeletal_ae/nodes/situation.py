@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Summarizes the state of a running arm from the reports of all nodes on /diagnostics.
 
-The level of the whole arm is the worst level of its nodes, and 'error' if a required node stops
-reporting. This module decides only by identifiers in the reports, such as the controller's values
-`mode` and `stop cause`. It shows the sentences in the reports unchanged, and never parses them.
+The level of the whole arm is the worst level of its nodes. It is 'error' if a required node stops
+reporting, if an anomaly is detected, or if nodes use different networks. This module decides only
+by identifiers in the reports, such as the controller's values `mode` and `stop cause`. It shows the
+sentences in the reports unchanged, and never parses them.
 """
 
 import contextlib

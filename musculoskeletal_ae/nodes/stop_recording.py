@@ -86,7 +86,10 @@ class StopRecording:
                 self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
-        """Write the kept messages in the background; keep `most` recordings (0: none)."""
+        """Write the kept messages in the background; keep `most` recordings (0: none).
+
+        While an earlier recording is still being written, this does nothing.
+        """
         messages = list(self._recent)
         if not (messages and most) or (self._writing is not None and self._writing.is_alive()):
             return

@@ -33,8 +33,8 @@ def send_taught_motion(bag: Bag, options: Namespace, arguments: list[str]) -> in
     """Publish a hand-guided motion as one trajectory, and return the exit status 0.
 
     Raises:
-        MusculoskeletalError: If the bag has no hand-guided motion, or the controller refuses the
-            trajectory.
+        MusculoskeletalError: If the bag has no hand-guided motion, or the trajectory is not
+            received or is refused.
     """
     names = select(bag, [TAUGHT_TOPIC], options.from_namespace, options.keep_names)
     if len(names) > 1:  # with --keep-names, the bag's arms stay separate

@@ -51,7 +51,7 @@ def draw_batch(values: Array, rng: np.random.Generator) -> Array:
 
 
 class OnlineLearning(Updater):
-    """Updates the whole network after every new sample."""
+    """Trains the whole network in every update, once more than C_thre samples are stored."""
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         super().__init__(robot, mae, seed)

@@ -36,7 +36,7 @@ class DefaultPreset:
     methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 
     def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return a number of mini-batches that grows with the number of joints and muscles."""
+        """Return a number of mini-batches that grows with D + M of the largest group."""
         from musculoskeletal_ae.mae.default_training import default_steps
 
         return default_steps(groups)
@@ -89,7 +89,10 @@ class DefaultPreset:
         return {name: method for name, method in METHODS.items() if name != 'proposed'}
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return the paper's three steps, with targets at which some joints are at their limits."""
+        """Return a function that draws the paper's three steps.
+
+        Some joints of the targets are at their limits, and the third step presses them there.
+        """
         from musculoskeletal_ae.control.exploration_steps import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps
 

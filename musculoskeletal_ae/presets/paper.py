@@ -81,7 +81,7 @@ class PaperPreset:
         return METHODS
 
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
-        """Return the three steps of random motion (§IV-A)."""
+        """Return the function that draws the three steps of random motion (§IV-A)."""
         from musculoskeletal_ae.paper.exploration import three_steps
 
         return three_steps

@@ -4,7 +4,7 @@
 For postures drawn uniformly within the joint limits, the check computes
 
 - the tension nearest to 0.3 T_limit within [T_bias, T_limit] that holds weight and springs,
-- the joint stiffness under muscle stiffness control (MSC) at that tension, with the springs, and
+- the joint stiffness at that tension (`stiffness`), with the springs, and
 - the moment arms r(θ) = −G(θ) [m], the joint torque for one newton of tension. A muscle with r > 0
   moves the joint in its positive direction.
 
@@ -12,7 +12,8 @@ To give all joints the same unit, a prismatic joint is treated as if a pinion of
 it: a tendon parallel to its axis has r = RACK. doc/explanation/method.md ("An arm must be
 holdable") defines a sound arm. A joint with a spring of its own may have muscles on one side only,
 if these muscles can hold the joint. The report also shows the one-sided stiffness, in which muscles
-at the bias tension count as slack. The one-sided stiffness is not a criterion.
+at the tension that their modules maintain (T_bias, or 0 for position-controlled modules) count as
+slack. The one-sided stiffness is not a criterion.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ REQUIRED_SHARE = 0.95
 REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
 STIFFNESS_PER_LOAD = 2.0  # [1/rad]
 LEAST_INERTIA = 1e-12  # inertia of a joint below which the value is a rounding error [kg·m²]
-#: tension above T_bias up to which a muscle counts as slack [N], because the solver rounds
+#: tension above the one that its module maintains, up to which a muscle counts as slack [N];
+#: the solver rounds
 SLACK_MARGIN = 1e-3
 # A moment arm counts if it is longer than the smaller of COUNTED_ARM and COUNTED_ARM_SHARE of the
 # longest one at its joint, but at least LEAST_COUNTED_ARM.
@@ -123,7 +125,8 @@ class RobotCheck:
     tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
     missing_torque: Array  # torque that the muscles lack to hold a posture [N·m], (N, D)
     stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
-    one_sided: Array  # like `stiffness`, with muscles at the bias tension counted as slack, (N,)
+    #: like `stiffness`, but muscles at the tension that their modules maintain count as slack, (N,)
+    one_sided: Array
     required: float  # required stiffness [N·m/rad]
     matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
     faults: tuple[Finding, ...]  # reasons why the arm is not sound; empty if it is sound
@@ -317,7 +320,7 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
-    """Yield a fault for each joint that has muscles on one side only in too many postures."""
+    """Yield a fault for each joint that lacks muscles on one side or both in too many postures."""
     lacks = {
         '+': np.max(moment_arms, axis=1) <= matters,
         '-': np.min(moment_arms, axis=1) >= -matters,

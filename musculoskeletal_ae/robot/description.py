@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read and check a robot description: a directory with `robot.urdf` and `muscles.yaml`.
 
-All faults of the two files are detected here, with the file, the entry and the legal values in the
-message. Later code relies on this.
+All faults of the two files are detected here or by `muscle_file` and `urdf`, with the file, the
+entry and the legal values in the message. Later code relies on this.
 """
 
 import math
@@ -453,7 +453,7 @@ def _read_end_effectors(
     order: list[str],
     fail: Fail,
 ) -> tuple[str, ...]:
-    """Return the end effectors in muscles.yaml, by default the last link of the chain."""
+    """Return the end effectors in muscles.yaml, by default the link that most joints move."""
     links = _joints_above(model, {*content.joints})
     moved = _joints_above(model, {*content.joints, *couplings})
     places = {f'$.end_effectors[{i}]': n for i, n in enumerate(content.end_effectors or ())}

@@ -48,7 +48,7 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
         points: Route points [m], (P, 3); by default those of the geometric model.
 
     Returns:
-        One line for each bone and for each branch of a tendon.
+        One line for each bone longer than SHORTEST_BONE and for each branch of a tendon.
     """
     kin = robot.kinematics
     origins = kin.tree.joint_poses(theta[None]).translation[0]

@@ -112,7 +112,7 @@ def jump_choices(robot: Robot) -> list[str]:
 
 
 def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Return, as text, limits of one joint that exclude all jumps and keep most of its range.
+    """Return, as text, limits of one joint that exclude the jumps and keep the largest range.
 
     Args:
         robot: The geometric model.

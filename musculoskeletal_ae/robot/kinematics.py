@@ -71,7 +71,7 @@ def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
 
 
 class Kinematics:
-    """Link poses, torques of weight and springs, and end-effector Jacobian of a robot."""
+    """Link poses, end-effector Jacobian, inertia and joint torques of a robot."""
 
     def __init__(
         self,

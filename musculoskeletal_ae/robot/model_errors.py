@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much muscle lengths of a real arm differ from those of its geometric model.
 
-A real tendon is attached some millimetres beside the route points of the model. The error of a
-length is zero at θ = 0, where lengths are zero by definition. Its variance is
+A real tendon is attached some millimetres beside the route points of the model, and does not run
+straight between them. At θ = 0, attachments cause no error, because lengths are relative to that
+posture. The variance of the error of a length is
 
     s² = SHAPE_FACTOR² (SMOOTH² + ATTACHMENT² Σ over the route points of ‖∂f/∂p(θ) − ∂f/∂p(0)‖²)
 

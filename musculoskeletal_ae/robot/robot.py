@@ -100,9 +100,10 @@ class Robot:
         return ', '.join(self.muscles[m] for m in muscles)
 
     def without(self, muscles: Iterable[int]) -> Robot:
-        """Return a copy with exactly these muscles isolated, whose tension limits become 0.
+        """Return a copy with exactly these muscles isolated.
 
-        The copy shares the geometry with the original.
+        T_bias, T_limit and T_max of isolated muscles become 0. The copy shares the geometry with
+        the original.
         """
         reduced, whole = copy.copy(self), self.description.tension
         reduced.isolated = tuple(sorted(muscles))

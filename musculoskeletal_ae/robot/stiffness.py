@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint stiffness of an arm whose muscles follow muscle stiffness control (MSC).
+"""Joint stiffness of an arm under muscle stiffness control (MSC) or position control.
 
     K_θ = Gᵀ diag(k) G + Σ_i T_i ∂²l_i/∂θ²,    k = (1/K_stiff + ∂L_e/∂T)⁻¹
 
 `check_robot` takes G and L_e from the geometric model, the controller from the network. A muscle
 that MSC holds at T_bias does not resist shortening. The one-sided stiffness therefore counts it as
-slack, with k = 0. The stiffness against an external wrench is K_θ + ∂g/∂θ, because the torque of
-the arm's weight changes with θ as well.
+slack, with k = 0. For position-controlled modules, K_stiff is infinite. The stiffness against an
+external wrench is K_θ + ∂g/∂θ, because the torque of the arm's weight changes with θ as well.
 """
 
 from collections.abc import Callable

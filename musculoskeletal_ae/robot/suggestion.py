@@ -3,8 +3,9 @@
 
     min  mean_p |d_p| / r + penalty(d),    d_p = r · x_p / √(1 + |x_p|²)
 
-over x. Each via point p moves by d_p, which is shorter than the reach r. The penalty is zero if
-stiffness and moment arms meet the requirements of the check in all but a few postures.
+over x. Each via point p moves by d_p, which is shorter than the reach r. The penalty is zero if the
+arm is held, and its stiffness and moment arms meet the requirements of the check, in all but a few
+postures.
 """
 
 import shutil
@@ -45,8 +46,8 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
         seed: Random seed. The postures differ from the postures of a check with the same seed.
 
     Returns:
-        The change d [m] (P, 3), in the frames of the links, and the result of `lacking` before and
-        after the change.
+        The change d [m] (P, 3), in the frames of the links, and by how much the requirements are
+        missed before and after the change; 0 if they are met.
     """
     import cma
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read robot.urdf with pinocchio, after a check of every number in it.
+"""Read robot.urdf with pinocchio, after a check of its structure and its numbers (NUMBERS).
 
 The URDF parser silently ignores what it does not understand, so the file is checked here first. The
 parser only warns about a missing or malformed mass or inertia, and continues with a massless link.

@@ -127,8 +127,8 @@ def _capsules(robot: Robot) -> list[Solid]:
 def space(robot: Robot, solids: list[Solid]) -> Array:
     """Return points [m], (N, 3), between which the arm moves.
 
-    They are corners of the drawn solids and points of the muscles, in random postures within the
-    joint limits. In half of the postures, every joint is at a limit.
+    They are the corners of the solids' bounding boxes, the route points and the end effectors, in
+    random postures within the joint limits. In half of the postures, every joint is at a limit.
     """
     rng = np.random.default_rng(0)
     shares = rng.uniform(0.0, 1.0, (2 * POSTURES, robot.joint_count))
