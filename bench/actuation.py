@@ -38,7 +38,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held-out motion [s]
 TARGETS, HELD = 5, 4.0  # number of targets, and time for each of them [s]
-RUPTURES = 3
+RUPTURES = 3  # number of muscles that rupture, one after another
 MOVING = 4.0  # time for which the arm explores before a rupture [s]
 LATEST = 10.0  # longest time from a rupture to its isolation [s]
 #: kinds of muscle modules, each with the entries of muscles.yaml that describe it
@@ -103,7 +103,10 @@ def learn(
 
 
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
-    """Explore for a time [s]; return the mean error of the estimate [rad] and wrong isolations."""
+    """Explore for a time [s]; return the mean error of the estimate [rad], and its wrong results.
+
+    Wrong results are isolations, and a stop that lasts at the end.
+    """
     loop = IsolatingLoop(arm, mae, EXPLORATION_STREAM + 50 + seed)
     loop.run(1.0)
     loop.core.explore(True)

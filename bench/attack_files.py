@@ -84,7 +84,7 @@ def changed_tree(value: object, rng: random.Random) -> object:
 
 
 def bomb(rng: random.Random) -> str:
-    """Return YAML that expands to far more than its own size."""
+    """Return YAML that could take far more time or memory to read than its size suggests."""
     inner = rng.choice(['[{}]', '{{<<: [{}]}}'])
     lines = [f'a{i}: &a{i} ' + inner.format(', '.join([f'*a{i - 1}'] * 9)) for i in range(1, 30)]
     keys = '\n'.join(f'k{i}: {i}' for i in range(8000))

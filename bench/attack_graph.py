@@ -478,7 +478,10 @@ class Attack:
         self.start(name)
 
     def episode(self, messages: int, kills: int) -> None:
-        """Attack the moving arm with `messages` messages, in bursts and singly."""
+        """Attack the moving arm with `messages` messages, in bursts and singly, and kill nodes.
+
+        Some requests to services and some faults come in between. `kills` is the number of kills.
+        """
         if not self.moving():
             return
         topics, services = list(self.topics().items()), list(self.services().items())

@@ -115,7 +115,7 @@ class Scene:
         return mode in ('idle', 'holding', 'moving', 'torque', 'exploring')
 
     def follow_advice(self) -> None:
-        """Take all steps that the reports on /diagnostics advise, in order."""
+        """Restart silent nodes, and take all steps that the reports on /diagnostics advise."""
         attack = self.attack
         for name in attack.situation.silent_nodes():
             node = name.rpartition('/')[2]

@@ -5,7 +5,7 @@
 
 The constants of `emulator.individual.Spread` were set once, with seeds 0–9 of musashi_left_arm, and
 are never changed to improve a result. They meet two targets on the held-out motion (5 minutes at
-100 Hz; mean of ‖θ_est − θ_true‖ over all samples):
+100 Hz; mean of ‖θ_est − θ_true‖ over samples and individuals):
 
 - Before learning, preset `paper` has an error of 0.32–0.42 rad, as in the paper.
 - The oracle, least squares on the true body, has an error of 0.04–0.06 rad in motion.
@@ -45,7 +45,7 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT_SEED = 9001  # seed of the held-out motion, which no experiment learns from
-EVERY = 10  # every tenth message is evaluated
+EVERY = 10  # the length error is evaluated at every tenth message
 
 
 class Row(NamedTuple):

@@ -13,9 +13,9 @@ networks
     inside  the share of messages whose true angles lie in the 95 % confidence ellipsoid
     NEES    the mean of eᵀ Σ⁻¹ e / D, with the error e of D joints and the covariance Σ
 
-The last line shows the means over the individuals with their standard errors. With the right
-covariance, 0.95 of the messages lie inside and the NEES is 1. A NEES below 1 means that the
-covariance is too large.
+A last line for each emulator model shows the means over the individuals with their standard errors.
+With the right covariance, 0.95 of the messages lie inside and the NEES is 1. A NEES below 1 means
+that the covariance is too large.
 
 Without joint sensors, most of an individual's error is one constant offset, so nearly all of its
 motion lies inside or outside. Even if the covariance is right, the mean share over ten individuals

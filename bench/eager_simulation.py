@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulator's step of preset `default` in plain eager torch, for comparison.
 
-It solves the equations of `simulation.equilibrium`, which explains them, for N arms in single
-precision. Autograd computes the gradient of the network; the mechanics are batched tensors.
+It solves the equations of `simulation.equilibrium`, which explains them, for N arms under muscle
+stiffness control, in single precision. Autograd computes the gradient of the network; the mechanics
+are batched tensors.
 """
 
 from itertools import combinations_with_replacement
@@ -181,7 +182,7 @@ class EagerSimulation:
         return jacobian, curvature
 
     def _turn(self, theta: Tensor, push: Tensor, matrix: Tensor, h: float) -> tuple[Tensor, Tensor]:
-        """Return θ after a step, and a mask of joints held by a limit or a hand, both (N, D)."""
+        """Return θ after a step, and a mask of joints at a limit or forced to an angle, (N, D)."""
         low, high, most, fixed = self.body.lower, self.body.upper, JOINT_SPEED * h, self.fixed
         forced = torch.isfinite(fixed)
         held = forced | ((theta <= low) & (push < 0.0)) | ((theta >= high) & (push > 0.0))

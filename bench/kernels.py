@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the tests with the arithmetic of other processors: all BLAS and torch kernels.
+"""Runs the tests with the arithmetic of other processors: several BLAS and torch kernels.
 
 Other processors select other kernels, which sum in another order. No test may depend on the last
 bits. Tests must therefore pass with each combination of kernels that this processor can run.

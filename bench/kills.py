@@ -123,7 +123,7 @@ class Child:
 
 
 def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> list[str]:
-    """Kill `kills` children one after another; return descriptions of the losses."""
+    """Kill `kills` children one after another, check with one more; return what was lost."""
     rng = np.random.default_rng(seed)
     # All stores that may be on disk: the kill may come after a sample was saved and before the
     # child has reported it.

@@ -98,7 +98,8 @@ def errors(robot: Robot, mae: Mae, reading: Reading, motion: Recording) -> tuple
 def main(argv: list[str] | None = None) -> int:
     """Print the table; exit status 1 if the folder lacks a network."""
     parser = Parser('paper_readings', "Compares interpretations of the paper's simulation.")
-    parser.add_argument('folder', type=Path, help='folder of experiment online_learning --keep')
+    text = 'folder that `experiment online_learning --keep FOLDER` has written'
+    parser.add_argument('folder', type=Path, help=text)
     parser.add_robot()
     parser.add_seeds((0, 1))
     parser.add_argument('--seconds', type=positive, default=60.0, help='duration of the motion [s]')

@@ -6,8 +6,9 @@ python -m bench platforms wheels-3.13 sourced      # some
 python -m bench platforms --node wheels-3.12       # without torch: the core and one node
 python -m bench platforms rclpy-7.1.11             # needs git access to GitHub, and a C++ compiler
 
-Each platform has a clean clone of the committed state in a separate folder, where ./bringup.sh
-installs the dependencies. The clone is deleted when its platform has passed.
+Without --node, each platform has a clean clone of the committed state, where ./bringup.sh installs
+the dependencies. With --node, the sources of this folder run in a virtual environment of the
+platform. The folder of a platform is deleted when the platform has passed.
 """
 
 import argparse

@@ -8,9 +8,9 @@ DIR has one clone for each repository of `recordings_read.repositories`, named O
 given, and left out otherwise. Nothing of the data is kept. The results are result.json and
 tables.md, which `python doc/make.py` writes into doc/results.md.
 
-Every model is trained on the training rests only, and tested on all rows of other runs (neck),
-files (arm) or poses (stand). All constants are in `recordings_learn`; none was
-chosen by an error on test rows.
+Every model is trained on the training rests, and tested on all rows of other runs (neck), files
+(arm) or poses (stand). For neck and arm, polynomials are also fitted to all rows of the training
+runs. All constants are in `recordings_learn`; none was chosen by an error on test rows.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models that estimate θ in recordings: that of this package, and others to compare it with.
 
-Every model is trained on rest samples and maps lengths (and efforts) to θ.
+Every model maps lengths (and efforts) to θ. All are trained on rest samples; `polynomial` may also
+receive all rows of a run.
 """
 
 from __future__ import annotations
@@ -206,7 +207,7 @@ def bend_gain(run: Run, azimuths: Array) -> float:
 
 
 def effort_slope(run: Run, azimuths: Array) -> float:
-    """Return by how much the efforts at rest rise per tendon length commanded to bend it [m]."""
+    """Return how much the efforts at rest rise per tendon length commanded to bend the link [m]."""
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound, effort = -rest.length @ out, rest.effort @ out

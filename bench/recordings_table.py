@@ -53,7 +53,7 @@ def table(results: list[Result]) -> str:
 
 
 def tables(document: dict[str, Any]) -> str:
-    """Return the tables of a recordings.json as Markdown."""
+    """Return the tables of a result.json of `bench recordings` as Markdown."""
     results = [Result(**row) for row in document['errors']]
     parts = []
     for repository in repositories():

@@ -55,7 +55,7 @@ class Row(NamedTuple):
 
 
 class Timed(NamedTuple):
-    """Times of one call [µs]; 0 if there is none."""
+    """Times of one call [µs]; 0 if there is no implementation in torch, or no bound."""
 
     name: str
     ours: float

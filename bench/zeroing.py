@@ -45,8 +45,10 @@ HELD_OUT = 300.0  # duration of the held-out motion [s]
 AFTER = 30.0  # duration of the motion after a calibration [s]
 LONGEST = 120.0  # longest duration of a calibration [s]
 SETTLING = 20.0  # time until the arm hangs still [s]
-#: error of the posture that is stated to the calibration [rad], the same for each joint
+#: standard deviation of the error of the posture that is stated to the calibration [rad], the same
+#: for each joint
 STATED = 0.0
+#: largest legal time of a calibration [s], and ratio of the errors after and before it
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 
 

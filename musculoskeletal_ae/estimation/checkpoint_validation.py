@@ -21,8 +21,8 @@ switched off. A muscle that was repaired within the last RELEARNING_TIME seconds
 and its residuals then differ from the calibrated ones. The inherited detector ignores this
 muscle and judges all others, until a network with a calibrated detector of its own takes over.
 
-When an anomaly is detected, networks that have been in use for less than PROOF seconds are
-discarded, and the newest network that has been in use for longer takes over again.
+When an anomaly is detected, networks that took over less than PROOF seconds ago are discarded,
+except for the oldest one, and the newest of the remaining networks takes over again.
 """
 
 from collections import deque
@@ -139,7 +139,7 @@ class CheckpointValidator:
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
         if len(self._used) > MOST_USED:
-            del self._used[1]  # the first one is proven and stays
+            del self._used[1]  # the oldest one stays, because it is the most likely to be proven
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
         """Record whether an anomaly is detected, and roll back a network that is not proven.
@@ -164,7 +164,10 @@ class CheckpointValidator:
         return message_errors.message_errors(mae, self._messages, self.isolated)
 
     def agreement(self, mae: Mae) -> list[Comparison]:
-        """Return the comparisons of a network with the one in use; [] if none is in use."""
+        """Return the comparisons of a network with joint sensors or with the network in use.
+
+        The result is [] if no network is in use.
+        """
         if self.mae is None:
             return []
         in_use = self.mae.without(self.isolated)
@@ -172,7 +175,10 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def detector_measures(self, mae: Mae) -> Iterator[float]:
-        """Yield d / threshold on the recent messages, then with each muscle ruptured in turn."""
+        """Yield the measures of a network's detector, see `validation/detector.py`.
+
+        The first one is that on the recent messages; then each muscle is ruptured in turn.
+        """
         return detector.measures(mae, self._messages, self.isolated)
 
     def with_detector(self, mae: Mae, now: float) -> Mae:

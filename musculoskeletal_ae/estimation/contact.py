@@ -5,13 +5,13 @@
     F     = argmin Σ_j ((JᵀF − τ_ext)_j / σ_j)² + ‖F‖²/F₀²,   without a moment at the hand
     d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > CONTACT in IN_A_ROW consecutive messages
 
-M is the inertia matrix, h contains the torques due to velocity and weight, and s is the direction
-in which a tendon slid last (`signals/friction.py`). θ and Gᵀ T_end pass through the same
-second-order low-pass filter, which also gives θ̇ and θ̈. The result is the residual of the momentum
-observer (De Luca 2005) without numerical differentiation of noise. Tendon friction μ has to be
-known: unknown friction hides a contact force of 10 N. σ is the residual torque of the healthy
-moving arm (`estimation/healthy_torque.py`). The term with F₀ keeps those components of F small that
-produce no joint torque, such as the component along a stretched arm.
+M is the inertia matrix. h contains the torques due to velocity and weight, and those of the joints'
+springs and dampers. s is the direction in which a tendon slid last (`signals/friction.py`). θ and
+Gᵀ T_end pass through the same second-order low-pass filter, which also gives θ̇ and θ̈. The result
+is the residual of the momentum observer (De Luca 2005) without numerical differentiation of noise.
+Tendon friction μ has to be known: unknown friction hides a contact force of 10 N. σ is the residual
+torque of the healthy moving arm (`estimation/healthy_torque.py`). The term with F₀ keeps those
+components of F small that produce no joint torque, such as the component along a stretched arm.
 
 At a joint limit, the unknown torque of the stop is added to τ_ext. A computed torque that points
 away from the stop may be due to the stop alone and therefore counts as 0. If the computed torque
@@ -50,7 +50,8 @@ class Contact(NamedTuple):
         torque: τ_ext [N·m], (D,); 0 where a stop may be its only cause.
         force: Function that returns F [N], (3,), acting on the origin of the end effector, in the
             axes of the root link. It is a function, because few callers need the force.
-        distance: d; NaN if the residual torque of the healthy arm has not been calibrated.
+        distance: d; NaN if the residual torque of the healthy arm has not been calibrated, or if a
+            reading is not finite.
         is_contact: Whether there is contact.
     """
 
@@ -111,12 +112,12 @@ class ContactEstimator:
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Use another network, with its tendon friction and its residual torque σ."""
+        """Use another network, with its joint springs, its dampers and its residual torque σ."""
         joint_count, healthy = self._robot.joint_count, mae.touch
         self._robot = self._robot.with_elasticity(mae.elasticity)
         self._mae = mae
         self._evaluated_at = np.full(joint_count, np.inf)  # θ at which G was evaluated last
-        self._weight = np.ones(joint_count)  # 1/σ², (D,)
+        self._weight = np.ones(joint_count)  # 1/σ², (D,); 1 without a calibrated σ
         self.is_calibrated = healthy is not None and healthy.calibrated
         if healthy is not None and self.is_calibrated:
             self._weight = 1.0 / healthy.spread**2

@@ -65,7 +65,8 @@ class Output(NamedTuple):
         covariance: Covariance of θ [rad²], (D, D), or None.
         anomaly: A, in scaled units.
         detected: Whether this message latches a finding.
-        contact: External load; None while the length offsets are unknown.
+        contact: External load; None while the length offsets are unknown, and on a robot whose
+            tensions are unknown.
     """
 
     sample: MuscleSample
@@ -95,8 +96,9 @@ class Estimator:
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
         measured: θ from joint sensors [rad], (D,), at the last message with an estimate; None
-            unless all joint sensors reported a value.
-        stepped_at: Time of the last message with an estimate, on the steady clock [s].
+            unless all joint sensors reported a value within the JOINTS_AGE seconds before it.
+        stepped_at: Time of the last accepted message since there is a network, on the steady
+            clock [s].
     """
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:
@@ -190,7 +192,8 @@ class Estimator:
             posture: θ in which the arm stands [rad], (D,); () if it moves gently.
 
         Raises:
-            MusculoskeletalError: If there is no network, or the posture is not valid.
+            MusculoskeletalError: If there is no network, if the posture is not valid, or if it is
+                missing on a robot whose tensions are unknown.
         """
         if self.mae is None:
             raise MusculoskeletalError(

@@ -47,10 +47,10 @@ _REMEDIES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of one muscle.
+    """A fault, and the muscle that it is attributed to.
 
     Attributes:
-        muscle: Index of the muscle.
+        muscle: Index of the muscle; one of those affected if the fault is not that of one muscle.
         kind: Kind of the fault.
         evidence: The evidence as a text for users.
     """
@@ -72,11 +72,12 @@ class Observation:
     Attributes:
         sample: The readings.
         estimate: The network's estimate.
-        demand: T commanded to the muscle modules [N], (M,); None without a command.
+        demand: T that the newest command demands of the muscle modules [N], (M,); None without a
+            command, and for position-controlled modules.
         dt: Time since the previous message [s]; the caller limits it after a pause.
         lengths_known: Whether the length offsets are known.
         measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
-        command: l_target of the muscle modules [m], (M,); None without a command.
+        command: l_target of the muscle modules [m], (M,); None without a length command.
     """
 
     sample: MuscleSample
@@ -129,10 +130,10 @@ def observe(
 
 
 class Detector:
-    """Base class of the detectors. Each detects one kind of fault; `SuspectHandling` latches it.
+    """Base class of the detectors, each of which looks for one sign of a fault.
 
-    A new detector overrides `step` or `read`, and other methods as needed. To use it, add it to the
-    list in `HealthMonitor`.
+    `SuspectHandling` latches what they find. A new detector overrides `step` or `read`, and other
+    methods as needed. To use it, add it to the list in `HealthMonitor`.
     """
 
     def use(self, mae: Mae) -> None:

@@ -41,7 +41,8 @@ class HealthyTorque:
     def use(self, mae: Mae) -> Mae:
         """Use another network, and return it.
 
-        If it has a calibrated body model, the returned copy contains the measured σ.
+        If it contains a σ, the returned copy contains the measured one instead. Until the arm has
+        moved, the σ of the network is kept.
         """
         if (known := mae.touch) is None:
             self._mae = mae

@@ -21,7 +21,7 @@ from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
 ENOUGH_WITH_ANGLES = 20.0  # required duration of gentle motion with measured joint angles [s]
 ENOUGH = 38.0  # required duration of gentle motion without measured joint angles [s]
 STANDING = 1.0  # required duration of standing in a stated posture [s]
-FIRST_FIT = 0.5  # time until the first fit [s]
+FIRST_FIT = 0.5  # time until the first fit, and between fits of an arm that stands [s]
 FIT_INTERVAL = 2.0  # time between two later fits [s]
 #: A fit consists of short pieces of work, each of which takes 1 to 2 ms. One piece is done per this
 #: time between messages [s], so that a fit takes equally long at any rate of the messages.
@@ -196,8 +196,8 @@ def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
         posture: θ [rad], (D,); () means no posture and is legal.
 
     Raises:
-        MusculoskeletalError: If the posture is outside the joint limits; the text names the legal
-            ranges.
+        MusculoskeletalError: If the posture has not one value for each joint, or is outside the
+            joint limits; the text names the legal ranges.
     """
     if not posture:
         return

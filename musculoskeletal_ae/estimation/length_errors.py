@@ -153,7 +153,10 @@ class LengthErrors:
         return theta
 
     def given(self, now: Prediction, taut: Prediction, muscle: int) -> Prediction:
-        """Return the prediction with the error that one muscle had while it was taut removed.
+        """Correct the prediction for one muscle by the error that it had while it was taut.
+
+        The correction is smaller the further the arm has moved from the posture at that time. The
+        variance decreases accordingly.
 
         Args:
             now: The prediction to correct.

@@ -76,7 +76,8 @@ class Fit(NamedTuple):
     """A fit to K moments.
 
     Attributes:
-        cost: Negative logarithm of the posterior, up to a constant.
+        cost: −2 times the logarithm of the posterior, up to a constant; 0 if the joint angles were
+            measured.
         constants: o [m], μ of the tendons, offsets of the tension sensors [N], Coulomb torques of
             the joints [N·m], (3M + D,).
         theta: Postures [rad], (K, D).

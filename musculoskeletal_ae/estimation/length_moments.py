@@ -2,8 +2,9 @@
 """Collects the readings for a length calibration: means over short windows, called moments.
 
 Tendon friction changes its sign with the direction of motion. The moments therefore have to cover
-many postures, reached from different sides. A moment counts only if the arm has moved since the
-previous one.
+many postures, reached from different sides. A moment of a moving arm counts only if the arm has
+moved since the previous one, but not so fast that inertial forces matter. The moments of an arm
+that stands in a stated posture count until it moves.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class Moments(NamedTuple):
         sliding: Direction s in which each tendon slid last, (K, M): 1 when wound in, −1 when paid
             out.
         read: Raw l of all muscles, including isolated ones [m], (K, M).
-        theta: Measured θ [rad], NaN where it was not measured, (K, D).
+        theta: Measured or stated θ [rad], NaN where it is unknown, (K, D).
     """
 
     tension: Array

@@ -20,7 +20,9 @@ UNKNOWN_TENSION = 'unknown: tension_source is none'
 ISOLATION = 'isolated muscles with faults'
 CALIBRATION = 'calibration'  # key of what a length calibration needs, one of the next two
 GENTLE_MOTION, STANDING = 'gentle_motion', 'standing'
-SILENCE = 1.0  # time without a message after which the status is a warning [s]
+#: time without a message after which the status is a warning, and after which the filter of the
+#: contact estimator starts again [s]
+SILENCE = 1.0
 
 
 def report(core: Estimator, now: float) -> Report:

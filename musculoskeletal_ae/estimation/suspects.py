@@ -22,8 +22,9 @@ differ:
                             a verification, because a sensor without numbers is faulty
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
     lengths_disagree        are revoked, and the finding stays latched until the next length
-                            calibration. The same applies to a `length_jump` of a muscle that is
-                            not isolated.
+                            calibration, or until a reset while joint sensors agree with the
+                            lengths. The same applies to a `length_jump` of a muscle that is not
+                            isolated.
     joint_sensors_disagree  concerns no muscle, so none is isolated
 """
 
@@ -43,7 +44,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
-#: kinds of findings that no single muscle can cause
+#: kinds of findings after which no muscle is isolated, because the named one may be healthy
 OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
 
 
@@ -54,7 +55,8 @@ class SuspectHandling:
         settings: Settings with `on_anomaly`.
         finding: The latched finding, or None.
         verification: The running verification of the suspect, or None.
-        last_verdict: Index of the last verified suspect, and its verdict.
+        last_verdict: Index of the last verified suspect, or of a muscle isolated without a
+            verification, and its verdict; None before the first.
         faults: Verdicts on the isolated muscles that turned out to be faulty, by index.
     """
 

@@ -30,8 +30,8 @@ Under muscle stiffness control, the first row that applies decides:
     l does not change at all                     length_sensor_frozen
     T near zero, and l' − l > FAR or growing     ruptured: the winch winds in the rest of the tendon
     T does not change at all                     tension_sensor_frozen
-    |l − l'| > FAR                               length_sensor_offset
-    l stays, and T does not rise with T_ref      jammed
+    T not near zero, and |l − l'| > FAR          length_sensor_offset
+    l stays, and T near zero or not rising       jammed
     T near zero otherwise                        tension_sensor_frozen
     T follows T_ref                              healthy
     otherwise                                    jammed
@@ -58,7 +58,9 @@ RUPTURE_CHANGE = 0.005  # decrease of l − l' when the rest of a ruptured tendo
 #: T_bias for which CLOSE and JAM_EXCESS apply [N]; for a lower T_bias, they are scaled down
 USUAL_BIAS = 30.0
 CLOSE = 8.0  # absolute tolerance of the difference between T and T_ref [N]
-SHARE = 0.35  # tolerance of the difference between T and T_ref, relative to T_ref − T_bias
+#: tolerance of the difference between T and T_ref, relative to T_ref − T_bias; also the smallest
+#: rise of T that counts as rising, relative to the rise of T_ref
+SHARE = 0.35
 JAM_EXCESS = 20.0  # T − T_ref above which a suspect that was not wound in is jammed [N]
 STRETCHED = 1.5  # stretch at which a healthy tendon has tension, relative to the stretch at T_bias
 LONGEST_WINDING = 2.5  # longest duration of winding in a slack tendon [s]
@@ -136,7 +138,10 @@ class ModuleLaw:
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return the stretch x [m]; used by position-controlled modules only."""
+        """Return l' − l [m]; only the verdict on position-controlled modules uses the stretch x.
+
+        `PositionLaw` overrides this method.
+        """
         return row.likely - row.length
 
     def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002

@@ -161,9 +161,10 @@ def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
 
 
 def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Array:
-    """Push the moving arm N times; return the sizes of the forces [N] and the delays of detection.
+    """Push the moving arm up to `count` times; return the forces and the delays of detection.
 
-    The rows of the result (2, N) are the forces [N] and the delays [s].
+    The rows of the result (2, N) are the sizes of the forces [N] and the delays [s]. A delay of
+    MOVED means that the collision was not detected.
     """
     robot, collisions = loop.arm.robot, list[tuple[float, float]]()
     for _ in range(TRIES_PER_COLLISION * count):

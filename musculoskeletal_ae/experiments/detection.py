@@ -223,10 +223,12 @@ def anomaly_levels(
     healthy_outputs: Mapping[str, DetectorOutput],
     fault: str,
 ) -> dict[str, Any]:
-    """Return the largest A and d of healthy messages, and the smallest levels of ruptures.
+    """Return measures of A and d on healthy messages and in ruptures, before and after learning.
 
-    The level of a rupture is the median over the messages from rupture to mending. The levels have
-    the order of `plan.muscles`. `fault` is the name of the fault in the keys.
+    The measures are the largest and the median value of healthy messages, the level of each rupture
+    and the smallest of them, and the AUROC. The level of a rupture is the median over the messages
+    of `GraspAndRupture.while_ruptured`. The levels have the order of `plan.muscles`. `fault` is the
+    name of the fault in the keys.
     """
     numbers: dict[str, Any] = {}
     for when, prefix in (('before', '_before'), ('after', '')):

@@ -5,8 +5,9 @@
 
 With the true routes and elastic constants, this is the oracle: a reference that estimators without
 further knowledge can hardly beat. The oracle takes friction as zero and does not know the offsets
-of the sensors. With the geometric model, this is the classical estimator without learning. With the
-calibrated body of a learner, its error shows which part of the network's error is due to the body.
+and gains of the sensors. With the geometric model, this is the classical estimator without
+learning. With the calibrated body of a learner, its error shows which part of the network's error
+is due to the body.
 """
 
 from collections.abc import Callable
@@ -109,7 +110,8 @@ def oracle_errors(arm: Arm, seed: int, recording: Recording) -> dict[str, float]
     """Return the errors of the oracle on messages of an arm [rad].
 
     `oracle_rad` uses the recorded messages. `sensor_rad` uses messages that are recomputed without
-    friction, so that only noise and offsets of the sensors act.
+    friction, so that only the errors of the sensors act: noise, offsets, and gains of the tension
+    sensors.
     """
     body, part = arm.individual, recording.part(EVERY)
     estimator = oracle(arm.robot, body)

@@ -6,12 +6,12 @@ forced to 30°.
 
 Here. The elbow is flexed to 90°. A force of −50 N in z acts on the hand, then one of 50 N in y.
 Then the shoulder is forced to 30° and released. Each preset runs its own simulator on its networks
-before and after learning; with preset `paper`, L_sim,1 is minimised in the first three phases and
-L_sim,2 while the shoulder is forced. Each preset's `proposed` computes the command that holds the
-posture, with its learned network. The same forces act on an emulated arm with the same command.
-Its joints cannot be forced, so only the simulator runs the last two phases. On robots without
-elbow_pitch and shoulder_pitch, joints named elbow and shoulder take their roles, or else the last
-and the first joint.
+before and after learning; preset `paper` minimises L_sim,2 while the shoulder is forced, and
+L_sim,1 in all other phases. Each preset's `proposed` computes the command that holds the posture,
+with its learned network. The same forces act on an emulated arm with the same command. Its joints
+cannot be forced, so it is compared in the first three phases only. On robots without elbow_pitch
+and shoulder_pitch, joints named elbow and shoulder take their roles, or else the last and the first
+revolute joint.
 """
 
 from collections.abc import Mapping
@@ -60,7 +60,7 @@ PHASES = (
     Phase('released', 3.0),
 )
 SETTLING = Phase('settling', 5.0)  # the emulated arm comes to rest before the experiment
-SHARED = PHASES[:3]  # phases that the emulated arm goes through as well
+SHARED = PHASES[:3]  # phases in which the simulator is compared with the emulated arm
 #: index of the last step of each phase
 ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1
 
@@ -116,7 +116,10 @@ def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
 
 
 def _command(robot: Robot, mae: Mae, theta: Array, preset: str) -> Array:
-    """Return the length command [m] (M,) by which `proposed` of a preset holds θ [rad] (D,)."""
+    """Return the length command [m] (M,) by which `proposed` of a preset holds θ [rad] (D,).
+
+    If a muscle has no range of tensions, the command is that for T_bias on the geometric model.
+    """
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
         return robot.muscle_lengths(theta, np.full(robot.muscle_count, robot.tension.bias))

@@ -69,7 +69,8 @@ def _work_folder(args: Namespace) -> Iterator[Path]:
     """Yield the folder of networks and recordings: that of `--keep`, or a temporary one.
 
     Raises:
-        MusculoskeletalError: If the kept folder belongs to a run with other options.
+        MusculoskeletalError: If the kept folder belongs to a run with other options, or contains
+            files but no options of a run.
     """
     if args.keep is None:
         with tempfile.TemporaryDirectory(prefix='experiment_') as folder:

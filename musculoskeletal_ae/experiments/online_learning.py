@@ -11,9 +11,9 @@ Preset `paper` moves to random postures. The default preset puts a quarter of th
 their limits, where stops reveal the offsets of the joint sensors. "Same stream" is preset `paper`
 trained on the messages of the default preset’s exploration. All are evaluated on one held-out
 motion, a fixed list of commands to random postures from a random stream that is never used for
-learning. The error is the mean of ‖θ_est − θ_true‖ over all joints and all messages at 100 Hz, in
-motion and at rest, with the true joint angles of the emulator. Oracle: weighted least squares on
-one message with the true routes, elastic constants and noise; friction is taken as zero.
+learning. The error is ‖θ_est − θ_true‖, the 2-norm over all joints, averaged over all messages at
+100 Hz, in motion and at rest, with the true joint angles of the emulator. Oracle: weighted least
+squares on one message with the true routes, elastic constants and noise; friction is taken as zero.
 """
 
 import json

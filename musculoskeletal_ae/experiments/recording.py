@@ -148,8 +148,8 @@ def record(
     Every command is computed by method `first`. Method `second` would need the current tension,
     which a fixed list cannot contain. The step of `second` is therefore replaced by `first` with
     the least tension that holds the posture on the geometric model. While a muscle is switched off,
-    all modules follow tensions: 0 N for this muscle, and the tensions of MSC for all other muscles.
-    A position-controlled module is paid out instead.
+    all modules follow tensions: 0 N for this muscle, and those of muscle stiffness control for all
+    other muscles. A position-controlled module is paid out instead.
 
     Args:
         arm: The arm.

@@ -6,14 +6,14 @@ successor of the method (arXiv 2409.14951) continues without a ruptured muscle.
 
 Here. The held-out motion is estimated with all muscles, without each muscle and without each pair
 of muscles. Then the arm explores in closed loop through estimator and controller, with `on_anomaly:
-isolate`, until a muscle ruptures. An isolation is correct if exactly this muscle is isolated as
-broken within 10 s. Afterwards, `proposed` moves the arm to random postures that the true body can
-hold without the muscle, for at most a minute each. Every muscle is ruptured in turn. In the same
-way, every length sensor and every tension sensor fails in turn: it reads 0. The error of the
-estimate is averaged from the isolation on, or from the fault if nothing is isolated. Finally,
-healthy arms explore for five hours, shared by the individuals. They grasp or release 3.6 kg each
-minute, and a force of 10 to 30 N acts on the hand for one of every ten seconds. Every isolation of
-these hours is wrong.
+isolate`, until a muscle ruptures. An isolation is correct if the first verification ends within 16
+s and leaves exactly this muscle isolated. Afterwards, `proposed` moves the arm to random postures
+that the true body can hold without the muscle, for at most a minute each. Every muscle is ruptured
+in turn. In the same way, every length sensor and every tension sensor fails in turn: it reads 0.
+The error of the estimate is averaged from the isolation on, or from the fault if nothing is
+isolated. Finally, healthy arms explore for five hours, shared by the individuals. They grasp or
+release 3.6 kg each minute, and a force of 10 to 30 N acts on the hand for one of every ten seconds.
+Every isolation of these hours is wrong.
 
 - held: share of the holdable postures that remain holdable without the muscle; if there are none,
   the muscle has no targets, but its other numbers count
@@ -49,8 +49,8 @@ EVERY = 10  # every tenth message of the held-out motion is evaluated
 TARGETS = 2  # number of targets that the arm approaches without each muscle
 QUICK_TARGETS = 1  # this number in a shortened run
 MOVING = 12.0  # duration of healthy motion before a fault [s]
-LATEST_VERDICT = 10  # longest time from a fault to its isolation [s]
-AFTERWARDS = 6.0  # duration of the motion after an isolation [s]
+LATEST_VERDICT = 10  # longest wait for the end of the first verification after a fault [s]
+AFTERWARDS = 6.0  # duration of the motion after this wait [s]
 #: longest time to a target [s]; winches slow the motion, and a fallen arm is sent again
 LONGEST_APPROACH = 60
 SETTLING = 4  # after this time at rest, the arm has arrived [s]

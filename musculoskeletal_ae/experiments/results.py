@@ -47,7 +47,8 @@ def write(
 ) -> list[Path]:
     """Write result.json and the plots of every experiment to a folder; return the files.
 
-    A shortened run writes its plots only as PNG.
+    Plots are written as PNG and, except in a shortened run, also as PDF. The PDF files are not
+    among the returned ones.
 
     Raises:
         MusculoskeletalError: If a number is not finite.
@@ -338,7 +339,7 @@ def _page(folder: Path, results: Results) -> str:
 
 
 def flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
-    """Return the numbers of nested mappings in one mapping, by dotted path."""
+    """Return the values of nested mappings in one mapping, by dotted path."""
     rows: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):

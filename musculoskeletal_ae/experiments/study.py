@@ -129,13 +129,13 @@ class Study:
 class Measured(NamedTuple):
     """The results of an experiment for one individual."""
 
-    #: contents of result.json: nested dictionaries of finite numbers, text or lists
+    #: contents of result.json: nested dictionaries of finite numbers, text, lists or None
     numbers: dict[str, Any]
     traces: dict[str, Any]  # data of the plots
 
 
 def round_numbers(value: Any, path: str = '') -> Any:
-    """Return a value with its floats rounded to `DIGITS` digits, ready for JSON.
+    """Return a value with its floats rounded to `DIGITS` significant digits, ready for JSON.
 
     Args:
         value: A number, a text, or nested dictionaries and lists of them.

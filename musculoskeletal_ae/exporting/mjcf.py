@@ -40,7 +40,8 @@ THIN = 0.008  # radius of the capsules that draw bones [m]
 TIMESTEP = 0.002  # time step of the exported model [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
-moment arm  root mean square difference of dl/dq over all joints, and the size of dl/dq
+moment arm  difference of dl/dq (norm over all joints, root mean square over the postures), and the
+            size of dl/dq, in the same way
 spring      largest error of the linear spring between T_bias and T_limit
 offset      control = l + offset, where l is the length in muscle_states
 Torques of weight and springs are those of the robot directory, unless the springs were learned.
@@ -50,12 +51,18 @@ the elastic elements, friction proportional to tension, creep, sensor errors and
 
 
 class Report(NamedTuple):
-    """Differences between an exported model and the network, over the workspace."""
+    """Differences between an exported model and the network, over the workspace.
+
+    Only the torque is compared with that of the robot description, with the learned springs.
+    """
 
     lengths: Array  # standard deviation of each muscle's length error at T_mid [m], (M,)
-    arms: Array  # root mean square error of each muscle's moment arms [m], (M,)
-    arm_size: Array  # root mean square of the network's moment arms [m], (M,)
-    torque: Array  # largest difference of the torque that holds the weight [N·m], (D,)
+    #: error of each muscle's moment arms: norm over the joints, root mean square over the postures
+    #: [m], (M,)
+    arms: Array
+    arm_size: Array  # size of the network's moment arms, computed in the same way [m], (M,)
+    #: largest difference of the torque that holds the weight against the springs [N·m], (D,)
+    torque: Array
     stretch: Array  # largest error of the linear spring within [T_bias, T_limit] [m], (M,)
     warnings: tuple[str, ...]  # warnings of MuJoCo about the model
     mjx: str  # text that says whether MJX can load the model

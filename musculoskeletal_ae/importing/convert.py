@@ -62,7 +62,7 @@ def read_source(file: Path) -> Source:
     Raises:
         SourceError: If the file is not valid; the message names the file, the problem and the legal
             values.
-        RobotDescriptionError: If a URDF is not valid.
+        RobotDescriptionError: If the file cannot be read as XML, or if a URDF is not valid.
     """
     text = read_text(file, refuse, LARGEST)
     # Look for OpenSim before parsing, because some of its tags are not valid XML.

@@ -124,6 +124,7 @@ def tie_rims(model: Any) -> list[tuple[int, int]]:
 def far_end(model: Any, data: Any, body: int) -> Array | None:
     """Return the point of a body's geometry that is farthest from the body's last joint.
 
+    Without a joint, it is the point that is farthest from the origin of the body.
     Geoms that tendons wrap around count only if the body has no other geoms.
 
     Returns:
@@ -416,7 +417,7 @@ class _Reader:
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)
 
     def _tie_rims(self) -> None:
-        """Call `tie_rims` on the model, and add a note for each site that it attached to a rim."""
+        """Call `tie_rims` on the model, and add a note for each site on a rim."""
         for tendon, geom in tie_rims(self.model):
             body = self.names['body'][self.model.geom_bodyid[geom]]
             site = (

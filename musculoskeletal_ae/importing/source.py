@@ -26,7 +26,10 @@ ARM_POSTURES = 200  # number of postures in which moment arms are compared
 TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad] or [m]
 SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
 LISTED = 12  # largest number of names in a message
-STRENGTH = 'tension.limit is the largest tension in the source, bias 0.1 and max 1.5 times that'
+STRENGTH = (
+    'tension.limit is the largest tension in the source, max 1.5 times that, and bias 0.1 times '
+    'that, but at most 30 N'
+)
 EARTH = 9.81  # gravity of the earth [m/s²]
 #: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
@@ -277,8 +280,8 @@ def cut(
 ) -> None:
     """Reduce the source in place to the links that descend from the base, and to some joints.
 
-    The remaining joints are held fixed, with a note. All other links are removed, with their
-    muscles. Muscles that move no joint are removed as well.
+    All other joints are held fixed, with a note. All other links are removed, with their muscles.
+    Muscles that move no joint are removed as well.
 
     Args:
         source: The source.
@@ -289,6 +292,9 @@ def cut(
         base: The new root link; by default the present one.
         end: The end effector, a link or a point; by default it is chosen, with a note, and holds
             no joint fixed.
+
+    Raises:
+        SourceError: If a name is unknown or cannot be kept, or if no movable joint remains.
     """
     model, links = source.model, source.links
     if base and base not in links:
@@ -501,7 +507,7 @@ def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
 
 
 class Comparison(NamedTuple):
-    """Differences between an imported robot and the source's own engine, by muscle."""
+    """Differences between the lengths of an imported robot and those of its source, by muscle."""
 
     lengths: dict[str, float]  # largest error [m]
     arms: dict[str, float]  # largest error of a moment arm [m]; at prismatic joints, [m/m]
@@ -512,8 +518,9 @@ class Comparison(NamedTuple):
 def compare(source: Source, robot: Robot) -> Comparison | None:
     """Compare lengths in POSTURES and moment arms in ARM_POSTURES postures.
 
-    The source's moment arms are numerical derivatives of its lengths, independent of this package.
-    The result is None if the source computes no lengths.
+    The source's moment arms are numerical derivatives of its lengths. MuJoCo computes the lengths
+    of an MJCF file, and `cardsflow` those of straight routes on the URDF itself. The result is None
+    if the source computes no lengths.
     """
     if source.lengths is None:
         return None

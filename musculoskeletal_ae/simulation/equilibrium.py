@@ -14,12 +14,12 @@ and T. This root is no closer to the rest posture of the body, and each step cos
 
 The arm approaches the root against a viscous resistance B, by linearly implicit Euler steps. These
 are Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and
-geared muscle modules, which makes speeds realistic. It includes the dampers of the joints, and is
-larger where muscles have larger moment arms. B does not affect the rest posture. K and b describe
-the springs of the joints (`JointElasticity`): the values that the network has learned, or else
-those of the robot description. A joint limit is a hard stop that exerts any torque needed. Tendon
-friction (`friction`) does affect the rest posture: the arm rests in different postures after
-tendons have been wound in and after they have been paid out.
+geared muscle modules, which makes speeds realistic. It includes the dampers in the robot
+description, and is larger where muscles have larger moment arms. B does not affect the rest
+posture. K and b describe the springs of the joints (`JointElasticity`): the values that the network
+has learned, or else those of the robot description. A joint limit is a hard stop that exerts any
+torque needed. Tendon friction (`friction`) does affect the rest posture: the arm rests in different
+postures after tendons have been wound in and after they have been paid out.
 """
 
 import math
@@ -43,8 +43,8 @@ from musculoskeletal_ae.simulation.load import Load, Tree, hold
 PAID_OUT = np.inf
 #: K_stiff of position-controlled modules [N/m]; 400 N move such a module by a millimetre
 RIGID = 4e5
-#: B divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on the emulated arm;
-#: values from 8 to 20 do equally well.
+#: B without the dampers, divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on
+#: the emulated arm; values from 8 to 20 do equally well.
 VISCOSITY = 12.0
 JACOBIAN_POSTURES = 100  # number of postures over which |∂l_i/∂θ| is averaged
 LEAST_VISCOSITY = 0.1  # smallest B, such as that of a joint that no muscle crosses [N·m·s/rad]

@@ -32,7 +32,9 @@ LONGEST_STEP = 0.01  # longest step [s]; longer times are divided into several s
 CHUNK = 384  # number of arms in a call of the compiled code; their arrays fit into a core's cache
 SETTLING_STEP = 0.1  # duration of a step of `settle` [s]
 SETTLING_STEPS = 300  # largest number of steps of `settle`
-SETTLED = 1e-6  # motion in a step below which the arms have settled [rad]
+#: motion in a step below which the arms have settled [rad]; a change of tension by 1000 N counts
+#: like 1 rad
+SETTLED = 1e-6
 
 STOP_TORQUE = 0.1  # torque of a stop above which `limits` names the joint [N·m]
 TENSION_MARGIN = 1.0  # distance from T_max below which `limits` names the muscle [N]
@@ -94,7 +96,7 @@ class Simulation:
         self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
-        """Put the arms at θ [rad] (N, D) with T_bias, and reset their commands.
+        """Put the arms at θ [rad] (N, D), within the joint limits, with T_bias and no command.
 
         If the number of arms changes, wrenches and forced angles are reset as well.
 

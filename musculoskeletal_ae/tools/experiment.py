@@ -15,7 +15,7 @@ MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run experiments; exit status 1 if a robot or folder is unusable, 2 for invalid options."""
+    """Run experiments; exit status 1 if a part failed or a file is unusable, 2 for bad options."""
     parser = Parser(
         'experiment',
         'Runs an experiment of the paper on emulated arms, faster than real time and without ROS, '

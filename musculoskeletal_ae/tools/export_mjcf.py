@@ -14,7 +14,8 @@ def main(argv: list[str] | None = None) -> int:
         'export_mjcf',
         'Writes the body model of a checkpoint as an MJCF model. Links, joints, limits and masses '
         'are those of the robot; route points, series elastic elements and friction are learned. '
-        'A report compares lengths, moment arms and gravity torques with those of the network.',
+        'A report compares lengths and moment arms with those of the network, and the torques of '
+        'weight and springs with those of the robot.',
     )
     parser.add_argument('checkpoint', type=Path, metavar='CHECKPOINT', help='.safetensors file')
     parser.add_robot(default=None)

@@ -66,7 +66,8 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     """Return the constants, each of shape (1,), that fit T [N], l_abs [m] and L_e [m], (N,) each.
 
     Raises:
-        ValueError: If there are fewer than four rows, or they do not describe a spring.
+        ValueError: If there are fewer than four rows, if a number is not finite, or if the rows do
+            not describe a spring.
     """
     from scipy.optimize import least_squares
 

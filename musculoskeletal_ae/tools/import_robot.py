@@ -8,7 +8,7 @@ from musculoskeletal_ae.stop_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Import one model; exit status 0 if the written directory loads."""
+    """Import one model; exit status 0 if the written directory loads, 3 if `--play` is too slow."""
     parser = Parser(
         'import_robot',
         'Converts a MuJoCo model (MJCF), a cardsflow.xml beside its model.urdf or model.sdf, or a '

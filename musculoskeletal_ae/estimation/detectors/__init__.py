@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detectors of the health monitor, one for each kind of fault."""
+"""The detectors of the health monitor, one file for each sign of a fault."""

@@ -6,7 +6,7 @@
 A position-controlled module has no T_ref. It is jammed if it neither reaches l_target nor moves,
 although it could pull harder:
 
-    |l − l_target| > BEHIND, T < T_max and |Δl| < STANDS for JAM_TIME
+    |l − l_target| > BEHIND, T ≤ FULL · T_max and |Δl| < STANDS for JAM_TIME
 
 The readings of a jammed module may be consistent with a posture, so residuals may not reveal it.
 """
@@ -33,7 +33,7 @@ class JammedModule(Detector):
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
-        #: time for which the winch has been stationary [s]
+        #: time for which the winch has been stationary although it should move [s]
         self._time: Array = np.zeros(robot.muscle_count)
         self._length: Array = np.zeros(robot.muscle_count)  # l when the winch moved last [m]
 
@@ -78,7 +78,10 @@ class JammedPosition(JammedModule):
     """Measures how long each position-controlled winch has been stationary in the wrong place."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
-        """Return a mask (M,) of modules that are behind l_target, or None without a command."""
+        """Return a mask (M,) of modules that are far from l_target and could pull harder, or None.
+
+        The result is None without a command.
+        """
         if observation.command is None:
             return None
         tension, most = observation.sample.motor_tension, self._robot.tension.max

@@ -6,22 +6,22 @@
 A, the size of e, is published, but its healthy value varies with the posture. The decision is based
 on d instead, which relates the residual of every muscle to its healthy spread. The healthy
 statistics μ and Σ have to be measured on the real arm: with statistics of the geometric
-model, most healthy postures would count as anomalous. Without calibrated statistics, d is not
-evaluated.
+model, most healthy postures would count as anomalous. Without calibrated statistics, d is
+published, but not compared with a threshold.
 
 Threshold. Far from calibrated postures, the network is less accurate, so the threshold grows with
 the distance to the nearest one (`unfamiliarity`). It also grows in proportion to a tension above
 T_limit, because networks have learned few tensions that are so high. While a tendon is slack the
 threshold does not grow, because a ruptured muscle has no tension in any posture.
 
-Suspect. An anomaly affects the residuals of all muscles. The suspect is the muscle without which
-the remaining residual is most likely.
+Suspect. An anomaly affects the residuals of all muscles. The suspect of a finding is the muscle
+without which the remaining residual is most likely. If tendons are slack, only they can be suspect.
 
 Slack. While a slack tendon is being wound in, its measured length is longer than the length that ②
 restores, and messages do not count. The measured length of a ruptured tendon is shorter than the
 restored one, so its messages do count.
 
-If the parameter `anomaly_threshold` is set, A is compared with it, and d is not used.
+If the parameter `anomaly_threshold` is set, A is compared with it instead of d with its threshold.
 """
 
 import math
@@ -151,7 +151,7 @@ class ResidualDistance(Detector):
     def unfamiliarity(self, theta: Array) -> float:
         """Return the distance of θ [rad] (D,) to the nearest calibrated posture, divided by NEAR.
 
-        A posture with a value above 1 is unfamiliar.
+        A posture with a value above 1 is unfamiliar. Without calibrated postures, the value is 0.
         """
         postures = None if self._statistics is None else self._statistics.postures
         if postures is None or not len(postures):

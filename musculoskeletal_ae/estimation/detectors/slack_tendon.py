@@ -140,7 +140,7 @@ class StretchedTendon(SlackTendon):
         super().__init__(robot, settings)
         self._recent: deque[MuscleSample] = deque(maxlen=RECENT)
         self._taut_count: Ints = np.zeros(robot.muscle_count, dtype=int)  # messages without a break
-        #: the newest message that preceded RECENT messages in which each tendon was taut, by muscle
+        #: by muscle, the first of the last RECENT messages in a row in which its tendon was taut
         self._taut = dict[int, MuscleSample]()
         #: predictions from the messages of `_taut` without the slack muscles, by muscle
         self._taut_predictions = dict[int, tuple[MuscleSample, Bools, Prediction]]()

@@ -152,7 +152,10 @@ class PostureCheck:
         return self.length - (factor - 1.0) * self._elongation
 
     def _scale(self, length: Array) -> float:
-        """Return the factor between the route lengths in lengths (N, M) and those of the model."""
+        """Return the scale: the factor between a network's route lengths and those of the model.
+
+        `length` are the lengths that the network computes [m], (N, M).
+        """
         routes, read = (
             part - part.mean(axis=0) - self._slope_over_elongation(part) * self._centred
             for part in (self.length + self._elongation, length)
