@@ -5,7 +5,7 @@
     controller.lock    locked by the controller that uses the directory
 
 While a controller commands the arm, the file names the stop cause `restarted`. A latched stop
-replaces this cause by its own. A controller that ends properly while nothing stops it deletes the
+replaces this cause by its own. A controller that ends properly while no stop is latched deletes the
 file. The file therefore remains if the controller was stopped, was killed or has crashed. A
 controller that finds the file when it starts is stopped from the beginning, and moves the arm only
 after `controller/reset`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures the lag of the muscle modules behind muscle stiffness control (MSC)."""
+"""Measures the lag of the muscle modules behind their length commands."""
 
 from __future__ import annotations
 

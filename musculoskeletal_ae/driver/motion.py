@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common parts of the motion tests of both kinds of muscle modules.
 
-If a muscle does not follow its commands, it runs away: it is released at once, and the test ends.
+If a muscle departs too far from its commands, it runs away: it is released, and the test ends.
 Each kind of test defines when a muscle runs away (`MotionTest._run_away`).
 
 Since the test also moves the joints, their sensors are compared with the lengths afterwards.

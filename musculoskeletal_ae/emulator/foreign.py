@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Emulator model `foreign`, which shares no code with the body model that the learner fits.
+"""Emulator model `foreign`, whose muscles share no code with the model that the learner fits.
 
 MuJoCo simulates rigid bodies, wrapping, stops and joint friction; `tendons` simulates tendons,
 series elastic elements and spools. The muscle modules are those of all emulated arms. This file
