@@ -5,7 +5,8 @@
 
 The rule needs no statistics, because a healthy module maintains at least T_bias. A slow winch takes
 time to wind in slack. The detector waits while the winch moves at `slack_speed` or faster, until it
-has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count.
+has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count
+towards `slack_length`, but they do count towards the speed.
 
 A position-controlled module maintains no tension, so a healthy tendon is slack if a long length is
 commanded. For these modules, the rule is that a tendon is stretched, but has no tension:
