@@ -25,7 +25,7 @@ def replace_unprintable() -> None:
 
 
 class MusculoskeletalError(Exception):
-    """Base class of all errors that this package defines."""
+    """Base class of the errors whose text tells the user what is wrong."""
 
     reason = 'cannot be used'  # short text under which rejected messages are counted
 

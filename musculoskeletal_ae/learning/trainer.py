@@ -95,8 +95,8 @@ class TrainerProcess(Trainer):
     """Runs updates in a separate process, which is restarted if it dies or hangs.
 
     A thread communicates with the process, so that `submit` and `poll` do not wait for answers.
-    Only the end of a process is waited for, for LONGEST_ENDING at most. A restarted process repeats
-    the job that was lost.
+    Ending a process can take twice LONGEST_ENDING. A restarted process repeats the job that was
+    lost.
     """
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0, device: str = 'cpu') -> None:
