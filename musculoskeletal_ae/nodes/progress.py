@@ -10,7 +10,8 @@ A native call that never returns and holds Python's global interpreter lock bloc
 thread as well. A timer of CPU time covers this case: it ends the process by SIGVTALRM, after a dump
 of the stacks.
 
-Time in which the process was suspended does not count, nor does time in a debugger or in numba's
+Time in which the process was suspended does not count, nor does time in which the main thread was
+ready to run but an overloaded computer gave it no processor, nor time in a debugger or in numba's
 compiler.
 """
 
@@ -21,12 +22,26 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 LONGEST_STALL = 10.0  # longest legal time without progress [s]
 LOOK_PERIOD = 0.5  # time between two checks [s]
 STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
 #: names of modules in which the main thread may stay for more than LONGEST_STALL
 SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
+
+
+def waited_for_processor() -> float:
+    """Return how long the main thread has waited for a processor since its start [s].
+
+    Returns 0 if the kernel does not provide this time.
+    """
+    thread = threading.main_thread().native_id
+    try:
+        _, waited, _ = Path(f'/proc/self/task/{thread}/schedstat').read_text('ascii').split()
+    except (OSError, ValueError):
+        return 0.0
+    return 1e-9 * int(waited)
 
 
 def end_process() -> None:
@@ -45,6 +60,7 @@ class ProgressWatch:
         longest: float = LONGEST_STALL,
         look_period: float = LOOK_PERIOD,
         on_stall: Callable[[], object] = end_process,
+        waited: Callable[[], float] = waited_for_processor,
     ) -> None:
         """Prepare the watch; `start` begins it.
 
@@ -52,8 +68,10 @@ class ProgressWatch:
             longest: Longest legal time without progress [s].
             look_period: Time between two checks [s].
             on_stall: Called in another thread after `longest` without progress.
+            waited: Returns how long the main thread has waited for a processor so far [s].
         """
         self._longest, self._look_period, self._on_stall = longest, look_period, on_stall
+        self._waited = waited
         self._quiet = 0.0  # time without progress [s]
         self._is_stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, name='progress', daemon=True)
@@ -77,16 +95,17 @@ class ProgressWatch:
         faulthandler.unregister(signal.SIGVTALRM)
 
     def _watch(self) -> None:
-        before = time.monotonic()
+        before, waited_before = time.monotonic(), self._waited()
         while True:
             signal.setitimer(signal.ITIMER_VIRTUAL, self._longest)
             if self._is_stopped.wait(self._look_period):
                 return
-            now = time.monotonic()
+            now, waited = time.monotonic(), self._waited()
             # If the wait took much longer than the period, the process was suspended. Therefore
             # count at most two periods.
-            self._quiet += min(now - before, 2.0 * self._look_period)
-            before = now
+            passed = min(now - before, 2.0 * self._look_period)
+            self._quiet += max(passed - (waited - waited_before), 0.0)
+            before, waited_before = now, waited
             if self._quiet > self._longest:
                 if not _is_patient():
                     self._on_stall()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from graph import DEADLINE
 
-from musculoskeletal_ae.nodes.progress import STALLED, ProgressWatch
+from musculoskeletal_ae.nodes.progress import STALLED, ProgressWatch, waited_for_processor
 
 START = (
     'from musculoskeletal_ae.nodes.progress import ProgressWatch\n'
@@ -74,3 +74,27 @@ def test_progress_keeps_the_watch_quiet_until_it_ends():
         assert not stalled.wait(0.05)
     assert stalled.wait(DEADLINE)
     watch.stop()
+
+
+def test_a_process_that_gets_no_processor_does_not_hang():
+    stalled, begun = threading.Event(), time.monotonic()
+    is_overloaded = True
+    watch = ProgressWatch(
+        longest=0.5,
+        look_period=0.05,
+        on_stall=stalled.set,
+        waited=lambda: time.monotonic() - begun if is_overloaded else 0.0,
+    )
+    watch.start()
+    assert not stalled.wait(1.5)
+    is_overloaded = False
+    assert stalled.wait(DEADLINE)
+    watch.stop()
+
+
+def test_the_time_for_which_a_thread_waits_for_a_processor_grows():
+    before = waited_for_processor()
+    deadline = time.monotonic() + DEADLINE
+    while waited_for_processor() == before and time.monotonic() < deadline:
+        time.sleep(0.001)  # every wake-up waits for a moment
+    assert waited_for_processor() > before
