@@ -233,7 +233,7 @@ CAPABILITIES = (
         'estimation',
     ),
     (
-        'isolating exactly the ruptured muscle within 10 s (`on_anomaly: isolate`)',
+        'isolating exactly the ruptured muscle within 16 s (`on_anomaly: isolate`)',
         '{isolated} of {ruptures}',
         'resilience',
     ),
