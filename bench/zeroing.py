@@ -39,7 +39,7 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-LEAST, MOST = 0.05, 0.13  # range of the absolute length offsets [m]
+LEAST, MOST = 0.05, 0.13  # range of the magnitudes of the length offsets [m]
 MINUTES = 10.0  # duration of the exploration [min]
 HELD_OUT = 300.0  # duration of the held-out motion [s]
 AFTER = 30.0  # duration of the motion after a calibration [s]

@@ -127,7 +127,7 @@ def test_every_document_that_code_cites_is_in_the_repository() -> None:
     assert not missing
 
 
-# -- the linters of ROS 2, which the wheels lack ---------------------------------------------------
+# -- linters of ROS 2: not among the ROS wheels of PyPI, so they need a sourced Jazzy ------------
 
 
 def test_ament_flake8() -> None:

@@ -36,7 +36,8 @@ SOLVES = 2
 # The following constants are those of the method `stiffness`.
 
 # Candidates for the margin of T_low above T_bias [N]; the largest feasible margin is used. An
-# external force can reduce a muscle's tension by this margin before the muscle becomes slack.
+# external force can reduce a muscle's tension by this margin before it falls to T_bias, where the
+# muscle is stiff in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6  # largest number of iterations of Gauss–Newton and of Frank–Wolfe
 # Weight of the least tension relative to the stiffness. A reachable stiffness is missed by about

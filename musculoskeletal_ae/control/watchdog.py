@@ -75,7 +75,10 @@ class DataAge:
         self._came_at[cause] = self.awake(now) + within
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
-        """Return the causes of data older than `max_age` [s]."""
+        """Return a stop condition for each kind of data that is older than `max_age` [s].
+
+        If the clock of the messages runs slowly, older data are permitted accordingly.
+        """
         allowed = max_age / min(max(self.pace, SLOWEST), 1.0)
         return [
             Condition(cause, f'older than {allowed:.3g} s')

@@ -11,10 +11,11 @@ receives the desired posture in every message. The controller may use the full s
 winches. Where they cannot follow, a trajectory is slowed, and errors refer to the slowed
 trajectory. Afterwards, `target_pose` moves the hand along circles of 10 cm diameter at 0.1 m/s,
 with 50 poses a second; a planar arm draws them in its plane. Then forces of 10 to 50 N in random
-directions act on the hand of the resting arm for 1.5 s, and of the exploring arm. At rest, a joint
-stop may carry a part of the force. In method `float` the arm is first left alone, and then guided
-with 15 to 20 N. If the controller stops on a trajectory, the individual fails. If another method
-stops, or if no circle is reachable, the number is missing.
+directions push the hand: that of the resting arm for 1.5 s, and that of the exploring arm for 1 s.
+At rest, a joint stop may carry a part of the force. In method `float` the arm is first left alone,
+and then guided with 15 to 20 N. If the controller stops on a trajectory, the individual fails. If
+another method stops, or if no circle is reachable, the number of that method or of the circles is
+missing.
 
 - tracking: mean of ‖θ_desired − θ_true‖ over the motion
 - settled: the same distance 0.5 s after the end of the motion

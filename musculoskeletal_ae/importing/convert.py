@@ -33,7 +33,7 @@ LARGEST = 20_000_000  # largest file [bytes]
 WARM_UP, PLAYED = 0.1, 1.0  # simulated times before and during the speed test [s]
 #: largest CPU time per second of model time that leaves enough for the other nodes [s]
 REAL_TIME = 0.5
-SLOW = 3  # exit status for a model that is slower than real time
+SLOW = 3  # exit status for a model that needs more CPU time than REAL_TIME
 OPENSIM = (
     'OpenSim models are not read; convert this model to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'

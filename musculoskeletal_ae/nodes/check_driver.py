@@ -261,8 +261,9 @@ def _parse(arguments: list[str]) -> Namespace:
     )
     add('--muscles', type=names, metavar='NAME,…', help='with --move: wind only these muscles in')
     text = (
-        'with --move: highest commanded tension [N] (default: T_bias + 40 N, or T_bias + 0.8 mm '
-        'times K for modules with a stiffness K above 50 kN/m; at most tension.max)'
+        'with --move: tension up to which muscles are wound in [N] (default: T_bias + 40 N, or '
+        'T_bias + 0.8 mm times K for modules with a stiffness K above 50 kN/m; at most '
+        'tension.max, or tension.limit for actuation: position)'
     )
     add('--tension', type=positive, metavar='N', help=text)
     add('--wait', action='store_true', help='wait for a driver, and listen until it has no faults')

@@ -273,7 +273,7 @@ class View(Node):
             self.page.notify(f'stopped again: {trouble}' if is_stopped else 'reset', not is_stopped)
 
     def _reset(self) -> None:
-        """Reset anomaly and stop, unless a muscle of the emulated arm is still ruptured."""
+        """Reset anomaly and stop, unless a ruptured muscle of the emulated arm is not isolated."""
         isolated = set(self.robot.names(self._isolated()).split(', '))
         if remaining := [name for name in self.ruptured if name not in isolated]:
             problem = f'ruptured muscles ({", ".join(remaining)}) would stop the arm again'
