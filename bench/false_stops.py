@@ -53,7 +53,7 @@ WAIT = 0.0008  # mean time until a process gets the processor, for each process 
 STALL_EVERY = 10.0  # mean time between two stalls of a process [s]
 STALL = 0.015  # mean duration of a stall, for each process per core [s]
 HANDLING = 0.0005  # time in which a node handles a message [s]
-QUEUE = 10  # number of messages that wait in a subscription
+QUEUE = 10  # largest number of messages that wait in a subscription; older ones are dropped
 #: time by which the publisher's clock is ahead of the steady clock [s]; no node may depend on it
 AHEAD = 1.7e9
 

@@ -22,8 +22,8 @@ MOST_MOMENTS = 12_500
 
 #: factors by which a motion may be slowed until its tensions suffice, in ascending order
 SLOWER = tuple(1.1**k for k in range(17))
-#: The same without some muscles. Large steps add to the reserve, because such an arm may fall where
-#: a whole arm only deviates from its trajectory.
+#: The same factors for an arm with isolated muscles. Their large steps add to the reserve, because
+#: such an arm may fall where an arm with all muscles only deviates from its trajectory.
 SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: smallest lag λ for which a motion is planned [s]; λ is measured only after the motion has begun
 LEAST_LAG = 0.02

@@ -27,6 +27,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
+from musculoskeletal_ae.signals.message_delay import longer_pause
 
 
 class Verdict(NamedTuple):
@@ -199,8 +200,7 @@ class LengthJumps:
 
     def _pause(self, now: float, delay: float) -> float:
         """Return the pause between receptions or between sendings, whichever is longer [s]."""
-        received = max(now - self._last_at, 0.0)
-        return received + max(self._last_delay - delay, 0.0)
+        return longer_pause(max(now - self._last_at, 0.0), self._last_delay, delay)
 
     def _problem(self, jump: Jump, used: Bools) -> tuple[str, str]:
         """Return reason and detail of the rejection of a message."""

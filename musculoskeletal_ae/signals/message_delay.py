@@ -30,6 +30,17 @@ DRIFT = 1e-3
 LONGEST_DELAY = 10.0
 
 
+def longer_pause(elapsed: float, delay_before: float, delay: float) -> float:
+    """Return the pause between two messages: that of reception or of sending, the longer one [s].
+
+    Args:
+        elapsed: Time between the receptions [s].
+        delay_before: Delay of the first message [s].
+        delay: Delay of the second message [s].
+    """
+    return elapsed + max(delay_before - delay, 0.0)
+
+
 class MessageDelay:
     """Measures the delays of the messages of one publisher."""
 

@@ -30,6 +30,7 @@ from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 from musculoskeletal_ae.signals.length_jumps import DisplacedMuscles, LengthJumps, Verdict
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
+from musculoskeletal_ae.signals.message_delay import longer_pause
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
 from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states
 
@@ -197,7 +198,8 @@ class MuscleStream:
         self._direction = FrictionDirection()
         self._median.reset()
         self._pull.reset()
-        self._time = self._sent_at = math.inf  # reception and sending of the last sample [s]
+        self._time = math.inf  # reception of the last sample [s]
+        self._sample_delay = 0.0  # delay of the last sample [s]
         self._delay = 0.0  # delay of the newest message, accepted or not [s]
 
     def use_transmission(self, transmission: Transmission) -> None:
@@ -276,11 +278,10 @@ class MuscleStream:
         self._implausible.note('' if problem is None else ': '.join(problem), now - delay)
         if problem is not None:
             raise RejectionError(*problem, states, self._pull.median(offsets.offset))
-        sent_at = time - delay
-        pause = max(time - self._time, sent_at - self._sent_at)
+        pause = longer_pause(time - self._time, self._sample_delay, delay)
         if time < self._time or pause > LIMITS.pause:
             self._direction.reset()
-        self._time, self._sent_at = time, sent_at
+        self._time, self._sample_delay = time, delay
         read = self._median.step(states)
         length = read[0] - offsets.offset
         sliding = self._direction.step(length)
