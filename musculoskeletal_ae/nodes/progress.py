@@ -79,6 +79,8 @@ class ProgressWatch:
     def start(self) -> None:
         """Begin to watch."""
         faulthandler.register(signal.SIGVTALRM, all_threads=True, chain=True)
+        # Set the timer before the thread runs: a native call may take the lock of Python before.
+        signal.setitimer(signal.ITIMER_VIRTUAL, self._longest)
         self._thread.start()
 
     def note(self) -> None:
