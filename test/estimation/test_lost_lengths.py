@@ -28,6 +28,7 @@ class MovingArm:
         self.rng = np.random.default_rng(0)
         self.off, self.joint_off = np.zeros(robot.muscle_count), np.zeros(robot.joint_count)
         self.tension = robot.tension.bias + 20.0
+        self.tense = np.ones(robot.muscle_count)  # 0 for a tendon without tension
 
     def go(self, seconds, sensors=True):
         for _ in range(round(seconds / DT)):
@@ -36,6 +37,7 @@ class MovingArm:
             span = 0.25 * (self.robot.upper - self.robot.lower)
             theta = middle + span * np.sin([0.5 * self.time, 0.7 * self.time])
             tension = self.tension + self.rng.standard_normal(len(self.tension))
+            tension *= self.tense
             length = self.robot.muscle_lengths(theta, tension) + self.off
             length += 1e-4 * self.rng.standard_normal(len(length))
             if sensors:
@@ -132,6 +134,25 @@ def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae
     arm.off = 2.0 * SEVERAL
     arm.go(4.0)
     assert arm.kind is Kind.LENGTHS_DISAGREE
+
+
+@pytest.mark.parametrize('muscle', [0, 4])
+def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arrive(
+    robot, mae, muscle
+):
+    """The module of a ruptured tendon winds it in; it is to be repaired, and the rest is valid."""
+    arm = MovingArm(robot, mae)
+    arm.go(8.0)
+    ruptured = np.eye(6)[muscle]
+    arm.tense = 1.0 - ruptured
+    for wound in np.linspace(0.0, 0.2, 40):
+        arm.off = -wound * ruptured
+        arm.go(0.05)
+    arm.go(2.0)
+    assert arm.kind is Kind.SLACK_TENDON
+    assert arm.core.suspects.finding.muscle == muscle
+    assert 'repair' in arm.core.suspects.advice
+    assert arm.offsets.known
 
 
 def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(robot, mae):

@@ -11,6 +11,10 @@ by as much as the offset.
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ. Because
 muscles outnumber joints, arbitrary errors of lengths rarely have this form. If some δθ explains
 most of Δ, the joint sensor with the largest δθ is reported; otherwise, the lengths are reported.
+
+A healthy tendon that is shorter than at the measured posture is stretched. If it has no tension, it
+is ruptured, and its muscle is reported, provided that the lengths of all others agree with θ. This
+is how a rupture is detected while no commands arrive.
 """
 
 from collections import deque
@@ -22,6 +26,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 SPACING = 0.1  # time between two values of g [s]
@@ -165,6 +170,9 @@ class JointDisagreement(Detector):
         assert observation.measured is not None
         change, largest = self._change(self.gap)
         muscle = int(np.abs(change).argmax())
+        if self._is_ruptured(muscle, observation.sample, change, largest):
+            short = f'{-1e3 * change[muscle]:.0f} mm shorter than at the measured posture'
+            return Finding(muscle, Kind.SLACK_TENDON, f'it has no tension although it is {short}')
         tension = observation.sample.bone_tension
         jacobian = self._mae.muscle_jacobian(observation.measured, tension)
         jacobian = jacobian * self._used[:, None]
@@ -184,3 +192,20 @@ class JointDisagreement(Detector):
             f'the lengths look as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
         )
         return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f"{cause}: the muscle's {evidence}")
+
+    def _is_ruptured(
+        self, muscle: int, sample: MuscleSample, change: Array, largest: Largest
+    ) -> bool:
+        """Return whether this muscle alone is too short, although it has no tension.
+
+        Args:
+            muscle: Index of the muscle with the largest Δ.
+            sample: The readings.
+            change: Δ [m], (M,).
+            largest: Its limits.
+        """
+        slack_tension = LIMITS.slack_share * self._robot.tension.bias[muscle]
+        is_slack = sample.motor_tension[muscle] < slack_tension
+        is_other = np.arange(len(change)) != muscle
+        others_agree = largest.excess(change * is_other, self._used & is_other) <= 1.0
+        return bool(is_slack and change[muscle] < 0.0 and others_agree)
