@@ -166,25 +166,6 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--plot', type=picture, metavar='FILE.png', help=f'draw {text}')
 
 
-def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:
-    """Save the figure that `draw` returns, and print the file's name; do nothing without a file."""
-    if file is not None:
-        save_figure(draw(), file)
-        print(f'plot: {file}')
-
-
-def save_figure(figure: Any, file: Path) -> None:
-    """Save a matplotlib figure.
-
-    Raises:
-        MusculoskeletalError: If the file cannot be written.
-    """
-    try:
-        figure.savefig(file, dpi=110)
-    except OSError as error:
-        raise MusculoskeletalError(f'picture {file} cannot be written: {error}') from error
-
-
 def exit_status(
     work: Callable[[], int | None], *also: type[Exception], out: Path | None = None
 ) -> int:

@@ -6,16 +6,17 @@ message, which may be live or from a bag. An invalid message raises a `MessageEr
 reason; the caller counts it and continues.
 """
 
+from __future__ import annotations
+
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
@@ -232,7 +233,26 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
     return values
 
 
-def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
+class TrajectoryPoints(NamedTuple):
+    """K points of some joints in a JointTrajectory."""
+
+    joints: Ints  # indices in θ, (J,)
+    time: Array  # times from the start [s], (K,)
+    position: Array  # [rad], (K, J)
+    velocity: Array | None  # [rad/s], (K, J)
+    acceleration: Array | None  # [rad/s²], (K, J)
+
+    def later(self, slower: float) -> TrajectoryPoints:
+        """Return the points slowed by the factor `slower`."""
+        velocity, acceleration = self.velocity, self.acceleration
+        return self._replace(
+            time=self.time * slower,
+            velocity=None if velocity is None else velocity / slower,
+            acceleration=None if acceleration is None else acceleration / slower**2,
+        )
+
+
+def read_trajectory(message: Any, joints: Sequence[str]) -> TrajectoryPoints | None:
     """Return the points of a JointTrajectory; None if it is empty, which commands the arm to stop.
 
     Velocities and accelerations must be present at all points or at none.
@@ -271,7 +291,7 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> Points | None:
             'moves at its end', f'last velocities {velocity[-1].tolist()}; expected 0'
         )
     places = np.array([list(joints).index(name) for name in names])
-    return Points(places, time, position, velocity, acceleration)
+    return TrajectoryPoints(places, time, position, velocity, acceleration)
 
 
 def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:

@@ -43,7 +43,7 @@ from musculoskeletal_ae.control.stopping import SafeStop
 from musculoskeletal_ae.control.stops import Action, Condition, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
-from musculoskeletal_ae.control.trajectory import Points, Setpoint
+from musculoskeletal_ae.control.trajectory import Setpoint
 from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
@@ -51,6 +51,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 WINDOW = 3  # number of messages in the median filter against outliers
 RESTORE = 'call estimator/restore to use isolated muscles again'
@@ -412,7 +413,7 @@ class Controller:
         except Exception as error:  # noqa: BLE001 (as in `_desired`)
             self._note_fault(error)
 
-    def trajectory(self, points: Points | None, delay: float = 0.0) -> None:
+    def trajectory(self, points: TrajectoryPoints | None, delay: float = 0.0) -> None:
         """Follow a trajectory through points, or come to rest and hold if there are none.
 
         Args:

@@ -17,11 +17,12 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.reach import lacking, nearest_held
-from musculoskeletal_ae.control.trajectory import STOPPING, Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 #: tolerances [m] and [rad] of the inverse kinematics for a whole pose, and for its position only
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
@@ -111,7 +112,9 @@ class Hand:
                 path = np.array([np.clip(further, robot.lower, robot.upper), theta])
                 rates = np.array([velocity, np.zeros_like(velocity)])
                 time, every = np.array([ahead, ahead + RETURNING]), np.arange(len(theta))
-                return Trajectory.through(start, Points(every, time, path, rates, 0.0 * rates))
+                return Trajectory.through(
+                    start, TrajectoryPoints(every, time, path, rates, 0.0 * rates)
+                )
         self._interval = 0.0
         distance = float(np.linalg.norm(where - here))
         return Trajectory.to(start, theta, max(SHORTEST, PEAK * distance / speed))
@@ -151,5 +154,5 @@ class Hand:
             raise MessageError('not holdable', f'{detail}; {remedy}')
         rates = np.array([1.0, 1.0, 0.0])[:, None] * velocity * free
         return Trajectory.through(
-            start, Points(np.arange(len(velocity)), time, inside, rates, 0.0 * rates)
+            start, TrajectoryPoints(np.arange(len(velocity)), time, inside, rates, 0.0 * rates)
         )

@@ -21,11 +21,12 @@ from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.slowness import exertion_slowness, slowness
-from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 #: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times RACK [m].
 #: The estimate of an arm that is held against a joint stop exceeds the limit by less than this.
@@ -86,7 +87,9 @@ class Planner:
         slower = exertion_slowness(self._robot, mae, planned, lag)
         return Plan(planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower)))
 
-    def through(self, mae: Mae, start: Setpoint, points: Points, passed: float, lag: float) -> Plan:
+    def through(
+        self, mae: Mae, start: Setpoint, points: TrajectoryPoints, passed: float, lag: float
+    ) -> Plan:
         """Plan a motion through points.
 
         Args:
@@ -175,7 +178,7 @@ class Planner:
             raise MessageError('not holdable', problem)
         return held, f'{problem}; the arm moves there'
 
-    def _clipped(self, points: Points) -> Points:
+    def _clipped(self, points: TrajectoryPoints) -> TrajectoryPoints:
         """Return the points clipped to the joint limits.
 
         Raises:

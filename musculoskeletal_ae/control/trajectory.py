@@ -22,10 +22,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 #: largest allowed excess over the joint limits between points [rad]; for prismatic joints times
 #: RACK [m]
@@ -61,38 +62,19 @@ class Setpoint(NamedTuple):
         return cls(theta, np.zeros_like(theta), np.zeros_like(theta))
 
 
-class Points(NamedTuple):
-    """K points of some joints, as read from a message; see `validity.read_trajectory`."""
-
-    joints: Ints  # indices in θ, (J,)
-    time: Array  # times from the start [s], (K,)
-    position: Array  # [rad], (K, J)
-    velocity: Array | None  # [rad/s], (K, J)
-    acceleration: Array | None  # [rad/s²], (K, J)
-
-    def later(self, slower: float) -> Points:
-        """Return the points slowed by the factor `slower`."""
-        velocity, acceleration = self.velocity, self.acceleration
-        return self._replace(
-            time=self.time * slower,
-            velocity=None if velocity is None else velocity / slower,
-            acceleration=None if acceleration is None else acceleration / slower**2,
-        )
-
-
 @dataclass(frozen=True)
 class Trajectory:
     """A piecewise polynomial curve from `start` through points."""
 
     start: Setpoint
-    points: Points  # the remaining points
+    points: TrajectoryPoints  # the remaining points
     time: Array  # times of the knots [s], (K,); the first time is 0
     coefficients: Array  # coefficients of each piece, (K−1, 6, D)
     end: Array  # posture that is held after the last point [rad], (D,)
     slowed: float = 1.0  # factor by which the trajectory was slowed
 
     @classmethod
-    def through(cls, start: Setpoint, points: Points, passed: float = 0.0) -> Trajectory:
+    def through(cls, start: Setpoint, points: TrajectoryPoints, passed: float = 0.0) -> Trajectory:
         """Return the trajectory from `start` through the points that are still ahead.
 
         A single point at time 0 is reached as fast as possible.
@@ -119,11 +101,11 @@ class Trajectory:
                 'points too close in time',
                 f'two points are only {apart.min():.3g} s apart; send one of them only',
             )
-        left = Points(points.joints, time, position, velocity, acceleration)
+        left = TrajectoryPoints(points.joints, time, position, velocity, acceleration)
         return cls._joined(start, left)
 
     @classmethod
-    def _joined(cls, start: Setpoint, points: Points, slowed: float = 1.0) -> Trajectory:
+    def _joined(cls, start: Setpoint, points: TrajectoryPoints, slowed: float = 1.0) -> Trajectory:
         time = np.concatenate([[0.0], points.time])
         degrees = [points.velocity, points.acceleration]
         every = np.zeros((3, len(time), len(start.theta)))
@@ -155,7 +137,7 @@ class Trajectory:
         path = np.atleast_2d(theta)
         (count, joints), still = path.shape, np.zeros(path.shape)
         time = duration * np.arange(1.0, count + 1.0)
-        return cls.through(start, Points(np.arange(joints), time, path, still, still))
+        return cls.through(start, TrajectoryPoints(np.arange(joints), time, path, still, still))
 
     @classmethod
     def stopping(cls, start: Setpoint, robot: Robot) -> Trajectory:
@@ -172,7 +154,7 @@ class Trajectory:
         time = np.append(STOPPING, STOPPING + points.time)
         where = np.vstack([_halt(self.start, robot), points.position])
         rates = (None if part is None else np.vstack([still, part]) for part in points[3:])
-        return self.through(self.start, Points(points.joints, time, where, *rates))
+        return self.through(self.start, TrajectoryPoints(points.joints, time, where, *rates))
 
     def check(self, robot: Robot) -> None:
         """Check that the curve stays within the joint limits between its points.

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.options import save_figure
+from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
 #: length below which a bone is not drawn, because it connects two joints in the same place [m]

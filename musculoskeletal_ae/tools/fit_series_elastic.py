@@ -12,8 +12,9 @@ import yaml
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.files import read_csv
-from musculoskeletal_ae.options import Parser, exit_status, save_plot
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
 COLUMNS = ['tension', 'absolute_length', 'elongation']

@@ -11,11 +11,11 @@ import numpy as np
 from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import Trained, initial_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, PairError, pair_errors, random_states, train_on
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.options import save_plot
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import jump_warning

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.options import save_plot
+from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.checks import (
     COUNTED_ARM,

@@ -16,8 +16,8 @@ from musculoskeletal_ae.control.goal import (
     read_tolerances,
 )
 from musculoskeletal_ae.control.stops import StopCause
-from musculoskeletal_ae.control.trajectory import Points
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 FREE = np.full(2, np.inf)
 TIGHT = np.array([0.05, np.inf])
@@ -35,7 +35,7 @@ class FollowingBench:
 
     def start(self, delay=0.0):
         still = np.zeros((1, 2))
-        points = Points(np.arange(2), np.array([1.0]), OTHER[None], still, still)
+        points = TrajectoryPoints(np.arange(2), np.array([1.0]), OTHER[None], still, still)
         self.bench.core.trajectory(points, delay)
 
     def run(self, steps=1000, moves=True):

@@ -21,7 +21,7 @@ from musculoskeletal_ae.control.slowness import slowness
 from musculoskeletal_ae.control.stopping import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.tension_plan import TURNING
-from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.robot.actuation import DEPTH
@@ -29,6 +29,7 @@ from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 LOST = 0
 USED = np.arange(ROBOT.muscle_count) != LOST
@@ -481,7 +482,9 @@ def test_a_trajectory_to_a_posture_that_cannot_be_held_is_refused():
     bench.isolate([0])
     bench.step(5)
     still = np.zeros((1, 2))
-    end = Points(np.array([0, 1]), np.array([3.0]), np.array([[-1.2, -0.2]]), still, still)
+    end = TrajectoryPoints(
+        np.array([0, 1]), np.array([3.0]), np.array([[-1.2, -0.2]]), still, still
+    )
     with pytest.raises(MessageError, match='nearest holdable posture'):
         bench.core.trajectory(end)
     assert not bench.core.is_following

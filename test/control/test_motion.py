@@ -20,17 +20,18 @@ from musculoskeletal_ae.control.hand import Hand
 from musculoskeletal_ae.control.methods import StiffnessModel
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.slowness import SHARE, slowness
-from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.control.winches import Winches
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 STILL = np.zeros((1, 2))
 PEAK_SPEED = 1.875  # ratio of peak to mean speed of a quintic from rest to rest
 
 
 def points(goal, duration=1.0):
-    return Points(np.array([0, 1]), np.array([duration]), np.array([goal]), STILL, STILL)
+    return TrajectoryPoints(np.array([0, 1]), np.array([duration]), np.array([goal]), STILL, STILL)
 
 
 def moved(bench, count):
@@ -458,7 +459,9 @@ def test_a_long_trajectory_is_slowed_as_a_short_one_is(bench):
     theta = np.vstack([REST, np.tile([OTHER, REST], (3, 1))])
     slowed, still = [], np.zeros_like(theta)
     for late in (0.0, 500.0):
-        points = Points(np.array([0, 1]), late + 0.3 * np.arange(1.0, 8.0), theta, still, still)
+        points = TrajectoryPoints(
+            np.array([0, 1]), late + 0.3 * np.arange(1.0, 8.0), theta, still, still
+        )
         trajectory = Trajectory.through(Setpoint.resting(REST), points)
         slowed.append(slowness(ROBOT, bench.mae, trajectory, bench.core.settings))
     assert slowed[0] > 1.2
@@ -488,7 +491,9 @@ def test_a_twist_moves_the_hand_until_it_times_out(bench):
 @pytest.mark.parametrize('apart', [1e-9, 1e-6])
 def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apart):
     goals = np.stack([np.array(REST), np.array(OTHER)])
-    bench.core.trajectory(Points(np.arange(2), np.array([1.0, 1.0 + apart]), goals, None, None))
+    bench.core.trajectory(
+        TrajectoryPoints(np.arange(2), np.array([1.0, 1.0 + apart]), goals, None, None)
+    )
     follower = bench.follower
     text = status.slowed(follower)
     assert f'takes {follower.progress.latest.duration:.3g} s' in text, text

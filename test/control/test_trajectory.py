@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from robots import write_robot
 
-from musculoskeletal_ae.control.trajectory import Points, Setpoint, Trajectory
+from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.validity import TrajectoryPoints
 
 ROBOT = Robot.load('arm26')
 MIDDLE, REACH = 0.5 * (ROBOT.lower + ROBOT.upper), 0.5 * (ROBOT.upper - ROBOT.lower)
@@ -30,7 +31,7 @@ def made(rows, order):
     table = np.array(rows)
     position = MIDDLE + REACH * table[:, 1:3]
     given_values = [0.3 * table[:, 3:5], table[:, 5:7]][:order] + [None] * (2 - order)
-    points = Points(BOTH, np.cumsum(table[:, 0]), position, *given_values)
+    points = TrajectoryPoints(BOTH, np.cumsum(table[:, 0]), position, *given_values)
     return points, Trajectory.through(Setpoint.resting(MIDDLE), points)
 
 
@@ -55,7 +56,7 @@ def test_a_slowed_trajectory_passes_its_points_with_scaled_derivatives(rows, ord
 def test_points_at_nearly_the_same_time_are_refused():
     # The last interval is too short for double precision at such large times [s].
     time = np.array([0.001, 3e5, 3e5 + 1e-9])
-    points = Points(BOTH, time, np.array([MIDDLE, MIDDLE, MIDDLE + REACH]), None, None)
+    points = TrajectoryPoints(BOTH, time, np.array([MIDDLE, MIDDLE, MIDDLE + REACH]), None, None)
     with pytest.raises(MessageError, match='points too close in time'):
         Trajectory.through(Setpoint.resting(MIDDLE), points)
 
@@ -90,7 +91,7 @@ def test_from_rest_to_rest_is_the_motion_of_least_jerk():
 
 
 def test_joints_not_named_stay_and_points_in_the_past_are_left_out():
-    points = Points(
+    points = TrajectoryPoints(
         np.array([1]),
         np.array([0.0, 1.0, 2.0]),
         MIDDLE[1] + np.array([[0.5], [0.2], [0.1]]),
@@ -106,7 +107,7 @@ def test_joints_not_named_stay_and_points_in_the_past_are_left_out():
 
 
 def test_a_point_at_time_zero_is_approached_at_once():
-    points = Points(BOTH, np.array([0.0]), MIDDLE[None] + 0.1, None, None)
+    points = TrajectoryPoints(BOTH, np.array([0.0]), MIDDLE[None] + 0.1, None, None)
     trajectory = Trajectory.through(Setpoint.resting(MIDDLE), points)
     assert 0.0 < trajectory.duration < 0.02
     np.testing.assert_allclose(trajectory.end, MIDDLE + 0.1)
@@ -116,7 +117,7 @@ def test_a_point_at_time_zero_is_approached_at_once():
 
 def test_a_curve_that_leaves_the_joint_limits_between_its_points_is_refused():
     fast = np.array([[30.0, 0.0], [0.0, 0.0]])
-    points = Points(BOTH, np.array([0.5, 1.0]), np.array([MIDDLE, MIDDLE]), fast, None)
+    points = TrajectoryPoints(BOTH, np.array([0.5, 1.0]), np.array([MIDDLE, MIDDLE]), fast, None)
     with pytest.raises(MessageError, match='leaves the joint limits'):
         Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
 
@@ -125,7 +126,7 @@ def test_a_curve_that_leaves_the_joint_limits_between_its_points_is_refused():
 def test_a_curve_that_leaves_the_joint_limits_briefly_in_a_long_trajectory_is_refused(late):
     time, rates = late + np.array([0.6, 1.6, 2.0, 5.0]), np.zeros((4, 2))
     rates[1] = 8.0
-    points = Points(BOTH, time, np.tile(MIDDLE, (4, 1)), rates, None)
+    points = TrajectoryPoints(BOTH, time, np.tile(MIDDLE, (4, 1)), rates, None)
     with pytest.raises(MessageError, match='leaves the joint limits'):
         Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
 
@@ -133,7 +134,7 @@ def test_a_curve_that_leaves_the_joint_limits_briefly_in_a_long_trajectory_is_re
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 def test_a_curve_whose_values_overflow_is_refused():
     rates = np.array([[1e308, 0.0], [0.0, 0.0]])
-    points = Points(BOTH, np.array([10.0, 20.0]), np.array([MIDDLE, MIDDLE]), rates, None)
+    points = TrajectoryPoints(BOTH, np.array([10.0, 20.0]), np.array([MIDDLE, MIDDLE]), rates, None)
     with pytest.raises(MessageError, match='the curve is not finite'):
         Trajectory.through(Setpoint.resting(MIDDLE), points).check(ROBOT)
 
@@ -143,7 +144,7 @@ def test_a_refusal_for_a_prismatic_joint_is_in_metres(tmp_path):
     start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))
     for off, reported in ((0.001, None), (0.01, 'wrist exceeds its limits by 0.01 m')):
         end = np.append(start[:3], robot.upper[3] + off)
-        points = Points(np.arange(4), np.ones(1), end[None], still, None)
+        points = TrajectoryPoints(np.arange(4), np.ones(1), end[None], still, None)
         trajectory = Trajectory.through(Setpoint.resting(start), points)
         with pytest.raises(MessageError, match=reported) if reported else nullcontext():
             trajectory.check(robot)
