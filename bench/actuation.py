@@ -12,7 +12,7 @@ network. With the learned network, the bench measures:
   ruptures after which a muscle is isolated within 10 s, the share after which it is the ruptured
   muscle, and the mean time from a rupture to the first isolation (10 s if there is none),
 - max/limit: the highest true tension as a multiple of `tension.limit`, except after a rupture,
-- wrong: the number of muscles that are isolated, and of stops, although the arm is healthy.
+- wrong: the number of isolations and stops although the arm is healthy.
 
 Tensions are the true ones of the emulated arm, whatever its sensors measure.
 """
@@ -40,7 +40,7 @@ EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held
 TARGETS, HELD = 5, 4.0  # number of targets, and time for each of them [s]
 RUPTURES = 3  # number of muscles that rupture, one after another
 MOVING = 4.0  # time for which the arm explores before a rupture [s]
-LATEST = 10.0  # longest time from a rupture to its isolation [s]
+LATEST = 10.0  # longest wait for an isolation after a rupture [s]
 #: kinds of muscle modules, each with the entries of muscles.yaml that describe it
 KINDS = {
     'stiffness': {'actuation': 'stiffness'},

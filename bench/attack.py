@@ -6,8 +6,8 @@
 The whole system runs on an emulated arm, once for each seed. Each run has three parts:
 
 1. Known attacks (`attack_kinds`), in several variants, while the arm holds and while it explores.
-   The seeds share them. After each attack, the bench takes the steps that /diagnostics advises
-   until the arm moves on.
+   They are divided among the seeds. After each attack, the bench takes the steps that /diagnostics
+   advises until the arm moves on.
 2. Random events: targets, services, faults, suspended and killed nodes, false states of the body.
 3. Messages of a hostile node. It publishes on every topic that a node subscribes to (modified
    genuine messages, and random ones), and calls every service with illegal content.

@@ -274,7 +274,7 @@ def _write_bag(path: Path) -> Path:
 
 
 def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attempt]:
-    """Write and read the hostile files number `start` to `count`; yield the outcome of each."""
+    """Write and read the hostile files `start` to `count` − 1; yield the outcome of each."""
     reader = Reader(folder)
     for i in range(start, count):
         kind = KINDS[i % len(KINDS)]
@@ -326,7 +326,8 @@ def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
 
 
 def _child(start: str, count: str, seed: str, folder: str) -> None:
-    # Limits of memory and CPU time end a child that hangs; its parent reports that as a finding.
+    # Without these limits, one file could exhaust the memory of the machine or stop the bench. The
+    # parent reports as a finding that a limit was reached.
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     resource.setrlimit(resource.RLIMIT_CPU, (3600, 3600))
     import faulthandler

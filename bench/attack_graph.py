@@ -83,7 +83,7 @@ class Command(NamedTuple):
 
     time: float  # time of publishing by the publisher's clock [s]
     number: int  # sequence number of the message
-    life: int  # number of controller restarts before the command
+    life: int  # number of times that the controller had been started before the command
     topic: str
     value: Array
 
@@ -171,7 +171,7 @@ class Attack:
 
     def __exit__(self, *_: object) -> None:
         self.end_strangers()
-        for process in self.processes.values():  # a suspended process could not handle SIGINT
+        for process in self.processes.values():  # a suspended process would not end by SIGTERM
             with suppress(ProcessLookupError):
                 process.process.send_signal(signal.SIGCONT)
         end_processes([process.process for process in self.processes.values()], signal.SIGTERM)

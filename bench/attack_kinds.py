@@ -97,7 +97,9 @@ class Scene:
                 return
             waits_for_cooling = Step.WAIT_UNTIL_COOL.identifier in attack.situation.steps()
             self.follow_advice()
-            if waits_for_cooling:  # a hot winding cools by about 0.1 °C per second
+            # A hot winding cools by about 0.1 °C per second only, so extend the deadline by this
+            # time.
+            if waits_for_cooling:
                 end = min(end + time.monotonic() - begun, longest)
         attack.found(
             'the remedy helps', f'{self.what}: no recovery in {PATIENCE:g} s; status: {trouble}'
@@ -344,7 +346,8 @@ def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
     """Return an attack that suspends the node `name`, or kills it if not `is_paused`."""
 
     def attack(scene: Scene) -> None:
-        # The process ends on purpose. `recover` restarts it if the status line advises that.
+        # The attack itself ends or suspends the process, which is no violation. `recover` restarts
+        # the node when its reports are missing.
         scene.attack.watches_processes = False
         if is_paused:
             scene.pause(name)

@@ -11,7 +11,7 @@ understands these marks in a page:
   has printed its first status line.
 - `<!-- bench: skip REASON -->` above a block: the block is listed but not run.
 - `<!-- bench: ros2 -->` above a block of doc/howto/install.md: the block builds the command `ros2`.
-  It runs before the first command that needs `ros2`, if there is none.
+  If `ros2` is not installed, the block runs before the first command that needs it.
 
 `REPOSITORY` stands for a clone of the committed state. The shell has no ROS and a separate home. A
 page ends at its first command that fails; the exit status is then 1. The first page installs about
@@ -48,7 +48,7 @@ INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'
 FUNCTIONS = f"""
 exec 2>&1
 declare -A running=()
-stop() {{ # SCRIPT: ends what runs in the background
+stop() {{ # SCRIPT: ends the command in the background that runs this script
   local pid=${{running[$1]-}}
   [ -n "$pid" ] || return 0
   kill -INT -- -"$pid" 2>/dev/null
@@ -56,7 +56,7 @@ stop() {{ # SCRIPT: ends what runs in the background
   unset "running[$1]"
 }}
 trap 'for script in "${{!running[@]}}"; do stop "$script"; done' EXIT
-ask() {{ # COMMAND: fails if the command does or does not end, or if its answer is a refusal
+ask() {{ # COMMAND: fails if the command fails, does not end, or prints a refusal
   eval "timeout {ANSWER_PATIENCE} $1" | tee answer.log
   [ "${{PIPESTATUS[0]}}" = 0 ] &&
     ! grep -qE 'success(ful)?=False|[Ss]etting parameter failed' answer.log

@@ -6,18 +6,20 @@
 New individuals explore and learn for an hour of simulated time each. The cores of estimator,
 controller and learner run in one process. They exchange messages as their nodes do, best-effort and
 with a queue of QUEUE messages. With --load, the computer is busy. The driver and each node then
-wait for the processor: each time by WAIT, and every STALL_EVERY by STALL, in the mean and for each
-process per core. What arrives meanwhile waits as well. When the process continues, it takes the
-oldest message at once. Of the others it finds only the last QUEUE, so that a late message is
-followed by one that was sent much later. The modules and the arm do not wait.
+wait for the processor: WAIT on average before each run, and once in STALL_EVERY another STALL.
+These times are multiplied by the number of other processes per core. Messages that arrive meanwhile
+wait as well. When the process continues, it takes the oldest message at once. Of the others it
+finds only the last QUEUE, so that a late message is followed by one that was sent much later. The
+modules and the arm do not wait.
 
 The constants are as severe as a measurement on two cores at a load of 20. A process woke up 100
 times a second and computed for a few milliseconds. It took 13 ms in the mean and 46 ms in 1 % of
 all cases. Ten times in 150 s it stood still for 0.12 to 0.41 s.
 
-The bench prints the false findings and stops, the pauses (which end by themselves, such as those
-without messages for 0.2 s), the messages that the controller lost, and their longest delay. An
-individual's hour ends with its first finding or stop. Exit status 1 if there was one.
+The bench prints the false findings and stops, the pauses (stops that end by themselves, for example
+after 0.2 s without messages), the number of messages that the controller lost, and the longest
+delay of a message. An individual's hour ends with its first finding or stop. Exit status 1 if there
+was one.
 """
 
 from __future__ import annotations
@@ -219,7 +221,8 @@ class BusyLoop:
             use()
         self._reliable.clear()
         was_running = core.supervisor.is_running
-        if now - core.watchdog.age.stepped_at > 1.5 * SAMPLE_TIME:  # the timer of the node
+        # Without an estimate for 1.5 periods, the timer of the node steps the controller.
+        if now - core.watchdog.age.stepped_at > 1.5 * SAMPLE_TIME:
             self._command_by(core, now)
         estimates, self._estimates = self._estimates[-QUEUE:], []
         for message, theta in zip_longest(self.controlling.receive(now), estimates):

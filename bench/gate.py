@@ -69,7 +69,8 @@ class Spread:
     def __init__(self) -> None:
         """Start with no network."""
         self.most: defaultdict[str, float] = defaultdict(float)
-        #: smallest d of a ruptured muscle, as a multiple of the detection threshold
+        #: largest d among the ruptured muscles of a network, as a multiple of the detection
+        #: threshold; the smallest of these values over all networks
         self.least_ruptured = np.inf
         self.refused, self.count = list[str](), 0
 

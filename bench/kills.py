@@ -30,10 +30,10 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-LONGEST = 6.0  # latest time of a kill [s]; until then, a child has started, trained and saved
+LONGEST = 6.0  # latest time of a kill [s]; by then, a child has started, trained and saved
 SPACING = 0.02  # time between two samples [s]
 STEPS = 20  # training steps of an update; few, so that many saves are interrupted by a kill
-DEADLINE = 60.0  # longest time in which a child may start [s]
+DEADLINE = 60.0  # longest wait for a child to start [s]
 
 
 def samples(robot: Robot, life: int) -> Iterator[Sample]:

@@ -46,7 +46,7 @@ WRIST_WIRES = {
         'flexor_carpi_ulnaris': 225, 'flexor_carpi_radialis': 315},
     3: {'extensor_carpi': 90, 'flexor_carpi_ulnaris': 210, 'flexor_carpi_radialis': 330},
 }  # fmt: skip
-WRIST_RADIUS = 0.044  # distance of the tendons from the axis of the wrist [m]
+WRIST_RADIUS = 0.044  # distance of the wrist's tendons from the long axis of the forearm [m]
 NECK = """<r>
   <joint name="neck_pitch" type="revolute"><parent link="torso"/><child link="neck_pitch_link"/>
     <origin xyz="0 0 0.10"/><axis xyz="0 1 0"/>
@@ -77,7 +77,8 @@ NECK_WIRES = {
     'splenius': ((154, 0.072, 0.035), (95, 0.070, 0.019)),
     'semispinalis': ((143, 0.070, 0.031), (104, 0.060, 0.050)),
 }
-#: intended moment arms of the wrist's tendons as in moment_arms.csv: muscle, joint, sign
+#: intended moment arms of the wrist's tendons: beginning of the tendon's name, and joint and sign
+#: as in moment_arms.csv
 WRIST_SIGNS = [('extensor', 'wrist_flexion', '+'), ('flexor', 'wrist_flexion', '-')]
 Muscle = dict[str, Any]
 

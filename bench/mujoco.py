@@ -19,9 +19,10 @@ columns of a row are
   and after learning with preset `default` [rad, norm over the joints],
 - the numbers of ruptures that were detected, and attributed to the right muscle,
 - the error while the arm follows four trajectories of 2 s between holdable postures, the first of
-  which is approached in 3 s [rad]. Only motions that the muscles of the individual can exert are
-  measured, with tendon friction, damping of the joints, and a reserve of 15 % of the tensions. If
-  there are fewer than four among 400 random postures, their number replaces the error,
+  which is approached in 3 s [rad]. Only motions for which the individual's muscles are strong
+  enough are measured, considering tendon friction, damping of the joints, and a reserve of 15 % of
+  the tensions. If there are fewer than four among 400 random postures, their number replaces the
+  error,
 - the error after 5 s of holding a posture in which the arm was placed [rad, mean over five holdable
   postures],
 - errors of moment arms [mm, median over the muscles]: of the exported model relative to the
@@ -76,7 +77,7 @@ HEAD = (
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
 MOMENTS = 25  # number of moments at which the torque of a motion is evaluated
-LEAST_TORQUE = 1e-6  # missing torque above which the muscles cannot exert a motion [N·m]
+LEAST_TORQUE = 1e-6  # missing torque from which on the muscles are too weak for a motion [N·m]
 HOLDING = 5.0  # time for which a posture is held [s]
 ARM_POSTURES = 300
 RATE = 100.0  # rate of muscle_states with --nodes [Hz]

@@ -116,7 +116,8 @@ def _environment(home: Path) -> dict[str, str]:
     }
     paths = kept.get('PATH', '').split(os.pathsep)
     kept['PATH'] = os.pathsep.join(path for path in paths if not path.startswith(sys.prefix))
-    # HOME changes below, so name the user's pip cache: it saves the downloads.
+    # By default, pip's cache is in HOME, which changes below. Keep the user's cache, so that pip
+    # does not download all packages again.
     kept.setdefault('PIP_CACHE_DIR', str(Path.home() / '.cache' / 'pip'))
     return {**kept, 'HOME': str(home)}
 

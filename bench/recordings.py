@@ -53,7 +53,8 @@ class Split(NamedTuple):
     test: Run  # all rows
     #: `training` by run, to which `Statics` is fitted; empty if it is not fitted to this split
     rests: list[Run]
-    #: all rows of the training runs; if given, polynomials are fitted to them as well
+    #: all rows of the training runs or poses, not only rests; polynomials are fitted to them as
+    #: well
     full: Run | None = None
 
 

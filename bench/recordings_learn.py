@@ -26,8 +26,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
 INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
-#: tension [N] that stands for a strong effort (the 95 % quantile of the training rests), in models
-#: that take efforts for tensions
+#: tension above T_bias [N] that stands for a strong effort (the 95 % quantile of the training
+#: rests), in models that take efforts for tensions
 STRONG = 40.0
 
 Model = Callable[[Run], Array]  # returns θ [rad], (N, D)
@@ -175,7 +175,8 @@ def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float
     """Estimate each run's payload by ridge regression on the other runs; return R².
 
     The inputs are the means of lengths, and optionally efforts and θ, at the last rest of each run.
-    R² is 1 if all payloads are estimated exactly, and 0 or less if the mean payload is as good.
+    R² is 1 if all payloads are estimated exactly, and 0 or less if the mean payload of the other
+    runs is at least as good an estimate.
     """
     rests = [run.at_rest(slice(-1, None)) for run in runs]
     parts = [[run.length[0]] for run in rests]

@@ -7,7 +7,8 @@
 Each package is cloned from the release repository that the packages of apt are built from, and
 compiled against the ROS wheels in a separate virtual environment. The result is a wheel, which pip
 installs into the virtual environment of this Python, so `pip uninstall ros-tf2-msgs` removes it.
-The bench needs git, a C++ compiler and the headers of Python, and one to three minutes a package.
+The bench requires git, a C++ compiler and the headers of Python. It takes one to three minutes a
+package.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from musculoskeletal_ae.options import Parser
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt', ROOT / '.ci' / 'requirements-ros-build.txt'
-#: paths of the machine that built the wheels, which their CMake files contain
+#: paths of the machine that built the wheels; the CMake files in the wheels contain them
 BUILD_PATHS = re.compile(r'/(?:opt/python|usr/lib64)/[^";]*')
 
 

@@ -183,6 +183,7 @@ def main(argv: list[str]) -> None:
     args = parser.parse_args(argv)
     if unknown := set(args.bodies) - {SMALLEST, *BODIES}:
         parser.error(
-            f'--bodies: no {", ".join(sorted(unknown))}, only {", ".join((SMALLEST, *BODIES))}'
+            f'--bodies: unknown bodies {", ".join(sorted(unknown))}; legal: '
+            f'{", ".join((SMALLEST, *BODIES))}'
         )
     run(args.bodies, args.minutes, args.out)

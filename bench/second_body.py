@@ -22,7 +22,8 @@ checkpoint validation, which the paper does not have; `after` is the error of th
      205                0.483          31                0.534  0.105             88     0.95
     mean                0.378          31                0.528  0.106             98     0.76
 
-Eight of the ten, with the middles of the ranges, and half of the tendons without kinks:
+Eight of these individuals, with each effect at the middle of its range, and half of the tendons
+without kinks:
     mean                0.372          33                0.680  0.111             83     0.77
 """
 

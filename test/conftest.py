@@ -61,7 +61,8 @@ def pytest_collection_modifyitems(items: list[Any]) -> None:
     for fixture in ('both_cores', 'graph', 'quick'):
         shares.append([item for item in remaining if fixture in item.fixturenames])
         remaining = [item for item in remaining if fixture not in item.fixturenames]
-    # By option `--dist worksteal`, each process receives one of as many equal parts of the list.
+    # The option `--dist worksteal` divides the list into as many equal parts as there are
+    # processes.
     processes = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
     for share in shares[: processes - 1]:
         missing = max(0, len(items) // processes - len(share))

@@ -60,8 +60,8 @@ class Bench:
     """A controller with healthy sensor data, unless a test changes them."""
 
     def __init__(self, mae=None, **chosen):
-        # The bench's arm does not move. With a duration of 0, targets are reached by ramps of
-        # lengths, which do not need a moving arm.
+        # The bench's arm does not move. With a `target_duration` of 0, lengths ramp to those of the
+        # target, which does not require a moving arm.
         self.core = Controller(ROBOT, Settings(**{'target_duration': 0.0, **chosen}))
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)
@@ -70,7 +70,7 @@ class Bench:
         self.blind = set()
 
     def step(self, count=1):
-        """Run `count` steps of 10 ms with the sensor data of the bench; return the commands."""
+        """Run `count` steps of `dt` with the sensor data of the bench; return the commands."""
         sent = []
         for _ in range(count):
             self.now += self.dt

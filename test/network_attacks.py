@@ -93,7 +93,7 @@ ATTACKS: Mapping[str, Attack] = {
     'one length 0.2 m off': _shifted(2, 2.0),
     'standardisation × 2': _scaled_std(2.0, slice(None)),
 }
-SCALED = 10.0  # the network scales lengths: units per metre
+SCALED = 10.0  # factor by which the network scales lengths [1/m]
 #: bad networks that only a comparison with the arm's own messages reveals
 ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures control of the nominal body, where all errors are those of the network.
 
-1. posture: error and ‖T‖ where the arm settles under the lengths of each method. The bound is that
-   of lengths by the true body, with T by QP on the true G.
+1. posture: error and ‖T‖ where the arm settles under the lengths of each method. The bound uses the
+   lengths of the true body at the least tension that holds the posture with the true G.
 2. stiffness: deflections by a push at a low and at a high stiffness (the lower and the upper
    quarter of the reported reachable range). Their ratio is compared with the predicted one.
 """

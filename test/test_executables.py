@@ -63,7 +63,7 @@ def test_there_is_an_executable_for_every_node_and_tool():
     assert all(executable(name) for name in (*NODES, *TOOLS))
 
 
-# Help of the other nodes: see test_parameters.
+# test/nodes/test_parameters.py checks the help of the other nodes.
 @pytest.mark.parametrize('name', [*COMBINED, *TOOLS])
 def test_help_loads_nothing_that_takes_long(name):
     # Help takes 0.1 to 0.4 s of CPU time, because no large module is imported. It must also work on

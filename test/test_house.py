@@ -53,7 +53,7 @@ def test_only_nodes_imports_ros() -> None:
 
 
 def test_no_module_imports_itself_in_a_circle() -> None:
-    # Also imports within functions count, but not those for annotations alone.
+    # Imports within functions count as well, but imports for annotations alone do not.
     modules = {'.'.join(f.relative_to(ROOT).with_suffix('').parts): f for f in sources(PACKAGE)}
     graph = {name: runtime_imports(file) & set(modules) for name, file in modules.items()}
     tuple(TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle

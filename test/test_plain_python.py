@@ -85,7 +85,7 @@ def test_the_tests_import_only_what_the_requirements_of_the_tests_bring():
     own = {path.stem for path in (*tests.rglob('*.py'), *(ROOT / 'doc').glob('*.py'))}
     own |= {path.name for path in tests.iterdir()} | {'bench'}
     brought = {module: distribution(module) for module in imported(tests.rglob('*.py')) - own}
-    # Message packages and rclpy are not listed: the wheels of ROS, or Jazzy, bring them.
+    # rclpy and the message packages need no entry: a sourced Jazzy or the ROS wheels provide them.
     of_ros = ('_msgs', '_srvs', '_interfaces', 'rclpy')
     missing = {m for m, name in brought.items() if name not in listed and not m.endswith(of_ros)}
     assert missing == set()

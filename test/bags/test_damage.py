@@ -77,7 +77,7 @@ def test_damage_is_never_read_without_a_word(recording, content, tmp_path):
             continue
         if all(file.has_checksums for file in bag.files):
             assert messages == (expected[: len(messages)] if bag.unfinished else expected), trial
-        else:  # without checksums, changed data cannot be noticed, but no message may be missing
+        else:  # without checksums, changed data cannot be noticed, but a missing message must be
             assert bag.unfinished or len(messages) == len(expected), trial
 
 

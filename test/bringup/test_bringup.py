@@ -218,7 +218,7 @@ def test_of_two_arms_one_learns_and_the_other_detects_a_rupture_and_names_a_dead
     graph.wait(lambda: len(learned) > 4, 'four updates of the network', 8 * DEADLINE)
     assert ports_in_shared_memory(left) == []
     graph.wait(lambda: len(errors(left.output, LEARNED)) >= 5, 'five status lines')
-    # SIGKILL leaves no process.
+    # Even SIGKILL of bringup.sh must leave no process behind.
     _, output = graph.ended(left, signal.SIGKILL)
     before, after = errors(output, INITIAL), errors(output, LEARNED)
     # Measured over seeds and runs: an error of 0.05 to 0.13 rad falls to between a tenth and a

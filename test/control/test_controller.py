@@ -357,7 +357,7 @@ def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
     bench.target(REST)
     bench.step(200)
-    if chosen['method'] == 'stiffness':  # measure the tensions that this method demands
+    if chosen['method'] == 'stiffness':  # let the sensors read the tensions that it demands
         bench.tension = bench.follower.plan.tension.bone
     still = bench.step(200)[-1].value
     bench.theta = REST + 0.05

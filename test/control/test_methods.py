@@ -47,8 +47,8 @@ def test_with_an_exact_body_image_the_arm_settles_at_the_target_with_the_least_t
         arm.command_length(solution.length)
         arm.step(0.02)
     assert np.linalg.norm(arm.theta - theta) < 0.01
-    # A longer tendon stretches more. This reduces the torque of a muscle by up to 0.5 %, and raises
-    # the tension that is needed.
+    # A tendon stretches in proportion to its length. The stretch reduces the torque of a muscle by
+    # up to 0.5 %, so holding the posture takes more than the least tension of rigid tendons.
     assert np.linalg.norm(solution.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
     assert not solution.missing_torque.any()
 
@@ -129,5 +129,6 @@ def test_with_a_network_proposed_settles_nearer_than_first_and_near_the_least_te
     assert error < 0.03
     assert error < 0.2 * table['first'].mean(axis=0)[0]
     assert tension == pytest.approx(bound, rel=0.02)
-    # The bound commands the lengths of the true body at the least tension, so it has no error.
+    # The bound commands the lengths of the true body at the least tension, so it has hardly any
+    # error.
     assert table['bound: QP on the true body'][:, 0].max() < 0.01

@@ -232,7 +232,7 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
 
     Args:
         arm: The emulated arm.
-        intervals: Times between two messages [ms], of which each is drawn at random.
+        intervals: Times [ms] from which each time between two messages is drawn at random.
         push: Force on the hand [N].
         chosen: Settings of the controller.
     """

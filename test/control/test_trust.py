@@ -249,7 +249,8 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
     bench.now += pause
     sent = bench.step(100)
     assert bench.cause == ''
-    # After a pause, the controller reckons with LONGEST_STEP at most, which is 10 ticks.
+    # However long the pause was, the controller limits the change of the command to that in
+    # LONGEST_STEP, which is 10 ticks.
     assert np.abs(values(sent)[0] - before.value).max() <= 10 * TICK + 1e-9
     assert pause > OWN_PAUSE
 

@@ -138,8 +138,8 @@ def test_creep_is_the_same_in_every_decade_of_time(robot):
         arm.step(seconds)
         crept.append(arm._memory.slow[:, :4].sum(axis=1) / arm._memory.elongation)
     decades = np.diff(crept, axis=0) / [[1.0], [np.log10(5.0)]]
-    # An individual creeps by 2/3 to 4/3 of 4 % of the elongation per decade. The few elements that
-    # are summed here contribute at least half of that.
+    # An individual creeps by 2/3 to 4/3 of 4 % of the elongation per decade. The model approximates
+    # the logarithm of time by four exponentials, so the creep may be 0.5 to 1.5 times as large.
     assert np.all((decades > 0.5 * 0.04 * 2.0 / 3.0) & (decades < 1.5 * 0.04 * 4.0 / 3.0))
 
 

@@ -167,7 +167,8 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
             core.take(broken, at, at)
         return core.body.isolated == (2,)
 
-    # Two bad messages with three good messages between them, then with a pause of 5 s.
+    # Two bad messages isolate no muscle if three good messages, or a pause of 5 s, lie between
+    # them.
     for good, pause in ((3, 0.01), (0, 5.0)):
         assert not isolates(now)
         for _ in range(good):

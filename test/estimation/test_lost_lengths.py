@@ -140,7 +140,7 @@ def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae
 def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arrive(
     robot, mae, muscle
 ):
-    """The module of a ruptured tendon winds it in; it is to be repaired, and the rest is valid."""
+    """The module winds in the ruptured tendon; only this muscle needs a repair."""
     arm = MovingArm(robot, mae)
     arm.go(8.0)
     ruptured = np.eye(6)[muscle]

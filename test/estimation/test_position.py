@@ -22,7 +22,7 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (600, 2)) * [1.0, 1e-4]
 
 
 def readings(mae, shorter=0.0):
-    """Return l and T with one muscle without tension, `shorter` [m] than a slack tendon."""
+    """Return l and T; one muscle has no tension, and is `shorter` [m] than a slack tendon."""
     length, tension = rest_readings(ROBOT, THETA, np.full(ROBOT.muscle_count, 60.0))
     tension = tension.copy()
     tension[MUSCLE] = 0.0

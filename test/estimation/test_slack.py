@@ -22,7 +22,7 @@ def noticed(robot, mae, slack):
     """Return a function that returns the time [s] until a muscle without tension is reported."""
 
     def run(speed, until, longest=20.0, settings=None):
-        """Wind in `until` [m] at `speed` [m/s], then stand; return the time of the finding [s]."""
+        """Wind in `until` [m] at `speed` [m/s], then stop; return the time of the finding [s]."""
         health, rng = HealthMonitor(robot, settings=settings), np.random.default_rng(0)
         health.use(mae)
         state = mae.estimate(*slack)

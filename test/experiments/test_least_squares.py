@@ -45,8 +45,8 @@ def body(robot, name):
 def test_least_squares_is_exact_on_its_own_body(robot, name):
     rng = np.random.default_rng(1)
     estimator, lengths = body(robot, name)
-    # Draw postures away from the joint limits, where θ is clipped, and near mid-range, where the
-    # search starts.
+    # Draw postures near mid-range, where the search starts. At the joint limits, θ would be
+    # clipped.
     middle, half = 0.5 * (robot.lower + robot.upper), 0.25 * (robot.upper - robot.lower)
     theta = middle + half * rng.uniform(-1.0, 1.0, (COUNT, robot.joint_count))
     tension = rng.uniform(30.0, 130.0, (COUNT, robot.muscle_count))

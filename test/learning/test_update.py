@@ -241,7 +241,8 @@ def test_the_covariance_of_a_network_covers_its_errors_and_is_saved(arm26, learn
     error = mae.estimate(tension, length).theta - theta
     distance = np.einsum('ni,ni->n', error, np.linalg.solve(mae.covariance, error.T).T)
     inside = (distance <= QUANTILE).mean()
-    # The ellipsoid covers 95 % if the errors follow the prior; this body is drawn from it.
+    # The ellipsoid covers 95 % of the errors if they follow the prior. This body is drawn from the
+    # prior.
     assert inside > 0.8
     spread = np.sqrt(np.diag(mae.covariance))
     assert (spread < 5.0 * error.std(axis=0)).all()

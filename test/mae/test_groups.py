@@ -16,7 +16,8 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.groups import Group, groups
 from musculoskeletal_ae.robot.robot import Robot
 
-# Three limbs. The numbers of their joints and muscles are mixed, as a user may list them.
+# Three limbs. The indices of their joints and muscles are interleaved, because a user may list
+# joints and muscles in any order.
 LIMBS = (Group((0, 4), (1, 6, 7, 8)), Group((1,), (0, 5)), Group((2, 3), (2, 3, 4)))
 JOINTS, MUSCLES = 5, 9
 

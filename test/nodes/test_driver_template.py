@@ -48,8 +48,8 @@ def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(gra
     assert (
         not done and 'subscribes to muscle_length_command only; legal: geometric, first' in reason
     )
-    # The first refusal shows that the driver's subscription is known. Before, an attempt may have
-    # set `float`.
+    # The first refusal shows that the driver's subscription is known. An attempt before that may
+    # have set `float`.
     assert core.settings.method in ('proposed', 'float')
     graph.listen(Float64MultiArray, 'muscle_tension_command')
     graph.wait(lambda: graph.set_parameter('controller', 'method', 'tension')[0], 'no refusal')

@@ -75,7 +75,7 @@ def test_no_request_or_clock_ends_a_node(graph, node):
     names = [*PARAMETERS[node], 'use_sim_time', 'start_type_description_service', *NAMES]
     lists = [[], names, names[:1] * 3, *([name] for name in NAMES)]
     for value in strange_values():
-        # Set all parameters to this strange value: first each for itself, then together.
+        # Set all parameters to this strange value: first independently, then all or none.
         parameters = [Parameter(name=name, value=value) for name in names]
         results = graph.call(
             SetParameters, f'{node}/set_parameters', SetParameters.Request(parameters=parameters)

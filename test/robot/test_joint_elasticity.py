@@ -277,7 +277,8 @@ def test_an_update_publishes_learned_springs_and_control_uses_them(springy):
         for torque in (core.robot.kinematics.holding_torque(theta), before)
     )
     assert off < 0.3 * nominal
-    # The estimator has a robot with the learned springs; the original must not change.
+    # The controller uses a copy of the robot with the learned springs. The original must not
+    # change.
     assert springy.kinematics.elasticity is springy.description.joint_elasticity
 
 

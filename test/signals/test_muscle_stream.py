@@ -189,7 +189,7 @@ def steady(count=20):
 
 
 def test_a_change_during_lost_messages_is_no_jump_even_if_the_message_before_was_late():
-    # One message waits for 0.2 s; those of the next 0.2 s are lost.
+    # One message waits for 0.2 s, and the messages sent in the next 0.2 s are lost.
     bunch = [(0.4, 0.2, 0.0), (0.401, 0.4, 0.046), (0.41, 0.41, 0.047)]
     assert all(taken(MuscleStream(ROBOT), steady() + bunch))
     late = steady() + [(0.4, 0.4, 0.0), (0.401, 0.401, 0.046)]
