@@ -40,7 +40,7 @@ def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
         return file.open('rb')
     except OSError as error:
         raise refuse(file, f'cannot be read: {error.strerror}') from error
-    except ValueError as error:  # a NUL in the path
+    except ValueError as error:  # a NUL in the path raises a ValueError
         raise refuse(file, f'cannot be read: {error}') from error
 
 
@@ -201,7 +201,7 @@ def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:
         with os.fdopen(descriptor, 'wb') as stream:
             stream.write(data)
             stream.flush()
-            os.fchmod(stream.fileno(), 0o644)  # mkstemp creates a file only its owner can read
+            os.fchmod(stream.fileno(), 0o644)  # mkstemp lets only the owner read the file
             os.fsync(stream.fileno())
         if previous is not None and file.exists():
             file.replace(previous)

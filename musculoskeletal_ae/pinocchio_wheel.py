@@ -34,7 +34,7 @@ def prefer_wheel() -> None:
     if bindings is None:
         return
     sys.path.remove(bindings)
-    sys.path.insert(0, bindings)  # affects pinocchio only: this folder has no other packages
+    sys.path.insert(0, bindings)  # this folder contains only pinocchio and its dependencies
     prefix = Path(bindings).parents[2]
     searched = filter(None, os.environ.get('LD_LIBRARY_PATH', '').split(os.pathsep))
     if any(Path(folder, name).exists() for folder in searched for name in LIBRARIES):

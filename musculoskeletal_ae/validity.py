@@ -30,7 +30,8 @@ MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
 LAST_VELOCITY = 1e-6  # highest velocity at the end of a trajectory [rad/s]
 MOST_EFFORT = 1000.0  # highest torque that may be requested of one joint [N·m]
-MOST_ISOLATED = 1e6  # largest value kept of an isolated muscle; powers of larger values overflow
+#: largest value of an isolated muscle that is kept; much larger values could overflow when squared
+MOST_ISOLATED = 1e6
 UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
 QUANTITIES = ('length', 'tension', 'temperature')
 

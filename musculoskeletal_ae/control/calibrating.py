@@ -15,9 +15,10 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
 SPEED = 0.05  # fastest change of a length command [m/s]
-DURATION = 1.5  # duration of a step [s]
+DURATION = 1.5  # duration of a step, which takes longer if SPEED requires it [s]
 REST = 0.25  # duration of the rest after a step [s]
-REACH = 0.7  # largest change of each joint in a step [rad]; for prismatic joints times RACK [m]
+#: largest change of each joint in a step [rad]; for prismatic joints times `kinematics.RACK` [m]
+REACH = 0.7
 INSIDE = 0.1  # smallest distance of goals from the joint limits, as a fraction of the joint range
 GOALS = 20  # number of random goals among which a holdable goal is sought
 SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limit

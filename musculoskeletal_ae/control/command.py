@@ -28,9 +28,9 @@ class Command(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """Tensions [N] of the muscles, (M,) each."""
+    """Tensions [N] of the muscles, (M,) each; 0 for isolated muscles."""
 
-    motor: Array  # motor-side tension T, as measured
+    motor: Array  # motor-side tension T: measured, or where that is impossible, assumed
     bone: Array  # bone-side tension T_end, after tendon friction
 
 

@@ -58,11 +58,12 @@ RESTORE = 'call estimator/restore to use isolated muscles again'
 GUIDED = (
     'with method `float`, the arm is guided by hand; set the parameter `method` to another method'
 )
-#: longest time in which the estimator isolates the suspect of an anomaly, or reacts to a length
-#: jump [s]
+#: Longest time by which the message on the isolation of a suspect may precede the message on its
+#: anomaly [s]. It is also the longest time that the estimator needs to revoke the length offsets
+#: after a jump of lengths.
 REACTION_TIME = 1.0
-#: time in which a length calibration provides its first estimate [s]; this takes 3.5 s if messages
-#: arrive at 10 Hz
+#: longest time that a length calibration needs for its first estimate [s]; if messages arrive at
+#: 10 Hz, it needs 3.5 s
 FIRST_ESTIMATE = 5.0
 APPROACHES = 3  # number of further attempts to reach a target if an arm with isolated muscles falls
 
@@ -481,7 +482,7 @@ class Controller:
             known = self.stream.body.offsets.known
             exploring = Activity.EXPLORING if known else Activity.CALIBRATING
             self._request(exploring if wanted else Activity.IDLE)
-        elif not wanted:  # also prevents exploring again after the present stop
+        elif not wanted:  # an exploration that a stop has interrupted must not resume
             self.supervisor.on_request(self.supervisor.activity)
         return ''
 
@@ -533,8 +534,8 @@ class Controller:
             now: Time of the steady clock [s].
             time: Time of the messages' clock [s]; None if this is the steady clock.
         """
-        # The rate limit applies to the time between publications. Therefore the time in which the
-        # last command was computed is subtracted.
+        # The rate limit applies to the time since the last publication. The time since the last
+        # step is longer, because it also contains the computation of the last command.
         computing = max(self.sent_at - self.watchdog.age.stepped_at, 0.0)
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
@@ -542,10 +543,10 @@ class Controller:
             self.activities.entered = None
         present = self.conditions(now)
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
-        if stale_estimate:  # a restarted estimator no longer has a suspect
+        if stale_estimate:  # the estimator may have restarted, and then no longer has a suspect
             self.supervisor.on_suspect(False)
         if self.limiter.command is not None or not self.supervisor.is_running:
-            # Before the first command there is no motion to stop.
+            # Before the first command, causes do not stop the arm, because it does not move yet.
             self.supervisor.on_conditions(present, step.elapsed, self.stopping.is_releasing)
         fall = self.limiter.largest_change(TENSION, step.dt)
         self.watchdog.heat.lower(self.settings.temperature_limit, fall)
@@ -645,7 +646,8 @@ class Controller:
             self.stopping.enter()
         if self.sample is None:
             return None
-        # A paused arm whose data is available again waits: the hold time does not advance.
+        # After an auto-recoverable cause has cleared, the arm waits to resume. This time does not
+        # count towards the hold time.
         waits = not self.supervisor.is_latched and not present
         causes = {condition.cause for condition in present}
         is_fresh = StopCause.STALE_MUSCLE_STATES not in causes

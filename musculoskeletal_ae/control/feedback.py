@@ -13,13 +13,15 @@ from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-REPLAN = 5.0  # change of a relevant tension limit that requires a new plan [N]
-CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times RACK [m]
-#: Largest estimated error that is not corrected [rad], for prismatic joints times RACK [m]. It is
-#: about as large as the error of the estimate. Without this dead band, an arm with friction would
-#: never rest.
+#: A change of a tension limit by more than this requires a new plan, if the planned tension is also
+#: nearer to the limit than this [N].
+REPLAN = 5.0
+CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times `kinematics.RACK` [m]
+#: Largest estimated error that is not corrected [rad]; for prismatic joints times `kinematics.RACK`
+#: [m]. It is about as large as the error of the estimate. Without this dead band, an arm with
+#: friction would never rest.
 DEADBAND = 0.03
-RELIEF_INTERVAL = 0.1  # time between two computations of the needless tension [s]
+RELIEF_INTERVAL = 0.1  # shortest time between two computations of the needless tension [s]
 PROPORTIONAL = 0.7  # proportional gain k_p in motion
 INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
 SETTLING = 0.5  # time after the end of the feedback in motion until the arm counts as resting [s]

@@ -50,8 +50,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
-SETTLING = 0.8  # time after the end for which the feedback of the motion continues [s]
-#: The limiter holds a muscle back if its published command is longer than desired by more [m].
+SETTLING = 0.8  # time after a trajectory for which the feedback of the motion continues [s]
+#: The limiter holds a muscle back if it has made the command longer by more than this [m].
 HELD_BACK = 1e-4
 
 

@@ -27,8 +27,8 @@ from musculoskeletal_ae.validity import TrajectoryPoints
 #: tolerances [m] and [rad] of the inverse kinematics for a whole pose, and for its position only
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
 FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
-TURNED = 0.05  # a pose is unreachable if the orientation of the hand differs by more [rad]
-SHORTEST = 0.3  # shortest movement to a single pose [s]
+TURNED = 0.05  # a pose is unreachable if the hand's orientation differs by more than this [rad]
+SHORTEST = 0.3  # shortest duration of a movement to a single pose [s]
 PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
 PATH_INTERVAL = 0.25  # longest interval between two poses that form a path [s]
 PATH_SPEED = 1.0  # highest speed of the hand between two poses that form a path [m/s]
@@ -106,7 +106,8 @@ class Hand:
                 before = self._interval or interval
                 self._interval = before + INTERVAL_WEIGHT * (interval - before)
                 velocity = (theta - last[2]) / self._interval
-                # Extrapolate the path for as long as joining it takes, then return to the pose.
+                # If the arm joins the path only after the next pose is due, extrapolate the path
+                # until then. Afterwards, come to rest at the last pose.
                 ahead = max(self._interval, JOINING)
                 further = theta + (ahead - self._interval) * velocity
                 path = np.array([np.clip(further, robot.lower, robot.upper), theta])

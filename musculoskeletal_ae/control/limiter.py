@@ -3,8 +3,8 @@
 
     desired ─► rate limit ─► tension limit ─► finite check ─► published
 
-Muscle stiffness control exerts T_bias + K (l − l_target). Therefore the tension limit of a muscle
-limits its commanded length:
+Muscle stiffness control exerts T_bias + K_stiff (l − l_target). Therefore the tension limit of a
+muscle limits its commanded length:
 
     l_target ≥ l + l_comp(T_limit) + r − λ max(0, −dl/dt),   l_comp(T) = −(T − T_bias) / K_stiff
     dr/dt = RELIEF (T − T_limit)/K_stiff,   0 ≤ r ≤ −l_comp(T_limit)
@@ -67,11 +67,13 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
-#: largest difference between the lengths of a real muscle and of its model [m]
+#: largest difference that is expected between the lengths of a real muscle and of its model [m]
 LENGTH_MARGIN = 0.03
-LONGEST_INTERVAL = 0.05  # longest time between two messages for which a rate is computed [s]
+LONGEST_INTERVAL = 0.05  # longest time between two messages from which dT/dt is computed [s]
 CONFIDENCE = 2.0  # number of standard deviations by which a measured tension may be too low
-RELIEF = 5.0  # gain of the tension feedback [1/s]; slow compared with the modules (30 ms)
+#: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the 30 ms
+#: of a module
+RELIEF = 5.0
 
 
 class CommandLimiter:
@@ -139,7 +141,7 @@ class CommandLimiter:
     def _length_demanding(self, tension: Array, sample: MuscleSample) -> Array:
         """Return lengths [m], (M,), that demand given tensions [N], (M,).
 
-        Of all lengths that do, these are as near to the last published lengths as possible.
+        Of all these lengths, those nearest to the last published lengths are returned.
         """
         robot = self._robot
         demand = np.maximum(tension, robot.tension.bias)
@@ -177,8 +179,8 @@ class CommandLimiter:
             tension_limit: Tension limit of each muscle in addition to `tension.limit` [N], (M,).
             dt: Time since the last command [s].
             lead: λ max(0, −dl/dt) of each muscle [m], (M,).
-            rejected: l [m] and T [N], (2, M), of messages that were rejected after the sample, or
-                None; see `RejectionError.pull`.
+            rejected: l [m] and T [N], (2, M), as in `RejectionError.pull`, if the newest message
+                was rejected; else None.
 
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
@@ -191,8 +193,8 @@ class CommandLimiter:
         before = self.last(kind, sample).value
         change = self.largest_change(kind, dt)
         value = np.clip(desired.value, before - change, before + change)
-        # Use the limits of the full description: isolated muscles have a limit of 0 in `_robot`,
-        # but a suspect is wound in to verify it.
+        # Isolated muscles have a limit of 0 in `_robot`. Use the limits of the full description
+        # instead, because a suspect is isolated, but is wound in to verify the fault.
         limit = np.minimum(tension_limit, self._robot.description.tension.limit)
         limit = self._certain(limit, sample)
         if kind == TENSION:

@@ -40,16 +40,18 @@ SOLVES = 2
 # muscle is stiff in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6  # largest number of iterations of Gauss–Newton and of Frank–Wolfe
-# Weight of the least tension relative to the stiffness. A reachable stiffness is missed by about
-# this share.
+# Weight of the distance from the initial tensions (at first the least tensions), relative to the
+# weight of the stiffness error. A reachable stiffness is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
 # Step lengths of the line search towards a corner of the feasible tensions. The full step need not
 # be the best, because K is concave in each tension.
 SHARES = (1.0, 0.5, 0.25, 0.125)
-FAR = 1e5  # scale of the gradient that makes a quadratic programme practically linear [N²]
-LEVELS = 8  # number of tensions between T_bias and limit at which the elongation is evaluated
-# Step of the finite difference of G [rad]: small relative to changes along a route, large relative
-# to errors of the MAE.
+# Distance of a point from the present tensions along the gradient of K [N]. It is so large that the
+# feasible tensions nearest to the point are those at which a linear approximation of K is extreme.
+FAR = 1e5
+LEVELS = 8  # number of tensions from T_bias to T_limit at which the elongation is evaluated
+# Step of the finite difference of G [rad]. A larger step would average over the curvature of the
+# routes, and a smaller step would amplify the errors of the network.
 STEP = 0.05
 
 
@@ -228,7 +230,7 @@ def stiffness_command(
     rounds = SOLVES if near is None else 1
     tension = tension if near is None else near
     model = StiffnessModel.read(robot, mae, theta, tension)
-    # If the torque determines all tensions, there is no freedom to choose the stiffness.
+    # If no tensions within their limits exert the torque, the stiffness cannot be chosen.
     lowest = highest = np.diag(model.joint_stiffness(tension))
     for _ in range(rounds):
         programme = TensionProgramme(model.jacobian, torque, low, high)

@@ -28,8 +28,9 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import TrajectoryPoints
 
-#: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times RACK [m].
-#: The estimate of an arm that is held against a joint stop exceeds the limit by less than this.
+#: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]. The points of a replayed motion are estimated postures. The estimate of an
+#: arm that is held against a joint stop exceeds the limit by less than this.
 TOLERANCE = 0.01
 SAME = 1e-6  # relative difference below which two poses count as equal
 
@@ -103,8 +104,8 @@ class Planner:
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
         slower = exertion_slowness(self._robot, mae, planned, lag)
-        # If slowing a trajectory that starts in motion would take it beyond the joint limits, the
-        # arm follows the trajectory as requested and deviates from it.
+        # Slowing changes the path of a trajectory that starts in motion. If the slowed trajectory
+        # would leave the joint limits, keep the faster one, from which the arm may then deviate.
         with suppress(MessageError):
             planned = self._slowed(mae, planned.scaled(slower)) if slower > 1.0 else planned
         return Plan(planned)

@@ -10,13 +10,13 @@ from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
 #: error above which an arm with isolated muscles has fallen [rad]; for prismatic joints, the error
-#: divided by RACK counts
+#: divided by `kinematics.RACK` counts
 FALLEN = 0.2
 #: time for which a trajectory must have ended before the arm can count as fallen, and for which the
 #: error must exceed LOST before the arm counts as having lost its trajectory [s]
 FALLING = 2.0
 #: An arm with isolated muscles has lost its trajectory if the error exceeds this for the time
-#: FALLING [rad]. For prismatic joints, the error divided by RACK counts.
+#: FALLING [rad]. For prismatic joints, the error divided by `kinematics.RACK` counts.
 LOST = 0.4
 
 

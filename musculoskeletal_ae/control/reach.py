@@ -33,7 +33,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 # Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
 # RACK and become [m], and torques are divided by RACK and become [N].
 NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
-HALVINGS = 6  # bisection steps on the way to a posture that is not holdable
+HALVINGS = 6  # bisection steps in the search for the last holdable posture of a path
 
 PRICE = 20.0  # cost of missing torque [rad/(N·m)]
 USED = 0.85  # fraction of the tension range above T_bias that a path may use
@@ -233,7 +233,7 @@ class Roadmap:
 
     def _apparently_cheapest(self) -> list[int]:
         """Return the numbers of the postures of the cheapest path at the present costs."""
-        # Import here, because an arm without isolated muscles does not need scipy.
+        # Import here, because scipy loads slowly, and an arm with all muscles does not need it.
         from scipy.sparse.csgraph import dijkstra
 
         before = dijkstra(self._price, indices=[0], return_predecessors=True)[1][0]

@@ -27,7 +27,9 @@ class Settings:
         'joints (0 or []: unconstrained)',
         'N·m/rad or N/m',
         0.0,
-        MOST_STIFFNESS / 0.06**2,  # for prismatic joints; 0.06 is RACK, whose import is slow
+        # Largest value for prismatic joints. 0.06 is `kinematics.RACK`; importing it would also
+        # import pinocchio, which is slow.
+        MOST_STIFFNESS / 0.06**2,
     )
     first_duration: float = settable(
         5.0,

@@ -22,8 +22,9 @@ MOST_MOMENTS = 12_500
 
 #: factors by which a motion may be slowed until its tensions suffice, in ascending order
 SLOWER = tuple(1.1**k for k in range(17))
-#: The same factors for an arm with isolated muscles. Their large steps add to the reserve, because
-#: such an arm may fall where an arm with all muscles only deviates from its trajectory.
+#: The same factors for an arm with isolated muscles. Such an arm may fall where an arm with all
+#: muscles only deviates from its trajectory. It therefore needs more reserve, to which the large
+#: steps between these factors add.
 SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: smallest lag λ for which a motion is planned [s]; λ is measured only after the motion has begun
 LEAST_LAG = 0.02
@@ -33,7 +34,7 @@ MOST_EXERTIONS = 500
 
 
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
-    """Return the factor by which to slow a trajectory so that the muscle modules can turn as fast.
+    """Return the factor by which to slow a trajectory so that the muscle modules can follow it.
 
     Only the lengths at T_bias count. Changes of the tensions are ignored, because they are sudden,
     at any speed, near postures that are hard to hold; `SHARE` reserves speed for them. A trajectory

@@ -44,7 +44,8 @@ def report(core: Controller, now: float) -> Report:
     warnings = _warnings(core, values)
     condition, present = supervisor.condition, core.conditions(now)
     if condition is not None:
-        # Name every cause that is present, with its present details, because each refuses a reset.
+        # Name every cause that is present, with its present details, because each one prevents a
+        # reset.
         causes = {condition.cause: condition} | {each.cause: each for each in present}
         text = '; also '.join(map(str, causes.values()))
         steps = stops.remedy_of(causes, supervisor.explored)
@@ -176,7 +177,7 @@ def _fallen(core: Controller, estimate: Array) -> str:
     """
     mae, robot = core.mae, core.robot
     error = core.activities.follower.progress.error
-    assert mae is not None  # the arm has moved
+    assert mae is not None  # the arm has moved, which requires a network
     joint = int(np.abs(error / robot.kinematics.radian).argmax())
     distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
     text = f'the arm has fallen: {robot.joints[joint]} rests {distance} away from its target'

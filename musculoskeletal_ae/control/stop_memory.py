@@ -6,9 +6,9 @@
 
 While a controller commands the arm, the file names the stop cause `restarted`. A latched stop
 replaces this cause by its own. A controller that ends properly while no stop is latched deletes the
-file. The file therefore remains if the controller was stopped, was killed or has crashed. A
-controller that finds the file when it starts is stopped from the beginning, and moves the arm only
-after `controller/reset`.
+file. The file therefore remains if a stop was latched, and if the controller was killed or has
+crashed. A controller that finds the file when it starts is stopped from the beginning, and moves
+the arm only after `controller/reset`.
 """
 
 import fcntl
@@ -65,7 +65,7 @@ class StopMemory:
             self.close()
             remedy = 'stop that controller, or set another directory if it controls another arm'
             raise MusculoskeletalError(f'{name} is in use by a controller; {remedy}') from error
-        # ValueError: a NUL in the path. RuntimeError: the home directory is unknown.
+        # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
         except (OSError, ValueError, RuntimeError) as error:
             self.close()
             remedy = (

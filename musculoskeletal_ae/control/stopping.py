@@ -27,7 +27,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-PAYING_OUT = 1.5  # duration of the release before a suspect is wound in [s]
+PAYING_OUT = 1.5  # shortest duration of the release before a suspect is wound in [s]
 LARGEST_RISE = 30.0  # rise of a suspect's tension at which winding in ends [N]
 SPEED = 0.02  # speed at which a suspect is wound in [m/s]
 
@@ -59,7 +59,7 @@ class SafeStop:
     def leave(self) -> None:
         """End a stop."""
         self.is_entered = False
-        self._held = 0.0  # time since the start of the stop [s]
+        self._held = 0.0  # time since the start of the stop, as far as it counts (`step`) [s]
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]
         self._released_from: Array | None = None  # lengths at the start of the release [m], (M,)
 

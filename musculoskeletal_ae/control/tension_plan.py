@@ -63,7 +63,8 @@ class Stiffening:
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near
             self.solution = solution
-        # Use half of the remaining rate, because the series elastic elements stretch as well.
+        # Use only half of the remaining rate. The other half is for the stretch of the series
+        # elastic elements, which changes with T and which the command has to follow, too.
         actuation = robot.actuation
         rates = actuation.fastest(settings.rate_limit) * actuation.tension_per_length(self._near)
         largest = 0.5 * (1.0 - SHARE) * rates * dt

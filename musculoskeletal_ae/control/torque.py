@@ -14,7 +14,8 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
 
-# Constants of gravity compensation. For prismatic joints, they apply to a pinion of radius RACK.
+# Constants of gravity compensation. For prismatic joints, they apply to a pinion of radius
+# `kinematics.RACK`.
 HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
 BAND = 0.05  # largest distance of the arm from θ_held [rad]
 DAMPING = 1.0  # damping of each joint [N·m·s/rad]

@@ -29,13 +29,15 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import TrajectoryPoints
 
 #: largest allowed excess over the joint limits between points [rad]; for prismatic joints times
-#: RACK [m]
+#: `kinematics.RACK` [m]
 BEYOND = 0.02
 STOPPING = 0.3  # time in which a cancelled motion comes to rest [s]
 SAMPLES = 200  # approximate number of moments at which a whole trajectory is evaluated
 WITHIN = 5  # smallest number of moments at which each piece is evaluated
 AT_ONCE = 0.01  # time that replaces a requested time of 0 [s]
-RESOLUTION = 1e-11  # smallest relative distance between two times that doubles can resolve
+#: smallest distance between two successive times, relative to the later one; in a shorter piece of
+#: the curve, rounding errors of the time would matter
+RESOLUTION = 1e-11
 # Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
 # and acceleration at both ends.
 LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])

@@ -42,7 +42,9 @@ MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMAT
 class Step(NamedTuple):
     """Duration of one step of control; on both clocks, it counts as at most LONGEST_STEP."""
 
-    dt: float  # duration on the messages' clock, if that clock is not too slow (SLOWEST) [s]
+    #: duration on the messages' clock [s]; of a stopped arm, it is that on the steady clock if the
+    #: pace of the messages' clock is below SLOWEST
+    dt: float
     elapsed: float  # duration on the steady clock [s]
     has_paused: bool  # whether control paused before the step, so that the arm may have moved
 
@@ -126,7 +128,8 @@ class Overload:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._level: Array = OVERLOAD * robot.tension.limit
-        #: time of sending since when each muscle exceeds the level [s]; ∞ if it does not
+        #: time of sending of the message with which each muscle's overload began [s]; ∞ without an
+        #: overload
         self._since: Array = np.full(robot.muscle_count, math.inf)
         self._received_at = self._sent_at = -math.inf  # times of the newest message [s]
 

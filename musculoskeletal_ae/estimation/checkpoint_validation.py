@@ -139,7 +139,7 @@ class CheckpointValidator:
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
         if len(self._used) > MOST_USED:
-            del self._used[1]  # the oldest one stays, because it is the most likely to be proven
+            del self._used[1]  # the oldest network stays, because it is most likely to be proven
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
         """Record whether an anomaly is detected, and roll back a network that is not proven.
@@ -151,7 +151,7 @@ class CheckpointValidator:
             return None
         self._is_anomaly = detected
         if not detected:
-            self._messages.clear()  # after a repair, the arm may differ from earlier messages
+            self._messages.clear()  # they may describe the arm as it was before a repair
             return None
         self._messages.drop_after(now - DETECTION_DELAY)
         in_use = self.mae

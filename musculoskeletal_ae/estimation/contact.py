@@ -33,14 +33,15 @@ from musculoskeletal_ae.robot.robot import Robot
 BANDWIDTH = 25.0
 LARGEST_USUAL = 20.0  # F₀: largest usual force at the hand [N]
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-#: distance from a limit below which a joint counts as at its stop [rad], for prismatic joints times
-#: RACK [m]; this is about the error of the estimate
+#: Distance from a limit below which a joint counts as at its stop [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]. It is about as large as the error of the estimate.
 AT_STOP = 0.06
-#: motion of a joint after which G is evaluated again [rad], for prismatic joints times RACK [m]
+#: motion of a joint after which G is evaluated again [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]
 TURNED = 0.02
 #: threshold of d; for five healthy arms that explored for ten minutes each, d was at most 8.6
 CONTACT = 10.0
-IN_A_ROW = 2  # number of consecutive messages with d > CONTACT that are a contact
+IN_A_ROW = 2  # number of consecutive messages with d > CONTACT that count as a contact
 
 
 class Contact(NamedTuple):
@@ -138,7 +139,7 @@ class ContactEstimator:
         """
         kinematics, joint_count = self._robot.kinematics, len(theta)
         near = np.abs(theta - self._evaluated_at) <= self._near
-        if np.count_nonzero(near) < joint_count:  # this also applies if θ is NaN
+        if np.count_nonzero(near) < joint_count:  # also true if θ is NaN
             self._jacobian = self._mae.muscle_jacobian(theta, end_tension)
             self._evaluated_at = theta
         moments = end_tension @ self._jacobian  # Gᵀ T_end

@@ -50,7 +50,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream,
 LONGEST_PERIOD = 0.1
 #: Pause between two messages after which the detectors discard their evidence [s]. What happened in
 #: the pause is unknown: the driver may have received no commands, or the whole computer may have
-#: stood still. The controller stops the arm after the same time (`max_age`).
+#: stood still. By default, the controller stops the arm after the same time (`max_age`).
 INTERRUPTION = 0.2
 JOINTS_AGE = 0.05  # age up to which measured joint angles are used with a message [s]
 SHIFTED = 0.02  # change of an estimated length offset above which it is published again [m]
@@ -440,7 +440,7 @@ class Estimator:
         guess = calibration.offsets
         if guess is None or (calibration.is_standing and not calibration.is_done):
             return None  # nothing is estimated while the arm stands in the stated posture
-        # Publish the estimate again only after a substantial change.
+        # Publish the first and the last estimate, and any other only after a substantial change.
         difference = np.abs(guess.offset - self.body.offsets.offset).max()
         if guess.known or self.output is None or difference > SHIFTED:
             self._use_body(self.body.with_offsets(guess))

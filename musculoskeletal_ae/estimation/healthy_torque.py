@@ -19,9 +19,9 @@ from musculoskeletal_ae.signals.friction import FrictionDirection
 
 MEMORY = 180.0  # largest time constant of the average; only time in motion counts [s]
 #: norm of the joint velocities above which an arm moves [rad/s]; speeds of prismatic joints are
-#: divided by RACK
+#: divided by `kinematics.RACK`
 MOVING = 0.05
-#: multiple of σ to which torques are clipped, because larger ones indicate contact
+#: multiple of σ to which torques are clipped, because larger torques indicate contact
 OUTLIER = 5.0
 LEAST_SPREAD = 1e-3  # smallest σ [N·m]
 
@@ -76,6 +76,6 @@ class HealthyTorque:
         if self._time > LEAST_MOTION:
             square = np.minimum(square, OUTLIER**2 * self._square)
         self._time = min(self._time + dt, MEMORY)
-        # A torque of exactly 0 means that the joint is at its stop.
+        # A torque of exactly 0 means that the joint is at its stop, where τ_ext is not known.
         change = np.where(torque == 0.0, 0.0, square - self._square)
         self._square = self._square + dt / self._time * change

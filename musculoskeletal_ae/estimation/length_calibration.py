@@ -23,8 +23,9 @@ ENOUGH = 38.0  # required duration of gentle motion without measured joint angle
 STANDING = 1.0  # required duration of standing in a stated posture [s]
 FIRST_FIT = 0.5  # time until the first fit, and between fits of an arm that stands [s]
 FIT_INTERVAL = 2.0  # time between two later fits [s]
-#: A fit consists of short pieces of work, each of which takes 1 to 2 ms. One piece is done per this
-#: time between messages [s], so that a fit takes equally long at any rate of the messages.
+#: A fit consists of short pieces of work, each of which takes 1 to 2 ms. At each message, one piece
+#: is done for every PIECE_TIME [s] since the previous message. A fit therefore takes equally long
+#: at any rate of the messages.
 PIECE_TIME = 0.005
 MOST_PIECES = 4  # largest number of pieces of work for one message
 #: median residual of a length above which a fit is rejected [m]; correct offsets leave 0.0003 m
@@ -32,11 +33,12 @@ LARGEST_RESIDUAL = 0.02
 #: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
 #: wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
-#: remedy for users; a network that has not learned the arm can be too inexact for this calibration
+#: remedy if a calibration in gentle motion fails, for which a network that has not learned the arm
+#: may be too inexact
 OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )
-CORRELATED = 10.0  # number of successive moments with the information of one independent moment
+CORRELATED = 10.0  # number of successive moments that together count as one independent moment
 BEYOND_STOP = 0.01  # fraction of its range by which a stated joint angle may exceed a limit
 MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
 

@@ -8,7 +8,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-# If an error is larger, the camera sees a different marker or is not calibrated.
+# A larger error than these means that the camera sees a different marker or is not calibrated.
 MARKER_DISTANCE = 0.05  # largest error of the position [m]
 MARKER_ANGLE = 0.3  # largest error of the orientation [rad]
 

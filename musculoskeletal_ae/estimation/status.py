@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 #: key of the names of the isolated muscles with their faults, such as 'biceps (ruptured)'
 ISOLATION = 'isolated muscles with faults'
-CALIBRATION = 'calibration'  # key of what a length calibration needs, one of the next two
+CALIBRATION = 'calibration'  # key of what a length calibration needs: one of the next two values
 GENTLE_MOTION, STANDING = 'gentle_motion', 'standing'
 #: time without a message after which the status is a warning, and after which the filter of the
 #: contact estimator starts again [s]

@@ -140,7 +140,7 @@ class SuspectHandling:
             self._acquitted.append(now)
         else:
             self.faults[self.verification.muscle] = verdict
-            self.verification = None  # the suspect stays isolated
+            self.verification = None  # `clear` then leaves the suspect isolated
         return self.clear(isolated)
 
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:

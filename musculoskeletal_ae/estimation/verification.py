@@ -62,7 +62,7 @@ CLOSE = 8.0  # absolute tolerance of the difference between T and T_ref [N]
 #: rise of T that counts as rising, relative to the rise of T_ref
 SHARE = 0.35
 JAM_EXCESS = 20.0  # T − T_ref above which a suspect that was not wound in is jammed [N]
-STRETCHED = 1.5  # stretch at which a healthy tendon has tension, relative to the stretch at T_bias
+STRETCHED = 1.5  # stretch above which a healthy tendon has tension, relative to that at T_bias
 LONGEST_WINDING = 2.5  # longest duration of winding in a slack tendon [s]
 BEHIND = 0.005  # decrease of a position command that a healthy module follows [m]
 STANDS = 0.0005  # largest motion of a jammed muscle module [m]

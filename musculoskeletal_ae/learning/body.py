@@ -158,7 +158,8 @@ class CalibratedBody:
         for m, own in enumerate(smooth):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
-            # A line from the end of one branch to the start of the next keeps the factor 0.
+            # A muscle may have several branches. The line from the last point of a branch to the
+            # first point of the next keeps the factor 0.
             weights = np.zeros(len(points) - 1)
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, own.basis.shape[1], self._has_drive))

@@ -22,11 +22,12 @@ MANY_MESSAGES = 200
 #: covariance of few draws underestimates the errors of other draws.
 BODIES = 100
 POSTURES_PER_BODY = 10  # number of postures at which errors of each body are drawn
-#: Factor of the covariance without validation messages. It stands for errors that are common to
-#: all samples and that no prior describes, for example because tendons wrap round bones. No single
-#: factor suits all arms: with this one, the ellipsoids contain 95 % of the true angles on emulator
-#: model `foreign`, and on `kin` if no joint reaches its limits. They are too large on `kin` if
-#: joints reach their limits (doc/limitations.md, `python -m bench covariance`).
+#: Factor of the covariance if there are fewer than MANY_MESSAGES validation messages. It stands for
+#: errors that are common to all samples and that no prior describes, for example because tendons
+#: wrap round bones. No single factor suits all arms: with this one, the ellipsoids contain 95 % of
+#: the true angles on emulator model `foreign`, and on `kin` if no joint reaches its limits. If
+#: joints reach their limits, the ellipsoids are too large on `kin` (doc/limitations.md, `python -m
+#: bench covariance`).
 UNVALIDATED_FACTOR = 1.7
 CONTAINED_SHARE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
 

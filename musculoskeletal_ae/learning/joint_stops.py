@@ -156,8 +156,8 @@ class Stops:
                 values push the joint towards its upper limit; the stop balances this torque.
         """
         # A joint with a sensor stays at its stop until the torque pulls it away. The score of a
-        # joint without a sensor has to exceed LEAST_PUSH every time. Otherwise a wrong stop would
-        # hold the joint and distort the other joints.
+        # joint without a sensor has to exceed LEAST_PUSH at every call. Otherwise a stop that was
+        # assumed wrongly would hold the joint and distort the other joints.
         enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, LEAST_PUSH)
         above = self.is_balanced & (own > self._upper - self._near) & (score > enough)
         below = self.is_balanced & (own < self._lower + self._near) & (score < -enough)

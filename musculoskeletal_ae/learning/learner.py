@@ -119,7 +119,8 @@ class Learner:
         self._time = -math.inf  # time of the last message [s]
         self._jumps = 0  # number of jumps of lengths so far
         if self.samples:
-            # Use a higher body-state version than all saved samples, so that no version repeats.
+            # Use a higher body-state version than those of the saved samples, so that no version
+            # repeats.
             self._use_body(replace(self.body, version=self.samples.body_version + 1))
         if saved is not None:
             self._start(saved)
@@ -325,7 +326,7 @@ class Learner:
         return self.keeper.publication.take(now)
 
     def _finish(self, update: Update, is_learning: bool) -> None:
-        if not is_learning:  # discard the update: its samples may come from a faulty arm
+        if not is_learning:  # the user has stopped learning, or the samples may show a faulty arm
             self.scheduler.note_news()
             return
         mae = self.scheduler.finish(update)

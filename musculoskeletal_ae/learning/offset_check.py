@@ -6,8 +6,9 @@
 θ is measured, or else estimated by ②. New offsets o are accepted if e is at most LARGEST_RATIO
 times the error with the previous offsets and the same network, or at most LEARNED_ERROR. If there
 are no messages with the previous offsets, the limit of e is LEARNED_ERROR or UNLEARNED_ERROR.
-Offsets within CALIBRATION_SPREAD of the accepted ones are accepted without a comparison. Learning
-pauses while the published offsets disagree with the messages, whichever node published them.
+Offsets within CALIBRATION_SPREAD of the accepted ones are accepted without a comparison, unless the
+offsets were unknown in between. Learning pauses while the published offsets disagree with the
+messages, whichever node published them.
 """
 
 import math
@@ -55,7 +56,7 @@ class OffsetCheck:
         change = np.abs(offsets.offset - self._believed.offset).max()
         is_same = bool(change <= CALIBRATION_SPREAD)
         self.is_believed = offsets.known and self._believed.known and is_same
-        if not offsets.known:  # the next offsets come from a new calibration
+        if not offsets.known:  # the next calibration is checked even if it gives the same offsets
             self._believed = LengthOffsets(self._believed.offset, offsets.deviation)
 
     def forget(self) -> None:

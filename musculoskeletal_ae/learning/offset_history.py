@@ -73,7 +73,7 @@ class OffsetHistory:
     def use(self, offset: Array) -> None:
         """Use plausible offsets [m] (M,) from now on, and put back, drop or correct samples."""
         change = self._offset - offset
-        size = float(np.nanmax(np.abs(change)))  # NaN: a muscle that was added at a restart
+        size = float(np.nanmax(np.abs(change)))  # NaN for a muscle that was added at a restart
         if size <= CALIBRATION_SPREAD:
             self._samples.put_back_held()
         else:

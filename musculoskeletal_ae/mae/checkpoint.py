@@ -42,8 +42,8 @@ LARGEST = 1e9  # largest absolute value of any number
 SMALLEST_STD = 1e-9  # smallest standard deviation
 LARGEST_FRICTION = 5.0  # largest μ; the tensions at the ends of a tendon then differ 150-fold
 SMALLEST_EIGENVALUE = 1e-12  # smallest eigenvalue of a covariance, relative to the largest one
-#: smallest eigenvalue of the springs' stiffness, relative to the largest one; it is 0 except for
-#: rounding errors
+#: smallest eigenvalue of the springs' stiffness, relative to the largest one; springs have no
+#: negative eigenvalue, except for rounding errors
 SMALLEST_SPRING_EIGENVALUE = -1e-6
 #: largest absolute values in the estimate of the middle posture: θ [rad], T [N], l [m], G [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
@@ -99,7 +99,7 @@ class Metadata(Strict, frozen=True):
         if len(known) < len(self.isolated) or not known <= {*muscles}:
             indices = f'indices of muscles, 0 to {len(muscles) - 1}, each at most once'
             raise ValueError(f'isolated {self.isolated}; legal: {indices}')
-        # Encoder and decoder have the same hidden layers; the latent layer is in the middle.
+        # Encoder and decoder have equally many hidden layers; the latent layer is between them.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))
         for group, sizes in zip(self.groups, self.sizes_by_group(), strict=True):
             d, m = len(group.joints), len(group.muscles)
@@ -300,10 +300,11 @@ def _check_covariance(name: str, covariance: Array) -> None:
     if not np.array_equal(covariance, covariance.T):
         raise CheckpointError(f'tensor {name} is not symmetric')
     try:
-        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # equal if the matrix is (1, 1)
+        least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # one value if the matrix is (1, 1)
     except np.linalg.LinAlgError as error:
         raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
-    # The detector inverts the matrix, so it must not be close to singular.
+    # A covariance is positive definite. The detector inverts the one of the residuals, which must
+    # therefore not be close to singular either.
     if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
             f'tensor {name} has eigenvalues from {least:g} to {most:g}; the smallest must '

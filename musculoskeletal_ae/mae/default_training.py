@@ -5,7 +5,7 @@
 
 Each norm is in units of the standard deviation of the data, so that all have similar weight. G is
 the muscle Jacobian ∂l/∂θ through ①, which control needs. Each sample has a twin, which is a close
-neighbour. The length error of the sample minus that of its twin, divided by their distance, serves
+neighbour. The difference between the length errors of the two, divided by their distance, serves
 as the error of G. Every sample passes through all three masks. Muon updates the matrices, with a
 step size that rises and then falls to zero.
 
@@ -151,7 +151,8 @@ def loss(network: Network, samples: Tensor) -> Tensor:
     values = torch.cat([rows.repeat(3, 1), twins])  # (4N, D+2M)
     error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std
-    # The error of l as a difference quotient between sample and twin is the error of ∂l/∂θ.
+    # The difference between the errors of l of a sample and of its twin, divided by the distance of
+    # the two, is the error of ∂l/∂θ in the direction from one to the other.
     between = (error[-count:] - error[:count])[:, -muscles:] / TWIN_DISTANCE
     slope = (between.square().sum(dim=1) + TINY).sqrt().mean()
     parts = error[:-count].square().split([joints, muscles, muscles], dim=1)

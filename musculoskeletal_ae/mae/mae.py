@@ -330,7 +330,7 @@ class Mae:
             places: Ints = (np.cumsum(selected) - 1)[all_columns[selected[all_columns]]]
             return places
 
-        vars(self).update(  # a frozen dataclass has no other way to set attributes
+        vars(self).update(  # a frozen dataclass refuses assignments to its attributes
             mean=mean,
             std=std,
             encoder=encoder,

@@ -30,7 +30,8 @@ LEAST_MOTION = 0.05  # smallest range of θ of a joint that is judged [rad]
 #: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
 BEYOND = 0.3  # distance by which a correct θ may exceed the joint limits [rad]
-#: Another unit or order of θ is assumed if it reduces the misfit of l to less than this fraction.
+#: Another unit, order or sign of θ (`_hypotheses`) is assumed if it reduces the misfit of l to less
+#: than this fraction.
 BETTER = 0.8
 MOST_SAMPLES = 600  # largest number of messages that are used, evenly distributed
 LEAST_SAMPLES = 20  # smallest number of messages by which sensors are judged
@@ -40,7 +41,8 @@ STUCK_MOTION = 0.2
 #: distance of a joint from its reading, according to the lengths, above which a repeated reading is
 #: stuck [rad]
 STUCK_OFFSET = 0.5
-#: fraction of the misfit of l that this motion or distance of the joint must explain
+#: fraction of the mean square of the misfit of l that this motion or distance of the joint must
+#: explain
 STUCK_EXPLAINED = 0.5
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 

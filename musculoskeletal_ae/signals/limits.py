@@ -49,8 +49,8 @@ class Limits(NamedTuple):
     #: distance by which a slack tendon can be shorter than `length_margin` permits [m]
     slack_length_margin: float = 1.0
     slack_share: float = 0.2  # tension below which a tendon is slack, as a fraction of T_bias
-    # Between two messages, a length changes by at most `step + speed · dt`, where dt is the time
-    # between them, but at most `longest_step`. A length that has jumped is accepted after it has
+    # Between two messages, a length changes by at most `step + speed · dt`. dt is the time between
+    # the messages, limited to `longest_step`. A length that has jumped is accepted after it has
     # stayed at the new level for `settled`.
     step: float = 0.02  # constant part of the largest change of a length [m]
     speed: float = 1.0  # largest speed of a length [m/s]

@@ -64,7 +64,8 @@ class MuscleSample:
         tension_read: T_read [N], the reading of the tension sensor, or the motor current converted
             to newtons; NaN where tension is not known.
         motor_tension: Motor-side tension T [N]; NaN where it is not known. It equals T_read for
-            tension sensors, and for motor currents until their friction has been learned.
+            tension sensors. For motor currents, it is max(0, T_read) until the friction of the
+            drives has been learned.
         bone_tension: Bone-side tension T_end, with tendon friction removed [N]. Where tension is
             not known, it is the tension that models assume (`Actuation.assumed_tension`).
         sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.

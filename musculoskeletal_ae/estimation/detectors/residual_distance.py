@@ -42,7 +42,7 @@ from musculoskeletal_ae.signals.limits import LIMITS
 DISTANCE = 'distance'  # name of the threshold of d in a checkpoint
 NORM = 'norm'  # name of the threshold of A in a checkpoint
 
-IN_A_ROW = 5  # number of consecutive messages above the threshold that are a finding
+IN_A_ROW = 5  # number of consecutive messages above the threshold that lead to a finding
 NEAR = 0.25  # distance to a calibrated posture above which the threshold grows [joint ranges]
 WIDEST = 3.0  # largest factor by which the threshold is raised
 
@@ -139,8 +139,9 @@ class ResidualDistance(Detector):
         if observation.lengths_known:
             evidence = self._evidence(observation, distance, slack_count > 0, waits)
         # If exactly one tendon is slack, it stays the suspect. If several are slack, some may be
-        # healthy tendons that a rupture has made slack for a moment. Likelihood then decides among
-        # the slack tendons. If none is slack, it decides among all muscles in use.
+        # healthy tendons that a rupture has made slack for a moment. The likelihood then decides
+        # among the slack tendons. If no tendon is slack, the likelihood decides among all muscles
+        # in use.
         is_first = evidence and self._beyond == IN_A_ROW
         if is_first and self.is_calibrated and slack_count != 1:
             candidates = is_slack if slack_count else self._robot.used

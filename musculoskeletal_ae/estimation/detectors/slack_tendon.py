@@ -38,11 +38,11 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: number of standard deviations by which a tendon without tension is stretched if it is ruptured
 SIGMAS = 3.0
-#: Standard deviations by which a tension has to exceed T_slack for a tendon that is surely taut.
-#: Motor currents have such a standard deviation.
+#: Number of standard deviations by which a tension has to exceed T_slack, so that its tendon is
+#: surely taut. Tensions from motor currents have a standard deviation; that of sensors counts as 0.
 SURE = 2.0
-#: number of messages without a break in which a tendon has to be taut, so that the first of them is
-#: no part of the loss of tension
+#: Number of consecutive messages in which a tendon has to be taut. The first of them then certainly
+#: came before the tendon began to lose its tension.
 RECENT = 5
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
@@ -140,10 +140,12 @@ class StretchedTendon(SlackTendon):
     def __init__(self, robot: Robot, settings: Detection) -> None:
         super().__init__(robot, settings)
         self._recent: deque[MuscleSample] = deque(maxlen=RECENT)
-        self._taut_count: Ints = np.zeros(robot.muscle_count, dtype=int)  # messages without a break
-        #: by muscle, the first of the last RECENT messages in a row in which its tendon was taut
+        #: number of consecutive messages in which each tendon has been taut, (M,)
+        self._taut_count: Ints = np.zeros(robot.muscle_count, dtype=int)
+        #: for each muscle, the first of the last RECENT consecutive messages in which it was taut
         self._taut = dict[int, MuscleSample]()
-        #: predictions from the messages of `_taut` without the slack muscles, by muscle
+        #: for each slack muscle, its message in `_taut`, the muscles that were not slack, and the
+        #: prediction from that message by these muscles
         self._taut_predictions = dict[int, tuple[MuscleSample, Bools, Prediction]]()
 
     def use(self, mae: Mae) -> None:

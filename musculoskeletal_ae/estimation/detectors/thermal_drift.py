@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a muscle module whose drag, cooling or tension sensor has changed, by its thermal model.
 
-`heat.py` estimates the constants of the model. A changed module is a finding only if its winding is
-hot. A cool module that has changed is reported in /diagnostics, and the arm is not stopped.
+`signals/heat.py` estimates the constants of the model. A changed module is a finding only if its
+winding is hot. A cool module that has changed is reported in /diagnostics, and the arm is not
+stopped.
 """
 
 from collections.abc import Iterable

@@ -41,7 +41,7 @@ ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
 # 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
 ANGLE_MOVED = 0.45  # largest difference of θ from a learned network [rad]
 ANGLE_MOVED_INITIAL = 0.8  # largest difference of θ from an initial network [rad]
-LENGTH_MOVED = 0.07  # largest difference of a length from either network [m]
+LENGTH_MOVED = 0.07  # largest difference of a length from a network of either kind [m]
 # A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
 SHAPE_MOVED = 0.3  # largest relative difference in shape from a learned network
