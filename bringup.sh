@@ -81,23 +81,23 @@ refuse() {
 
 robot=musashi_left_arm
 mujoco=
-chain=() # of import_robot
+chain=() # options of import_robot that select a part of the model
 checkpoint=
 hardware=false
 controller=true
 combined=false
 bag=
-explore= # on, except on hardware
+explore= # empty: on, except with --hardware
 learner=true
 preset=default
 seed=0
 reality=kin
 joint_source=sensor
-parameters=() # of NODE:NAME:=VALUE
+parameters=() # each NODE:NAME:=VALUE
 parameter_files=()
 namespace=
 network=false
-duration= # until Ctrl-C
+duration= # empty: until Ctrl-C
 record=
 view=false
 port=8080
@@ -110,7 +110,7 @@ sorted=$(getopt --name bringup.sh --options hp: --longoptions robot:,checkpoint:
   --longoptions joint-source:,params-file:,namespace:,network,duration:,record:,view,port: \
   --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,help -- "$@") || refuse 'see ./bringup.sh --help for the legal options'
 eval set -- "$sorted"
-given=$sorted
+passed=$sorted
 while [ $# -gt 0 ]; do
   case $1 in
     --robot) robot=$2 && shift ;;
@@ -153,7 +153,7 @@ while [ $# -gt 0 ]; do
   shift
 done
 
-is_given() { [[ " $given " == *" $1 "* ]]; }
+is_given() { [[ " $passed " == *" $1 "* ]]; }
 
 exclude() { # OPTION OTHER_OPTION…
   local other
@@ -231,9 +231,9 @@ say "logs in $logs"
 declare -A name_of=() # by pid
 
 launch() { # NAME ARGUMENT…
-  # If this script is killed with SIGKILL, the kernel ends its processes. sh checks the parent in
-  # case that happened before setpriv. The interpreter is stated because a path in a #! line cannot
-  # contain a space.
+  # If this script is killed with SIGKILL, the kernel ends the processes that setpriv has prepared.
+  # In case the script was killed even earlier, sh first checks that it is still the parent. The
+  # interpreter is stated because a path in a #! line cannot contain a space.
   # shellcheck disable=SC2016  # expanded by sh
   setpriv --pdeathsig TERM sh -c '[ "$PPID" = "$0" ] && exec "$@"' $$ \
     "$python" "$executables/$1" "${@:2}" </dev/null &
@@ -296,7 +296,7 @@ stop() {
     done
   done
   wait
-  # What the recorder says at its end: the number of messages, and those that were lost.
+  # Show what the recorder reports at its end: the numbers of recorded and of lost messages.
   [ -z "$record" ] || sed -n -e 's/^[0-9]* messages recorded/-- record: &/p' \
     -e 's/^warning: /-- record: &/p' "$logs/record.log"
 } 2>/dev/null # without bash's own messages about killed processes
@@ -330,8 +330,9 @@ train_once() {
 
 # --- a MuJoCo model ------------------------------------------------------------------------------
 
-# Sets $robot to a directory that is imported again each time, which takes seconds. The names of
-# checkpoints depend on its content only.
+# Sets $robot to a directory among the logs, into which the model is imported anew each time. This
+# takes seconds, and the cached checkpoint is found again, because its file name depends on the name
+# and the contents of this directory, not on its path.
 import_mujoco() {
   local status name
   name=$(basename "$mujoco" .xml)
@@ -357,8 +358,9 @@ chosen_value() { # NAME
     sed -n -e "s/^[^#]*\b$1: \+\([A-Za-z0-9.]\+\).*/\1/p" -e "s/^[a-z_]*:$1:=//p" | tail -n 1
 }
 
-# Sets $kept: what a node saves of an emulated arm is kept with the logs, because the next run may
-# emulate another arm. With hardware, the node continues from what it has saved.
+# Sets $kept to the parameters that choose a node's state directory. State of an emulated arm is saved
+# with the logs, because the next run may emulate another arm. With hardware, the node uses its usual
+# state directory, and continues from the state that it has saved there.
 kept_in() { # NODE
   kept=()
   [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/$1")")
@@ -366,7 +368,7 @@ kept_in() { # NODE
 
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, the format of ROS parameters
 
-own_clock=false # whether the emulated arm is slower than real time
+own_clock=false # whether the emulated arm may be too slow for real time, so that it publishes /clock
 [ -z "$mujoco" ] || import_mujoco
 [ -n "$checkpoint" ] || train_once
 
@@ -428,8 +430,8 @@ if [ $view = true ]; then
     sed -un 's/^http:/-- the page is on http:/p' &
 fi
 
-# The status line. It counts --duration from the first estimate, and then ends bring-up. Without an
-# estimate it fails after `patience`.
+# The status line. With --duration, it ends bring-up that long after the first estimate; if there is
+# no estimate within `patience` [s], it fails.
 limits=()
 if [ -n "$duration" ]; then
   [[ $duration == *.* ]] || duration+=.0 # a ROS double

@@ -30,8 +30,8 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
 use_udp
 export ROS_DOMAIN_ID=$(($$ % 25 * 4 + 1)) # and the next three, one for each process of pytest
 export ROS_LOG_DIR=$repository/log/test
-# Many tests wait for messages in real time. Four processes of pytest keep two cores busy
-# meanwhile, and further threads of torch would slow them down.
+# Because many tests wait for messages in real time, it takes four processes of pytest to keep two
+# cores busy. Further threads of torch would slow them down.
 export OMP_NUM_THREADS=1
 
 say "pytest, on ROS_DOMAIN_ID $ROS_DOMAIN_ID"

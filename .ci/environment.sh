@@ -137,8 +137,8 @@ install_requirements() { # FILE…
 urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
     arguments+=(--extra-index-url "$TORCH_CPU_INDEX")
   fi
-  # A killed pip may leave an installation that looks complete. Without this file, .venv is created
-  # again.
+  # A killed pip may leave an installation that looks complete. While $installed is missing, .venv
+  # counts as incomplete and the next run creates it again.
   rm -f "$installed"
   step "installing ${*##*/} into .venv (this takes minutes the first time)" \
     "$python" -m pip install --no-compile "${arguments[@]}" ||
@@ -149,8 +149,8 @@ urllib.request.urlopen('$TORCH_CPU_INDEX/torch/', timeout=5)" 2>/dev/null; then
 
 # --- the package ---------------------------------------------------------------------------------
 
-# The build links to the sources, so it is repeated only if a file that describes the package has
-# changed, or if the list of installed files has.
+# The build links to the sources. It is therefore repeated only if a file that describes the package,
+# or the list of installed files, has changed.
 build_package() {
   local stamp=build/.built described
   described=$(
@@ -169,7 +169,8 @@ build_package() {
 }
 
 # Compiles all numba functions, so that nodes need not compile when they start. Numba's cache does
-# not notice changes of functions from other files, so any change recompiles everything.
+# not notice changes of functions that are called from another file. All functions are therefore
+# compiled again after a change to any file that contains one.
 compile_package() { # PACKAGE STAMP
   local package=$1 stamp=$2
   if [ -e "$stamp" ] && [ -z "$(find "$package" -name '*.py' -newer "$stamp" \
@@ -221,7 +222,7 @@ environment_setup() { # [test]
 # Makes Fast DDS use UDP only. After the kill of a node, its shared memory may prevent a successor on
 # the same ports from receiving messages (eProsima/Fast-DDS 4737, 5053, 5469). On one machine, UDP is
 # not slower. With ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, rmw_fastrtps adds shared memory in spite
-# of the first variable; the profile file keeps messages out of it.
+# of FASTDDS_BUILTIN_TRANSPORTS; the profile file keeps messages out of it.
 use_udp() {
   export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
   [ "${ROS_AUTOMATIC_DISCOVERY_RANGE-}" != LOCALHOST ] ||

@@ -43,7 +43,8 @@ class Bus:
         now = time.monotonic()
         self.arm.step(min(round(now - self.read_at, 3), 0.1))
         self.read_at = now
-        reading = self.arm.sense()  # without temperature sensors, return NaN for each muscle
+        reading = self.arm.sense()
+        # If your modules have no temperature sensors, return NaN for each muscle instead.
         return -reading.length / SPOOL, reading.tension, reading.temperature, reading.theta
 
     def regulate(self, tension: np.ndarray) -> None:

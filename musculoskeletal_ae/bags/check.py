@@ -21,7 +21,8 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 # A column counts as misplaced only if another muscle fits it this many times better, because bodies
 # differ from their model and neighbouring muscles are similar.
 _BETTER_FIT = 2.5
-_LEAST_MOTION = 0.005  # a column whose length varies less is not checked [m]
+# A column whose length has a smaller standard deviation than this is not checked [m].
+_LEAST_MOTION = 0.005
 _MOST_SAMPLES = 2000  # largest number of samples that are compared with the model
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 

@@ -12,7 +12,8 @@ from musculoskeletal_ae.signals.joint_sensors import (
     stuck_sensors,
 )
 
-#: duration of the parts of a recording in which drifting lengths count as constant [s]
+#: duration of the parts of a recording that are judged separately, because lengths may drift from
+#: one part to the next [s]
 SEGMENT = 30.0
 #: by kind of fault, what was observed and what to do
 TEXTS = {

@@ -24,7 +24,7 @@ class Losses:
         """Record the sequence number of a received message."""
         if number in UNNUMBERED:
             return
-        # The numbers of a restarted publisher begin again.
+        # A restarted publisher begins with a small number again, which gives no positive gap.
         gap = number - self._last.get(topic, number) - 1
         if gap > 0:
             self._gaps[topic] += gap

@@ -37,7 +37,7 @@ LARGEST_RECORD = 64 << 20  # largest size of a record or a decompressed chunk [b
 # malicious file of a few kB could otherwise take hours to read.
 MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100
 
-_JUMP = 'record again, without --loop, a second /clock or another jump of time'
+_JUMP = 'record again without `replay --loop`, a second publisher of /clock, or other jumps of time'
 _LONGEST_QOS = 10_000  # largest length of the QoS profiles, as YAML [characters]
 
 

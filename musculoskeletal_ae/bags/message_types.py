@@ -18,8 +18,10 @@ TYPESTORE.max_sequence_length = 1 << 26
 
 CDR = 'cdr'  # the message encoding of ROS 2
 MSG = 'ros2msg'  # the encoding of definitions in .msg format
-_LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}  # by the first two bytes of a CDR message
-#: largest size of a definition [bytes]; the types of this package have several times shorter ones
+#: whether a CDR message is little-endian, by its first two bytes
+_LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}
+#: largest size of a definition [bytes]; those of the types in the interface are several times
+#: shorter
 _LONGEST_DEFINITION = 1 << 16
 
 

@@ -28,7 +28,8 @@ from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
 LONGEST_LAG = 1.0  # [s]
 
 TAUGHT_TOPIC = 'estimated_joint_states'
-# Standard deviation of the smoothing [s]; a hand moves more slowly, noise varies faster.
+# Standard deviation of the Gaussian weights that smooth a motion [s]. They keep the motion of a
+# hand, which takes longer, and remove noise, which varies faster.
 SMOOTHING = 0.15
 SPACING = 0.1  # time between two points of the trajectory [s]
 LEAD_TIME = 3.0  # duration of the motion to the first posture [s]

@@ -32,10 +32,10 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-# Conditions for a topic whose log times are bunched.
-FEW = 20  # topics with fewer messages are not checked
+# The log times of a topic count as bunched if all of these conditions hold.
+FEW = 20  # it has at least this number of messages
 BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
-MANY = 0.3  # at least this fraction of its messages was written together with the message before
+MANY = 0.3  # more than this fraction of its messages was written together with the message before
 
 
 class Series(NamedTuple):
@@ -172,8 +172,8 @@ class _ArmStreams:
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
 
-#: topics of the body state; they are read first, because the recorder may have received their
-#: messages after the readings to which these apply
+#: topics of the body state; they are read before all others, because the recorder may have received
+#: a body state only after the first readings to which it applies
 BODY_TOPICS = 'isolated_muscles', 'muscle_length_zeros'
 
 

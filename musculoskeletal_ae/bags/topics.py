@@ -15,7 +15,9 @@ class Topic(NamedTuple):
 
     type: str
     latched: bool = False  # whether late joiners receive the last message
-    sent: bool = False  # whether hardware, vision, user or controller send it; else it is computed
+    #: whether it is an input from hardware, vision or user, or a command to the muscle modules; all
+    #: other topics follow from these
+    sent: bool = False
 
 
 DIAGNOSTICS = '/diagnostics'  # the only absolute name
@@ -33,7 +35,7 @@ def topics_with(motors: MotorSettings) -> dict[str, Topic]:
     if motors.motor_state_topic:
         topics.setdefault(motors.motor_state_topic, Topic(JOINT_STATE, sent=True))
     if motors.motor_command_topic:
-        # Not `sent`: a replay must not move a robot that is connected.
+        # Not `sent`, so that a replay does not move the motors of a connected robot by default.
         topics.setdefault(motors.motor_command_topic, Topic(ARRAY))
     return topics
 

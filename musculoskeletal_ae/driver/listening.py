@@ -31,8 +31,8 @@ from musculoskeletal_ae.validity import (
     read_posture,
 )
 
-MOST_REPEATED = 0.2  # share of messages that may equal the message before to the last digit
-QUIET = 3  # largest number of different values that indicates a sensor without noise
+MOST_REPEATED = 0.2  # largest share of messages that may repeat the previous message exactly
+QUIET = 3  # sensors that show at most this many different values count as free of noise
 TEMPERATURES = -20.0, 130.0  # range of possible temperatures [°C]
 #: distance by which l may exceed its range, with and without length calibration [m]
 BEYOND = 0.1, 1.0
@@ -42,10 +42,13 @@ BEYOND_JOINT = 0.3  # distance by which θ may exceed the joint limits [rad]
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
 PULLS = 0.3, 3.0  # usual range of T / T_bias at rest
 USUAL = 10.0, 60.0  # usual temperatures of modules at rest [°C]
-#: largest relative deviation of a converted T from T_bias that indicates a wrong unit
+#: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
+#: T_bias
 UNIT_TOLERANCE = 0.3
 TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
-HOTTEST_AT_REST = 55.0  # highest temperature of modules without commands [°C]; it is 131 °F
+#: highest plausible temperature of modules without commands [°C]; modules above 13 °C exceed this
+#: value if their temperature is published in °F
+HOTTEST_AT_REST = 55.0
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
 # musashi_left_arm (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by
 # 0.31 to 1.55 times the model's changes. If another muscle fits a column 2.5 times better than its
@@ -104,7 +107,8 @@ class Listening:
         (low, high), most = length_range(robot), robot.tension.max
         ones, beyond, (coldest, hottest) = np.ones_like(most), BEYOND[not zeroed], TEMPERATURES
         least, most = -0.02 * most, 1.1 * most
-        if robot.tension_source.is_current:  # wider, for drive friction and an unknown scale
+        # T computed from currents may be wrong by drive friction and an unknown scale.
+        if robot.tension_source.is_current:
             least, most = reading_range(robot)
         #: lowest and highest possible values of l, T and temperature, (3, M)
         self._low = np.stack([low - beyond, least, coldest * ones])
@@ -163,7 +167,8 @@ class Listening:
         has_angles = not self._stated and not np.isnan(self._theta).all()
         for (topic, reason), errors in self._rejected.items():
             detail = f'{topic}: {len(errors)} messages rejected, {errors[-1]}'
-            if reason == 'missing joint' and has_angles:  # for example, messages of a hand
+            # Another driver, such as that of a hand, may publish its own joints on this topic.
+            if reason == 'missing joint' and has_angles:
                 verdict.notes.append(detail)
             else:
                 what = f'{topic}: {reason}'

@@ -17,7 +17,7 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded, load_text
 
 RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
-LONGEST_GAP = 0.2  # longest gap between two messages [s]; the controller's `max_age`
+LONGEST_GAP = 0.2  # longest gap between two messages [s]; the default of the controller's `max_age`
 #: time between two ticks above which this process was blocked [s]; check_driver ticks every 0.02 s
 LONGEST_TICK = 0.07
 OVERLOAD = 1.5  # load average per core above which this computer may slow the driver down

@@ -33,7 +33,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
 STEP = 0.003  # first step inwards, by which latency is measured [m]
-FURTHEST = 0.015  # farthest that the target moves inwards [m]
+FURTHEST = 0.015  # largest distance by which the target moves inwards [m]
 OUTWARDS = 0.005  # distance by which the target moves outwards [m]
 FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
 SHARES = 0.7, 1.4  # legal range of the motion of l, divided by that of l_target

@@ -88,7 +88,7 @@ class Winding(MotionTest):
         self._tolerance = np.maximum(TENSION_TOLERANCE, LENGTH_ERROR * robot.stiffness)
         self._scale: Array = self._tolerance / TENSION_TOLERANCE
         self._response: Array = RESPONSE[0] * self._scale
-        #: tolerance of T where T_bias or no tension is demanded [N] (M,)
+        #: smallest tolerance of T [N] (M,), which applies where T_bias is demanded
         usual = np.minimum(TENSION_TOLERANCE, 0.5 * self._bias)
         self._resting = np.maximum(usual, LENGTH_ERROR * robot.stiffness)
         self._run_away_tension = np.minimum(RUN_AWAY_TENSION * self._scale, robot.tension.max)
@@ -110,7 +110,8 @@ class Winding(MotionTest):
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, '
                     f'but it may command {limit} N at most; pass a higher --tension'
                 )
-        self._swing: Array = np.zeros(robot.muscle_count)  # noise of T while held [N]
+        #: standard deviation of T while the arm is held [N] (M,)
+        self._swing: Array = np.zeros(robot.muscle_count)
 
     # -- commands -------------------------------------------------------------------------------
 

@@ -56,7 +56,7 @@ class Effects:
     spool_gain: float = 0.05  # relative error of the spool's radius
     spool_layer: float = 0.1  # relative increase of the radius by the second layer of tendon
     eccentricity: float = 0.0008  # eccentricity of the spool [m]
-    spool_slip: float = 0.0011  # slip of the tendon on its spool, once in five hours [m]
+    spool_slip: float = 0.0011  # slip of a tendon on its spool, on average once in five hours [m]
     length_drift: float = 0.001  # σ of the drift of the offset [m/h]
     joint_zero: float = np.radians(2.0)  # σ of the offset [rad]; prismatic joints: times RACK [m]
     joint_bend: float = 0.01  # non-linearity, relative to the joint's range
@@ -64,7 +64,7 @@ class Effects:
     backlash: float = np.radians(1.0)
     # Messages
     delay: float = 0.02  # delay of joint angles, and of lengths and tensions [s]
-    jitter: float = 0.005  # range of the delay [s]
+    jitter: float = 0.005  # range over which the delay varies from one reading to the next [s]
     dropouts: float = 0.001  # share of each module's messages that are lost
 
 

@@ -248,8 +248,9 @@ class ForeignArm(Arm):
         Args:
             robot: The robot to emulate.
             seed: Selects the individual.
-            effects: Sizes of the effects; by default the calibrated ones. Ignored with `file`. Only
-                if `deviates` is false, a `joint_friction` of 0 removes all friction of the file.
+            effects: Sizes of the effects; by default the calibrated ones. Ignored with `file`,
+                except that a `joint_friction` of 0 removes all friction of the file if `deviates`
+                is false.
             file: MJCF model of the arm, instead of a body that is built from the robot directory.
             deviates: Whether the arm is an individual that differs from `file`
                 (`emulator/deviation.py`).

@@ -151,9 +151,9 @@ def _objects(
 ) -> WrapObjects:
     """Return the object that each segment wraps around: a described one, or a bone's head.
 
-    A described object has a slightly different radius than in the description, which is so small
-    that the object does not enclose the true route points `point`. With a `quantile` of 0,
-    described objects are unchanged, and bones have no heads.
+    The radius of a described object differs slightly from the description, and is small enough that
+    the object does not enclose the true route points `point`. With a `quantile` of 0, described
+    objects are unchanged, and bones have no heads.
 
     A bone's head is centred at the revolute joint nearest to the tendon. The tendon touches the
     head in about a share `quantile` of the postures. The head is smaller if the tendon could
@@ -184,7 +184,8 @@ def _objects(
             scale = min(described[s], 0.95 * least / objects.radius[s])
             objects.radius[s] *= scale
             if objects.side_joint[s] == objects.joint[s]:
-                objects.side[s] *= scale  # so that a ring stays a ring
+                # A side point inside the object, which makes it a ring, stays inside.
+                objects.side[s] *= scale
             continue
         between = (
             kin.tree.descends_from[routes.joint[ends[0]]]

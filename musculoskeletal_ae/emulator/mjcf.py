@@ -75,7 +75,8 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     springs = _drawn_springs(robot, draw)
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
-        # Joints with a common origin keep it.
+        # A joint that is hardly apart from its parent belongs to a joint module with several axes
+        # through one point. Its origin is not moved, so that these axes still meet.
         is_apart = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD
         place = at.translation + LENGTH_SPREAD * off[i, 0] * is_apart
         placement = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
@@ -170,7 +171,8 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
                 _add_round(bodies[joint], name, place, axis, scale * item.radius)
                 if item.side is not None:
                     side = f'{name} side'
-                    # Scale the side site with the object, so that a ring stays a ring.
+                    # If the side site is inside the object, the tendon passes through a ring. The
+                    # site is scaled with the object, so that it stays inside.
                     beside = item.xyz + scale * (item.side - item.xyz)
                     carrier, place = joint, at.act(beside)
                     if item.side_link is not None:

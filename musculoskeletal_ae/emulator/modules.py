@@ -51,8 +51,8 @@ LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
 CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
-#: errors of a motor current as a measure of tension: standard deviations of the logarithm of the
-#: scale and of the offset [N], and mean drive friction as a share of T_limit
+#: errors of a motor current as a measure of tension: standard deviation of the logarithm of the
+#: scale, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
 ACCELERATION_NOISE = 0.05  # [m/s²]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the orientation [rad]

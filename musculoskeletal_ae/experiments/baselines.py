@@ -75,7 +75,8 @@ class PolynomialFilter:
     MODEL_SAMPLES = 20_000
     PRIOR_ROWS = 20.0  # weight of the prior, as a number of samples
     TENSION_SCALE = 1.0 / 200.0  # gives a_m the magnitude of the other coefficients
-    #: standard deviation of a joint's random walk [rad/√s]; 0.2 changes the error by about 1 %
+    #: standard deviation of a joint's random walk [rad/√s]; with 0.2 instead, the error differs by
+    #: about 1 %
     WALK = 0.5
     LEAST_NOISE = 5e-4  # lower bound of the standard deviation of a length [m]
 

@@ -20,7 +20,9 @@ from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CONTACT_STREAM = 7000
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4  # numbers of tests at rest, in motion, and with `float`
-TRIES_PER_COLLISION = 20  # largest number of tries, because a collision needs a moving arm
+#: largest number of tries for each collision; a try fails if the arm hardly moves, or if a contact
+#: is detected before the push
+TRIES_PER_COLLISION = 20
 HEALTHY = 3600.0  # duration of healthy exploration, shared by the individuals [s]
 LEAST, MOST = 10.0, 50.0  # range of the external forces [N]
 LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide an arm in method `float` [N]
@@ -29,8 +31,10 @@ PUSH = 1.5  # duration of a push at rest [s]
 EVALUATED = 0.5  # duration of the last part of a push, over which estimates are averaged [s]
 APART = 3.0  # longest time between collisions [s]
 FLOATING = 30.0  # duration of the drift test [s]
-QUICK_FLOATING = 5.0  # its duration in a shortened run [s]
-QUICK_SHARE = 0.001  # share of everything else that a shortened run measures; at least once
+QUICK_FLOATING = 5.0  # duration of the drift test in a shortened run [s]
+#: factor on all other durations and numbers of tests in a shortened run, which makes at least one
+#: test of each kind
+QUICK_SHARE = 0.001
 MOVED = 1.0  # duration of a collision, and of guiding the hand [s]
 SOON = 0.1  # a collision should be detected within this time [s]
 INSIDE = 0.1  # distance of postures from the joint limits, relative to the joint ranges
@@ -113,7 +117,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _errors(true: Array, estimated: Array) -> tuple[Array, Array]:
-    """Return the relative errors of the sizes of N forces, and of their directions [deg], (N,).
+    """Return relative errors of the sizes of N forces, and errors of their directions [deg], (N,).
 
     `true` and `estimated` are the forces [N], (N, 3).
     """

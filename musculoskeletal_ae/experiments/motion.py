@@ -102,7 +102,8 @@ class TrackedMotion(NamedTuple):
 
 def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> ClosedLoop:
     """Return a loop for motions of `duration` [s] by a method; its arm is at `start` [rad] (D,)."""
-    # Method `second` needs half of the time for its second movement.
+    # A ramp takes RAMP_SHARE of the duration that its setting states. Method `second` has two
+    # ramps.
     ramp = duration / RAMP_SHARE
     first_part = 0.5 * ramp if method == 'second' else ramp
     settings = Settings(rate_limit=SPEED_LIMIT)

@@ -62,7 +62,9 @@ from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
-FIRST_ERRORS = 10.0  # time whose mean error is the initial guess of b in the exponential fit [s]
+#: duration of the first part of a run, whose mean error is the initial guess of b in the
+#: exponential fit [s]
+FIRST_ERRORS = 10.0
 PUBLISHED_MINUTES = 10.0
 PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
 #: number of steps of a shortened initial training; after fewer steps, checkpoint validation rejects

@@ -47,11 +47,12 @@ from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # every tenth message of the held-out motion is evaluated
 TARGETS = 2  # number of targets that the arm approaches without each muscle
-QUICK_TARGETS = 1  # this number in a shortened run
+QUICK_TARGETS = 1  # number of targets without each muscle in a shortened run
 MOVING = 12.0  # duration of healthy motion before a fault [s]
 LATEST_VERDICT = 10  # longest wait for the end of the first verification after a fault [s]
 AFTERWARDS = 6.0  # duration of the motion after this wait [s]
-#: longest time to a target [s]; winches slow the motion, and a fallen arm is sent again
+#: longest time to a target [s]; it allows for slow winches, and for further approaches if the arm
+#: falls
 LONGEST_APPROACH = 60
 SETTLING = 4  # after this time at rest, the arm has arrived [s]
 STILL = 0.02  # the arm rests if no joint moves more than this in a second [rad]

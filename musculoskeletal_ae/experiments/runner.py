@@ -191,7 +191,8 @@ class _Workers:
 
     def abort(self) -> None:
         """End all processes at once."""
-        # First the processes: one that is starting fails with a traceback if the pool is gone.
+        # End the processes before the pool. Otherwise, a process that is just starting would print
+        # a traceback.
         for child in multiprocessing.active_children():
             child.terminate()
         self._pool.shutdown(wait=False, cancel_futures=True)

@@ -61,7 +61,7 @@ class Report(NamedTuple):
     #: [m], (M,)
     arms: Array
     arm_size: Array  # size of the network's moment arms, computed in the same way [m], (M,)
-    #: largest difference of the torque that holds the weight against the springs [N·m], (D,)
+    #: largest difference of the torque that holds the arm against weight and springs [N·m], (D,)
     torque: Array
     stretch: Array  # largest error of the linear spring within [T_bias, T_limit] [m], (M,)
     warnings: tuple[str, ...]  # warnings of MuJoCo about the model

@@ -225,7 +225,8 @@ def _read_sdf(
     if len([*root.iter('model')]) > 1 or model.find('include') is not None:
         raise refuse(file, 'expected a single <model> without <include>; merge all models into one')
     version = [int(part) for part in root.get('version', '1.6').split('.')]
-    # Before SDF 1.5, an axis was given in the frame of the model, since then in that of the joint.
+    # Before SDF 1.5, axes were given in the frame of the model. Since then, they are given in the
+    # frame of the joint.
     frame_of_axis = '1' if version < [1, 5] else '0'
     source, centres = Source(safe_name(model.get('name'), 'robot')), dict[str, Array]()
     source.given_limits, source.limits_file = limits_and_file

@@ -144,7 +144,7 @@ def play(robot: Robot, file: Path) -> int:
     """Simulate the file for a second, and print the CPU time that the simulation takes.
 
     Returns:
-        0 if the file can be simulated in real time, otherwise SLOW.
+        0 if a second of the model needs at most REAL_TIME of CPU time, otherwise SLOW.
 
     Raises:
         MusculoskeletalError: If the file cannot be simulated.
@@ -164,8 +164,8 @@ def play(robot: Robot, file: Path) -> int:
         return 0
     slower = needed / REAL_TIME
     print(
-        f'{message}, about {slower:.2g} times too slow for real time; `bringup.sh --mujoco` '
-        "therefore lets all nodes follow the emulator's slower clock"
+        f'{message}, {slower:.2g} times as much as real time permits beside the other nodes; '
+        "`bringup.sh --mujoco` therefore lets all nodes follow the emulator's slower clock"
     )
     return SLOW
 

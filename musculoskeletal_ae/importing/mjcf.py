@@ -412,7 +412,8 @@ class _Reader:
         if axis is not None and side is not None and side_link is None:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
-                side = side + radius * turn.T @ data.geom_xmat[geom][::3]  # as MuJoCo does
+                # MuJoCo moves a side site on the axis of a cylinder in the same way.
+                side = side + radius * turn.T @ data.geom_xmat[geom][::3]
         link = self.names['body'][body]
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)
 

@@ -393,7 +393,8 @@ def urdf(source: Source) -> str:
         upright = pin.SE3(down.matrix(), np.zeros(3)) * upright
         if abs(size - EARTH) > 0.02:
             source.note('chosen', f'gravity: {EARTH} m/s², although the source has {size:.4g} m/s²')
-    carriers = {0: root}  # link in whose frame each joint of the tree is
+    #: by joint of the tree: the link whose frame coincides with that of the joint
+    carriers = {0: root}
     if not upright.isIdentity(1e-9):
         (carriers[0],) = distinct([f'{root}_upright'], source.links)
         reason = f'because the z axis of the root must point upwards, and {root} is rotated'

@@ -73,7 +73,8 @@ class Controller(Shell):
         self.recording: StopRecording = StopRecording(
             self.resolve_topic_name, topics=topics_with(self.motors.settings)
         )
-        self.recorded: StopCause | None = None  # cause of the last recorded stop
+        #: cause of the latched stop after its recording has begun; None otherwise
+        self.recorded: StopCause | None = None
         self.logged: list[str] = []
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
         self.published_mode = ''

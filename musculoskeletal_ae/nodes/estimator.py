@@ -6,8 +6,8 @@ anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_l
 estimated/markers; on request muscle_joint_states and /tf.
 mae_checkpoint → accepted_checkpoint, the networks that have passed the validation.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
-joint_states are optional: the length calibration, the validation of checkpoints and the detector of
-lengths that disagree with them use them.
+joint_states are optional. They are used by the length calibration, by the validation of
+checkpoints, and by the detector that compares them with the lengths.
 """
 
 import time
@@ -117,7 +117,9 @@ class Estimator(Shell):
         before = self.core.body.isolated
         self.core.use(mae)
         if mae.isolated != before:
-            self.published_isolated = None  # publish again, because the learner has restarted
+            # Publish the isolated muscles again, because the learner may have restarted without
+            # them.
+            self.published_isolated = None
         self._publish_isolated()
         waits_for_network = not self.core.body.offsets.known and self.core.calibration is None
         if waits_for_network:

@@ -78,8 +78,9 @@ class LeanExecutor(SingleThreadedExecutor):
         self._handles = ExitStack()  # keeps entities of the wait set alive
         self._next_full_round = 0.0  # time of the next full round on the monotonic clock [s]
 
-    # The guard condition wakes the executor at each of these calls. It does not tell that one of
-    # them was the reason, because rclpy also triggers it after every callback of a full round.
+    # Each of the following methods triggers the guard condition, which wakes the executor. They
+    # also set `_is_changed`, because the guard condition does not show why it was triggered: rclpy
+    # triggers it after every callback of a full round, too.
 
     def add_node(self, node: Node) -> bool:
         """Add a node whose callbacks are to run."""

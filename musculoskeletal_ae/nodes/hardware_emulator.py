@@ -84,7 +84,7 @@ class HardwareEmulator(Arm):
     def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
         self.arm.set_ruptured(self.parameter('ruptured_muscles'))
-        return 'the arm is at rest without a wrench, the modules are cool and in their safe state'
+        return 'the arm is at rest without a wrench; the modules are cool and in their safe state'
 
     def _set_marker_pose_rate(self, rate: float) -> None:
         self.marker_pose_rate, self.pose_due = rate, 0.0

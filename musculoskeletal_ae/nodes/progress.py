@@ -79,7 +79,8 @@ class ProgressWatch:
     def start(self) -> None:
         """Begin to watch."""
         faulthandler.register(signal.SIGVTALRM, all_threads=True, chain=True)
-        # Set the timer before the thread runs: a native call may take the lock of Python before.
+        # Set the timer here as well as in the thread, because a native call may take Python's lock,
+        # and never release it, before the thread runs for the first time.
         signal.setitimer(signal.ITIMER_VIRTUAL, self._longest)
         self._thread.start()
 

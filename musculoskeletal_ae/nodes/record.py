@@ -31,7 +31,7 @@ from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 #: time between writes to disk [s]; a killed recorder loses the messages since the last write
 FLUSH_PERIOD = 0.5
-#: QoS whose queue holds one or two seconds of the fastest topic while the disk is busy
+#: QoS whose queue holds at least a second of the fastest topic, in case the disk is busy
 LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DRAIN_TIME = 0.5  # time after Ctrl-C for recording messages that have already arrived [s]

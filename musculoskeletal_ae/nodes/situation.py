@@ -37,9 +37,8 @@ FORGET_TIME = 5.0
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 FOLLOWERS = 'controller', 'sim'  # nodes that use the network that the estimator has accepted
 VERSION = 'checkpoint version'  # key of the version in reports
-#: number of the estimator's reports (one a second) that a node may need to follow the estimator. A
-#: node counts as using a wrong network if these reports do not name its network, and as waiting for
-#: the end of an anomaly if they do not report one.
+#: number of the estimator's reports (one a second) during which other nodes may lag behind the
+#: estimator: they may use a previous network, or wait for the end of an anomaly that has just ended
 REPORTS = 3
 
 STOPPED, VERIFYING = StopState.STOPPED.value, StopState.VERIFYING.value

@@ -328,7 +328,7 @@ class StiffnessControl(Actuation):
         """Return the measured lengths [m] (M,), at which only T_bias is demanded."""
         # If the length is out of date, the muscle is paid out to its largest possible length.
         end = length if is_fresh else np.maximum(length, longest)
-        # The length sensor of an isolated muscle may be faulty.
+        # The length sensor of an isolated muscle may be faulty, so its reading is limited.
         return np.where(self._robot.used, end, np.minimum(end, longest))
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:

@@ -46,7 +46,7 @@ REQUIRED_SHARE = 0.95
 REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
 STIFFNESS_PER_LOAD = 2.0  # [1/rad]
 LEAST_INERTIA = 1e-12  # inertia of a joint below which the value is a rounding error [kg·m²]
-#: tension above the one that its module maintains, up to which a muscle counts as slack [N];
+#: a muscle counts as slack up to this much above the tension that its module maintains [N], because
 #: the solver rounds
 SLACK_MARGIN = 1e-3
 # A moment arm counts if it is longer than the smaller of COUNTED_ARM and COUNTED_ARM_SHARE of the

@@ -59,8 +59,8 @@ NO_TENSION = (
     'tendons by tension'
 )
 BY_CURRENT = (
-    'tensions are motor currents; their scale, offset and drive friction are learned, and tension '
-    'limits are as inaccurate as these until then'
+    'tensions are computed from motor currents; scale, offset and drive friction are learned, and '
+    'until then, their errors are also errors of the tension limits'
 )
 
 

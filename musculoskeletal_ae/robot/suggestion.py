@@ -153,7 +153,7 @@ def write(robot: Robot, change: Array, out: Path) -> None:
 
     def not_copied(folder: str, names: list[str]) -> list[str]:
         paths = {name: Path(folder, name) for name in names}
-        # Copy only files and directories, but no pipes and broken links.
+        # Copy files and directories, but not pipes or broken links.
         copyable = [name for name, path in paths.items() if path.is_file() or path.is_dir()]
         return [name for name in names if name not in copyable or paths[name].resolve() in skipped]
 

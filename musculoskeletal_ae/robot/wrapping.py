@@ -154,7 +154,8 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
             good = -1e4
         if good > best:
             best, arc = good, (way * (end - start)) % (2.0 * math.pi)
-            # Rounding may turn an arc of length zero into an almost full turn, so exclude these.
+            # Rounding may turn an arc of length zero into an almost full turn. Such an arc
+            # therefore counts as no wrapping.
             wraps = not crosses and arc < 2.0 * math.pi - 1e-9
             length = math.sqrt(far**2 - r * r) + math.sqrt(near**2 - r * r) + r * arc
             # Each straight part has the direction of the tangent at its point of contact.

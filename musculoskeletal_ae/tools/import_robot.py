@@ -28,7 +28,7 @@ def main(argv: list[str] | None = None) -> int:
     text = 'end effector: a link, a site, or LINK_tip, the far end of a drawn link; '
     text += 'joints outside the chain to it are held fixed'
     parser.add_argument('--end', metavar='NAME', help=text)
-    text = 'simulate an MJCF file for a second and report its speed; exit status 3: below real time'
+    text = 'simulate a second of an MJCF file and report its CPU time; exit status 3: over 0.5 s'
     parser.add_argument('--play', action='store_true', help=text)
     args = parser.parse_args(argv)
     return exit_status(

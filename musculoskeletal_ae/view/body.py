@@ -163,7 +163,9 @@ def viewpoint(points: Array, direction: Array, half: tuple[float, float]) -> tup
     near = points @ direction
     target, distance = np.zeros(3), 0.0
     for axis, tangent in zip((side, np.cross(direction, side)), half):
-        # |p·axis − centre| ≤ tangent (distance − near): the two tightest bounds meet at the centre.
+        # A point p is visible if |p·axis − centre| ≤ tangent · (distance − p·direction). All points
+        # are visible if high ≤ tangent · distance + centre and low ≤ tangent · distance − centre.
+        # Equality in both gives the centre and the smallest distance.
         high = float((points @ axis + tangent * near).max())
         low = float((-points @ axis + tangent * near).max())
         target += 0.5 * (high - low) * axis

@@ -101,7 +101,8 @@ class Controls:
                 'drag the hand', False, hint='shows arrows at the hand that you can drag'
             )
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', _chosen(event)))
-            # A slider ends at multiples of its step, so a step is at most a hundredth of the range.
+            # A slider can end only at multiples of its step. Steps of at most a hundredth of the
+            # range let it cover almost the whole range.
             spans = np.minimum(robot.upper - robot.lower, 100.0)
             places = np.ceil(2.0 - np.log10(spans)).astype(int).tolist()
             steps = np.array([float(f'1e-{n}') for n in places])
