@@ -86,7 +86,7 @@ class Steps(NamedTuple):
 
 
 def changes(time: Array, number: Array, value: Array, rate: float, relieved: Array) -> Steps:
-    """Return how fast the commands of one controller process changed, and which did too fast.
+    """Return how fast the commands of one controller process changed, and which were too fast.
 
     Args:
         time: Times of publishing [s], (N,).

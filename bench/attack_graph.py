@@ -152,8 +152,10 @@ class Attack:
             tuple[float, str, str]
         ] = []  # time [s], level and text of the status line
         self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
-        self.foreign: list[tuple[float, float]] = []  # when other nodes may send commands [s]
-        self.lying: list[tuple[float, float]] = []  # when sensor data are wrong [s]
+        self.foreign: list[
+            tuple[float, float]
+        ] = []  # intervals in which other nodes may send commands [s]
+        self.lying: list[tuple[float, float]] = []  # intervals in which sensor data are wrong [s]
         self.strangers: list[Process] = []  # duplicate nodes that the attack started
         self.watches_processes = True  # whether a process that ends counts as a violation
         self._learner = ''  # identity of the system's own learner, from /diagnostics
@@ -349,7 +351,9 @@ class Attack:
 
     def moving(self) -> bool:
         """Clear anomalies and stops, and explore; return whether the arm moves in time."""
-        self.wait(lambda: set(self.levels) == set(NODES), 'every node goes on', 'all reports')
+        self.wait(
+            lambda: set(self.levels) == set(NODES), 'every node goes on', 'reports of all nodes'
+        )
         self.set_faults([])
         for node, name, value in HEALTHY:
             self.call(SetParameters, f'{node}/set_parameters', set_request(name, value))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Known attacks on an arm, each in several variants, while it holds and while it explores.
 
-Each attack marks the time in which something is wrong (`Scene.wrong`). Afterwards the scene takes
-the steps that /diagnostics advises until the arm moves on.
+Most attacks mark the time in which something is wrong (`Scene.wrong`). After each attack, the scene
+takes the steps that /diagnostics advises until the arm moves on.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Scene:
 
     @contextmanager
     def wrong(self) -> Iterator[None]:
-        """Return a context within which the status line must report a problem after some time."""
+        """Return a context in which the status line must report a problem after REPORT_TIME."""
         begin = time.time()
         yield
         silent = [
@@ -123,7 +123,9 @@ class Scene:
             node = name.rpartition('/')[2]
             attack.processes[node].kill()
             attack.start(node)
-            attack.wait(lambda node=node: node in attack.levels, 'the remedy helps', node)
+            attack.wait(
+                lambda node=node: node in attack.levels, 'the remedy helps', f'a report of {node}'
+            )
         for identifier in attack.situation.steps():
             self._take(STEPS[identifier])
 
@@ -249,7 +251,9 @@ def deny_an_anomaly(scene: Scene) -> None:
     muscle = attack.robot.muscles[scene.rng.randrange(attack.robot.muscle_count)]
     scene.set('hardware_emulator', 'ruptured_muscles', [muscle])
     with scene.wrong():
-        attack.wait(lambda: attack.situation.detected, 'a rupture is detected', muscle)
+        attack.wait(
+            lambda: attack.situation.detected, 'a rupture is detected', f'rupture of {muscle}'
+        )
         scene.publish('anomaly_detected', Bool(data=False), qos=LATCHED)
         attack.call(Trigger, 'controller/reset')
         attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
@@ -261,7 +265,11 @@ def deny_and_go(scene: Scene) -> None:
     attack = scene.attack
     scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[0]])
     with scene.wrong():
-        attack.wait(lambda: attack.situation.detected, 'a rupture is detected', 'the first')
+        attack.wait(
+            lambda: attack.situation.detected,
+            'a rupture is detected',
+            'rupture of the first muscle',
+        )
         scene.publish('anomaly_detected', *[Bool(data=False)] * 3, qos=LATCHED)
         attack.end_strangers()
         attack.spin(0.5)
@@ -391,7 +399,11 @@ def stop_a_verification(scene: Scene) -> None:
     scene.set('estimator', 'on_anomaly', 'isolate')
     scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[1]])
     with scene.wrong():
-        attack.wait(lambda: attack.situation.detected, 'a rupture is detected', 'the second')
+        attack.wait(
+            lambda: attack.situation.detected,
+            'a rupture is detected',
+            'rupture of the second muscle',
+        )
         attack.call(Trigger, 'controller/stop')
         attack.spin(2.0 * LASTING)
     scene.set('hardware_emulator', 'ruptured_muscles', [''])

@@ -20,8 +20,8 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.description import refusal
 from musculoskeletal_ae.robot.directories import find_robot
 
-#: limbs of each body, by name. A number is an arm, and counts the tendons of its wrist (0: no
-#: wrist). 'held' is an arm whose joint elbow_yaw is fixed, so that it has four joints.
+#: limbs of each body, by name. A number stands for an arm with this number of tendons at its wrist
+#: (0: no wrist), 'held' for an arm of four joints, whose joint elbow_yaw is fixed.
 BODIES: dict[str, tuple[int | str, ...]] = {
     '5x10': (0,),
     '7x14': (4,),

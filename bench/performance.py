@@ -34,9 +34,10 @@ ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
 EXPLORING = 60.0  # duration of the exploration that provides the samples of the timed update [s]
-FLAME_RATE = 200.0  # rate of muscle_states while a profile is recorded [Hz]
+#: rate of muscle_states for start-up, memory, late messages and profiles [Hz]
+FLAME_RATE = 200.0
 STARTING = 60.0  # longest wait for the first command [s]
-SETTLING = 15.0  # time from the start of the nodes until profiles are recorded [s]
+SETTLING = 15.0  # running time of the nodes before memory or a profile is measured [s]
 
 #: CPU times [µs] of the first version that was measured (commit be0daee), by row of the table; the
 #: machine had two cores and was idle otherwise

@@ -176,7 +176,7 @@ def run(bodies: list[str], minutes: float, out: Path) -> None:
 def main(argv: list[str]) -> None:
     """Run the bench."""
     parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
-    text = f'of {", ".join((SMALLEST, *BODIES))}'
+    text = f'bodies to measure, of {", ".join((SMALLEST, *BODIES))}'
     parser.add_argument('--bodies', type=names, default=[SMALLEST, *BODIES], help=text)
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_out('DIR', 'networks, rows and plot')

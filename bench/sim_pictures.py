@@ -57,7 +57,7 @@ def main(argv: list[str]) -> None:
     """Write both pictures."""
     parser = Parser('sim_pictures', 'Pictures of the simulated arm: at rest, and loaded.')
     parser.add_robot()
-    parser.add_argument('--checkpoint', required=True, help='trained network')
+    parser.add_argument('--checkpoint', required=True, help='checkpoint of a trained network')
     parser.add_out('DIR', default=Path('doc/images'))
     args = parser.parse_args(argv)
 

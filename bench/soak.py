@@ -118,14 +118,18 @@ def main(argv: list[str]) -> int:
     parser.add_robot()
     parser.add_argument('--hours', type=float, default=24.0, help='robot time [h]')
     parser.add_quick('two hours, to try things out')
-    parser.add_argument('--every', type=int, default=20, help='samples between updates')
+    parser.add_argument(
+        '--every', type=int, default=20, help='number of samples between two updates'
+    )
     parser.add_argument(
         '--creep', type=float, default=0.0, help='lengthening of every tendon [mm/h]'
     )
     parser.add_argument(
-        '--moving', type=float, default=PART, help='motion in every five minutes [s]'
+        '--moving', type=float, default=PART, help='time of motion in every five minutes [s]'
     )
-    parser.add_argument('--steps', type=int, default=STEPS, help='training steps per update')
+    parser.add_argument(
+        '--steps', type=int, default=STEPS, help='number of training steps of an update'
+    )
     parser.add_seed('of the individual')
     parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
     args = parser.parse_args(argv)
@@ -169,7 +173,7 @@ def main(argv: list[str]) -> int:
                 f'{now / 3600.0:5.1f} h  samples {len(learner.samples)} '
                 f'({learner.samples.accepted} accepted)  error {error:.4f} rad  '
                 f'largest/smallest {worst:.3f}  threshold {threshold:.0f}  '
-                f'muscles learned again {reopened}  '
+                f'muscles relearned {reopened}  '
                 f'{memory(os.getpid()):.0f} MB  '
                 f'update {np.median(trainer.seconds[reported:]):.2f} s',
                 flush=True,

@@ -174,7 +174,9 @@ def main(argv: list[str]) -> int:
         initial = checkpoint.load(options.initial, robot)
     methods = [] if '-' in options.methods else options.methods
     if wrong := set(methods) - set(METHODS):
-        raise MusculoskeletalError(f'--methods {sorted(wrong)}; legal: {", ".join(METHODS)}')
+        raise MusculoskeletalError(
+            f'--methods: unknown methods {", ".join(sorted(wrong))}; legal: {", ".join(METHODS)}, -'
+        )
     print(HEAD)
     failures, worst, rows = 0, Excess(0.0, 0.0, 0.0, 0.0), []
     for seed in options.seeds:

@@ -51,7 +51,7 @@ class Row(NamedTuple):
     ours: Callable[[], object]
     torch_eager: Callable[[], object] | None = None
     several: int = 1
-    products: int = 0  # multiply-adds of the network in a call; 0 if they depend on the input
+    products: int = 0  # multiply-adds of the network in a call; 0 if no bound is computed
 
 
 class Timed(NamedTuple):

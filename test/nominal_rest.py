@@ -27,10 +27,10 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 STEP = 0.01  # time step of the simulator [s]
 STILL = 1e-4  # joint speed below which the arm counts as still [rad/s]
 LONGEST_WAIT = 20.0  # longest time until the arm is still [s]
-TENSION_UNIT = 100.0  # unit of the unknown tensions [N], which makes them as large as the angles
+TENSION_UNIT = 100.0  # unit in which the unknown tensions are about as large as the angles [N]
 FLEXED, FLEXION = 'elbow_pitch', np.radians(-90.0)
 FORCED, FORCED_TO = 'shoulder_pitch', np.radians(30.0)
-#: motion of a joint of the nominal body [rad]; smaller ones are not compared with the simulator's
+#: smallest motion of a joint of the nominal body that is compared with that of the simulator [rad]
 NOTICEABLE = 0.05
 
 

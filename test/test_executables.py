@@ -95,7 +95,8 @@ def test_ctrl_c_ends_a_tool_without_a_traceback(name, tmp_path):
     done = signalled(name, signal.SIGINT, 0.9, *arguments)
     output = done.stdout + done.stderr
     assert not any(word in output for word in ('Traceback', 'Exception ignored')), output
-    # Status 0: the tool had finished before the signal. Status 1: it had nothing to do.
+    # Status 0: the tool had finished before the signal. Status 1: it had ended with an error, or
+    # had recorded nothing.
     assert done.returncode in (0, 1, 130), output
 
 
@@ -157,7 +158,7 @@ def test_the_experiments_are_those_that_the_help_names():
     assert tuple(EXPERIMENTS) == NAMES
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason='only root can be somebody else')
+@pytest.mark.skipif(os.getuid() != 0, reason='only root can run a process as another user')
 def test_a_checkout_of_another_user_is_reported(tmp_path):
     clone = tmp_path / 'clone'
     (clone / '.ci').mkdir(parents=True)

@@ -154,7 +154,7 @@ def test_a_publisher_that_offers_less_than_usual_is_recorded(tool, graph, tmp_pa
             f'{graph.namespace}/{name}' for name in topics
         }
 
-    graph.wait(is_recorded, 'messages of both in the bag')
+    graph.wait(is_recorded, 'messages of both topics in the bag')
     recorder.end(signal.SIGINT)
     assert recorder.process.returncode == 0
 
@@ -241,13 +241,16 @@ def test_a_replay_publishes_its_position_and_follows_requests(tool, graph, tmp_p
     graph.listen(DiagnosticArray, '/diagnostics')
     begin = '--start', str(start * length)
     tool('replay', tmp_path / 'bag', '--wait', '0', '--paused', *begin, *ros(graph))
-    graph.wait(lambda: positions, 'where it is')
+    graph.wait(lambda: positions, 'the position of the replay')
     where, whole = read_array(positions[-1], 1, 2)  # the timeline of the page reads it like this
     assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
-    graph.wait(lambda: graph.report('replay').message == 'paused', 'its diagnostics')
+    graph.wait(lambda: graph.report('replay').message == 'paused', 'the report of the replay')
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
     assert good, reason
-    graph.wait(lambda: positions[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3), 'the middle')
+    graph.wait(
+        lambda: positions[-1].data[0] == pytest.approx(0.5 * length, abs=1e-3),
+        'the middle of the recording',
+    )
     assert not graph.set_parameter('replay', 'position', length + 1.0)[0]
 
 
@@ -257,7 +260,7 @@ def test_the_clock_ticks_a_hundred_times_in_a_recorded_second(tool, graph, tmp_p
     clock = graph.listen(Clock, '/clock', 1000)
     graph.listen(Float64MultiArray, 'muscle_states')
     replay = tool('replay', tmp_path / 'bag', '--clock', '--wait', '20', *ros(graph))
-    graph.wait(lambda: replay.process.poll() is not None, 'the end')
+    graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
     assert replay.process.returncode == 0
     times = np.array([c.clock.sec * 10**9 + c.clock.nanosec for c in clock])
     assert (np.diff(times) >= 0).all()
@@ -369,7 +372,7 @@ def test_the_result_of_a_replayed_demonstration_is_reported(tool, graph, tmp_pat
         content.append(samples.Sample('/estimated_joint_states', JOINTS, now, now, data))
     samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
     replay = tool('replay', tmp_path / 'bag', '--as-trajectory', '--wait', '20', *ros(graph))
-    graph.wait(lambda: replay.process.poll() is not None, 'its end')
+    graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
     output = replay.output()
     assert replay.process.returncode == (0 if takes else 1), output
     why = 'the controller refused the trajectory: joint_trajectory: no posture yet'

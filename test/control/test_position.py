@@ -73,8 +73,8 @@ def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hi
         moved = np.clip(goal - length, -SPEED_DEFAULT * DT, SPEED_DEFAULT * DT)
         sliding = slid(sliding, -np.sign(moved), moved)
         length = length + moved
-    # Every reversal of friction halves or doubles the tension. A muscle that was wound in again at
-    # full speed would therefore oscillate, with a tension of up to 1.6 T_limit.
+    # Every reversal of friction halves or doubles the tension. If the muscle were wound in again at
+    # full speed, it would therefore oscillate, with a tension of up to 1.6 T_limit.
     assert np.max(tensions[100:]) < 1.3
     assert (np.array(tensions[100:]) > 1.1).mean() < 0.06
 

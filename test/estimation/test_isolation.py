@@ -28,7 +28,7 @@ def verdict(tension, length, likely=0.0):
         pull, wound = tension(demand, shake), length(n, stir)
         if result := watched.step(pull, wound, command, likely, DT):
             return result
-    raise AssertionError('no answer')
+    raise AssertionError('the verification ended without an outcome')
 
 
 def follows(demand, shake):

@@ -142,7 +142,7 @@ def verdict(tension, length, slack):
         likely = -slack - elongation(pull)
         if result := watched.step(pull, wound, command, likely, DT):
             return result.outcome
-    raise AssertionError('no answer')
+    raise AssertionError('the verification ended without an outcome')
 
 
 PULLS = np.linspace(0.0, 500.0, 2001)

@@ -127,7 +127,11 @@ def test_a_result_without_a_number_that_the_report_shows_is_an_error_with_the_re
 def test_a_page_without_a_place_for_the_table_is_refused_before_the_work(
     tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(measurement, 'run', lambda *_: pytest.fail('measured first'))
+    monkeypatch.setattr(
+        measurement,
+        'run',
+        lambda *_: pytest.fail('the measurement began before the page was checked'),
+    )
     readme = tmp_path / 'README.md'
     options = f'body_change --robot arm26 --quick --readme {readme} --out {tmp_path}'.split()
     assert experiment.main(options) == 1

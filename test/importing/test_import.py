@@ -164,7 +164,7 @@ FORCES = 'forcelimited="true" forcerange="-100 500"'
         (f'<motor gear="-2" {RANGE}"-50 100"/>', 200.0),
         (f'<motor {RANGE}"-250 0"/><motor gear="-1" {RANGE}"0 100"/>', 350.0),
         (f'<muscle tendon="out" force="150" {FORCES}/>', 100.0),
-        (f'<position kp="100" {RANGE}"0 0.1"/>', 18.1),  # kp × its largest position error, 0.181 m
+        (f'<position kp="100" {RANGE}"0 0.1"/>', 18.1),  # kp × the largest position error, 0.181 m
         (f'<motor {RANGE}"0 250"/>', None),
     ],
 )

@@ -28,8 +28,8 @@ class Resting(Stage):
         tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
         direction = self.rng.choice([-1.0, 1.0], tension.shape)
         steps = 1e-4 * np.eye(robot.joint_count)
-        # Iterate to the tensions next to the drawn ones that hold the arm: their elongation changes
-        # the moment arms.
+        # Find tensions that hold the arm and are close to the drawn ones. This takes several
+        # rounds, because tensions elongate the tendons and thereby change the moment arms.
         for _ in range(3):
             slope = np.stack(
                 [

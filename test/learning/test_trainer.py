@@ -53,7 +53,7 @@ def test_the_training_process_learns_the_same_network_as_training_in_this_proces
     assert process.ready
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason='it learns there')
+@pytest.mark.skipif(torch.cuda.is_available(), reason='this machine has a GPU')
 def test_without_a_gpu_training_falls_back_to_the_cpu_with_a_warning(arm26, initial, stage, capfd):
     process = TrainerProcess(arm26, 'default', device='cuda')
     process.begin(initial)

@@ -147,7 +147,7 @@ def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
     history.use(wrong)
     for sample in true[2:]:
         store.add(sample._replace(length=sample.length - wrong))
-    if is_interrupted:  # after a power cycle, the true offsets may be others
+    if is_interrupted:  # after a power cycle, the true offsets may have changed
         history.interrupt()
     history.use(np.zeros(6))
     # Two samples are corrected when the wrong offsets arrive. If the right ones follow without an

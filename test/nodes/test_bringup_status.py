@@ -160,7 +160,7 @@ def test_after_an_isolation_the_fault_is_named_and_the_learner_advises_nothing_f
     for _ in range(3):
         situation.diagnosed(isolated)
         assert situation.trouble() == 'isolated: biceps (ruptured)'
-    situation.diagnosed(isolated)  # the learner waits for something that is over
+    situation.diagnosed(isolated)  # the learner still waits for an anomaly that has ended
     assert situation.trouble().endswith('warning: /left/learner: paused by an anomaly')
 
 

@@ -107,7 +107,7 @@ def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     assert refused.startswith('refused: muscle_states are too old')
     assert 'call controller/reset again' in refused
     before = arm.count()
-    arm.graph.wait(lambda: arm.count() > before + 20, 'commands to nobody')
+    arm.graph.wait(lambda: arm.count() > before + 20, 'commands without a driver')
     arm.start('hardware_emulator', seed=1)
     arm.graph.next('estimated_joint_states', 5)
     arm.set_max_age(PATIENT)

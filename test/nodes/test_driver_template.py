@@ -43,7 +43,10 @@ def test_the_driver_template_follows_lengths_and_tensions_whichever_came_last(gr
 def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(graph):
     core = graph.host(Controller, robot='arm26').core
     graph.listen(Float64MultiArray, 'muscle_length_command')
-    graph.wait(lambda: not graph.set_parameter('controller', 'method', 'float')[0], 'a refusal')
+    graph.wait(
+        lambda: not graph.set_parameter('controller', 'method', 'float')[0],
+        'the refusal of the method',
+    )
     done, reason = graph.set_parameter('controller', 'method', 'tension')
     assert (
         not done and 'subscribes to muscle_length_command only; legal: geometric, first' in reason
@@ -52,4 +55,7 @@ def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(gra
     # have set `float`.
     assert core.settings.method in ('proposed', 'float')
     graph.listen(Float64MultiArray, 'muscle_tension_command')
-    graph.wait(lambda: graph.set_parameter('controller', 'method', 'tension')[0], 'no refusal')
+    graph.wait(
+        lambda: graph.set_parameter('controller', 'method', 'tension')[0],
+        'the method to be accepted',
+    )

@@ -107,7 +107,7 @@ def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimato
         estimator.wait(counted, f'the count of {reason}')
     answer(estimator, healthy)
     estimator.received['/diagnostics'].clear()
-    estimator.wait(lambda: values(estimator), 'the diagnosis')
+    estimator.wait(lambda: values(estimator), 'a report with the counts')
     assert {f'rejected muscle_states: {reason}' for reason in cases} <= values(estimator).keys()
 
 
@@ -155,7 +155,7 @@ def test_a_checkpoint_is_replaced_by_parameter_and_topic_and_an_unfit_one_refuse
             f'refusal {count}',
         )
     estimator.received['/diagnostics'].clear()
-    estimator.wait(lambda: values(estimator), 'the diagnosis')
+    estimator.wait(lambda: values(estimator), 'the report of the estimator')
     assert values(estimator)['checkpoint version'] == '41'
     answer(estimator, healthy)
 
@@ -171,7 +171,7 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
         return detected and detected[-1].data
 
     estimator.wait(observed, 'the detection')
-    estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the diagnosis')
+    estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the report of an error')
     assert 'anomaly detected: ' in estimator.report('estimator').message
     for _ in range(8):
         answer(estimator, healthy)

@@ -35,7 +35,7 @@ def test_under_every_executor_a_node_counts_exceptions_goes_on_and_ends_with_sta
     monkeypatch.setenv(executor.VARIABLE, choice)
     graph.listen(DiagnosticArray, '/diagnostics')
     process = graph.start('estimator', robot='arm26')
-    graph.wait(lambda: graph.report('estimator').values, 'its diagnostics')
+    graph.wait(lambda: graph.report('estimator').values, 'the report of the estimator')
     # Callbacks of muscle messages take the message and its information.
     muscles = graph.publisher(Float64MultiArray, 'muscle_states')
 
@@ -50,7 +50,8 @@ def test_under_every_executor_a_node_counts_exceptions_goes_on_and_ends_with_sta
     )
     graph.call(SetParameters, 'estimator/set_parameters', request)
     graph.wait(
-        lambda: any('ValueError' in key for key in graph.report('estimator').values), 'the count'
+        lambda: any('ValueError' in key for key in graph.report('estimator').values),
+        'the count of the exception',
     )
     status, output = graph.ended(process, signal.SIGTERM)
     assert status == 0, output
@@ -68,7 +69,7 @@ def test_an_exception_of_a_node_s_callback_is_counted_by_topic(graph):
     for topic, callback in (('sync', fails), ('async', fails_later)):
         node.create_subscription(String, topic, callback, 10)
         graph.publisher(String, topic).publish(String(data='a'))
-    graph.wait(lambda: sum(node.rejected.values()) == 2, 'both')
+    graph.wait(lambda: sum(node.rejected.values()) == 2, 'the counts of both exceptions')
     place = graph.namespace
     assert node.rejected == {f'{place}/sync: ValueError': 1, f'{place}/async: KeyError': 1}
 
@@ -102,7 +103,7 @@ def test_messages_are_handled_while_a_callback_awaits(graph):
     graph.wait(lambda: heard, 'the message')
     future.set_result('done')
     quick.publish(String(data='again'))
-    graph.wait(lambda: 'done' in heard, 'the end')
+    graph.wait(lambda: 'done' in heard, 'the end of the asynchronous callback')
     assert heard[0] == 'meanwhile'
 
 

@@ -34,10 +34,11 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
     graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
     graph.wait(
-        lambda: graph.report('estimator').values['verification'] == 'running', 'what is done'
+        lambda: graph.report('estimator').values['verification'] == 'running',
+        'the verification to be reported',
     )
     assert graph.report('estimator').values['suspect muscle'] == name
-    graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'its end')
+    graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'the end of the anomaly')
     assert arm.estimator.core.suspects.last_verification == f'{name}: ruptured'
     assert graph.received['isolated_muscles'][-1].data == name
     graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
@@ -48,14 +49,18 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
     answer = graph.call(Trigger, 'estimator/restore')
     assert (answer.success, answer.message) == (True, 'isolated: none')
-    graph.wait(lambda: arm.controller.core.robot.isolated == (), 'its use')
+    graph.wait(
+        lambda: arm.controller.core.robot.isolated == (), 'the controller to use the muscle again'
+    )
 
 
 def test_a_muscle_whose_sensor_sends_nan_is_isolated_and_the_arm_goes_on(arm):
     graph, name = arm.graph, arm.robot.muscles[2]
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'nan_sensor:tension:{name}'])[0]
-    graph.wait(lambda: arm.controller.core.robot.isolated == (2,), 'the controller')
+    graph.wait(
+        lambda: arm.controller.core.robot.isolated == (2,), 'the controller to isolate the muscle'
+    )
     verified = arm.estimator.core.suspects.last_verification
     assert verified == f'{name}: a sensor reports NaN instead of a number'
     graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
@@ -75,12 +80,17 @@ def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trai
     assert 'legal: ' in reason
     assert graph.set_parameter('estimator', 'isolate_muscles', names)[0]
     assert graph.call(Trigger, 'estimator/isolate').message == f'isolated: {", ".join(names)}'
-    graph.wait(lambda: arm.controller.core.robot.isolated == (1, 2), 'the controller')
+    graph.wait(
+        lambda: arm.controller.core.robot.isolated == (1, 2),
+        'the controller to isolate the muscles',
+    )
     # A learner's network in which no muscle is isolated shows that the learner does not know the
     # list. The estimator therefore publishes it again.
     count = len(graph.received['isolated_muscles'])
     graph.send_network(checkpoint.to_bytes(trained['default']))
-    graph.wait(lambda: len(graph.received['isolated_muscles']) > count, 'the list')
+    graph.wait(
+        lambda: len(graph.received['isolated_muscles']) > count, 'the list of isolated muscles'
+    )
     assert arm.estimator.core.body.isolated == (1, 2)
 
 
@@ -89,7 +99,7 @@ def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, ar
     reported = graph.listen(String, 'isolated_muscles', LATCHED)
     estimator = graph.host(Estimator, robot='arm26')
     graph.send_network(checkpoint.to_bytes(known))
-    graph.wait(lambda: reported, 'the list')
+    graph.wait(lambda: reported, 'the list of isolated muscles')
     assert reported[-1].data == arm26.muscles[4]
     assert estimator.core.mae.isolated == (4,)
     # Only the first network determines the isolated muscles. From now on the estimator does.

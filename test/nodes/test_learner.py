@@ -175,7 +175,10 @@ def test_the_learner_publishes_and_saves_checkpoints_and_replaces_a_dead_trainin
     assert checkpoint.load(Path(state) / NETWORK, arm26).version in versions(graph, arm26)
     first = learner.report().values['training process']
     os.kill(int(first), signal.SIGKILL)
-    learner.learn(lambda: learner.report().values['training process restarts'] == '1', 'a notice')
+    learner.learn(
+        lambda: learner.report().values['training process restarts'] == '1',
+        'the report of the restarted training process',
+    )
     updates = learner.updates
     learner.learn(lambda: learner.updates > updates, 'an update')
     assert learner.report().values['training process'] != first
@@ -191,7 +194,7 @@ def test_an_anomaly_stops_learning_until_the_reset(host, graph):
     detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
     learner.learn(lambda: learner.updates >= 1, 'an update')
     detected.publish(Bool(data=True))
-    learner.learn(lambda: 'anomaly' in learner.report().message, 'the gate')
+    learner.learn(lambda: 'anomaly' in learner.report().message, 'the learner to pause')
     learner.learn(lambda: learner.node.core.trainer.ready, 'the end of the last update')
     samples, updates = learner.samples, learner.updates
     learner.run(2.0 * MARGIN + 2.0)
@@ -242,7 +245,7 @@ def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, state):
     fresh = host(state_directory=state, fresh=True)
     assert fresh.samples == 0
     assert (Path(state) / 'backup-1.state').exists()
-    fresh.learn(lambda: fresh.updates >= 1, 'learning anew')
+    fresh.learn(lambda: fresh.updates >= 1, 'an update from the start')
 
 
 def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, graph, arm26):
@@ -313,7 +316,9 @@ def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
         return learner.node.core.mae.isolated
 
     isolated.publish(String(data=''))  # an estimator that has just started publishes this
-    graph.wait(lambda: learner.node.has_heard_isolated, 'what it says')
+    graph.wait(
+        lambda: learner.node.has_heard_isolated, 'the learner to receive the isolated muscles'
+    )
     assert known() == (4,)
     for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
         isolated.publish(String(data=text))
@@ -356,8 +361,8 @@ def test_a_killed_learner_resumes_from_its_saved_state(graph, arm26, trained_fil
     graph.ended(process, signal.SIGKILL)
     graph.received['/diagnostics'].clear()
     start(graph, checkpoint='/no/such/file', state_directory=state)
-    graph.wait(lambda: samples(graph) >= stored, 'the samples of before')
-    graph.wait(lambda: versions(graph, arm26)[-1] >= version, 'the network of before')
+    graph.wait(lambda: samples(graph) >= stored, 'the saved samples')
+    graph.wait(lambda: versions(graph, arm26)[-1] >= version, 'the saved network')
     graph.wait(lambda: not is_running(worker), 'the end of the orphaned training process')
 
 
@@ -391,7 +396,7 @@ def test_learning_works_without_joint_sensors_and_with_an_accelerometer(host, gr
             reported = learner.node.rejected
             return reason in reported if reason else learner.tilted
 
-        graph.wait(taken, f'what came of {frame}')
+        graph.wait(taken, f'the result of the message with frame {frame!r}')
     second = graph.node.create_publisher(Imu, 'imu', 10)
     message.header.frame_id = 'forearm'
 

@@ -58,7 +58,7 @@ def test_render_writes_a_picture_and_refuses_an_unknown_file_type(graph, tmp_pat
     graph.host(HardwareEmulator, robot='arm26')
     out = tmp_path / file
     tool = graph.run('render', '--out', str(out))
-    graph.wait(lambda: not tool.alive(), 'its end')
+    graph.wait(lambda: not tool.alive(), 'the end of render')
     ended, output = tool.ended()
     assert ended == status and out.exists() is (status == 0)
     assert status == 0 or (file in output and '.png' in output and 'Traceback' not in output)
@@ -76,7 +76,7 @@ def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
             publisher.publish(MarkerArray(markers=markers))
         return not tool.alive()
 
-    graph.wait(ended, 'its end')
+    graph.wait(ended, 'the end of render')
     status, output = tool.ended()
     assert (status, out.exists()) == (0, True) and 'estimated/markers' in output
 

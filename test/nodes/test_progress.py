@@ -96,5 +96,5 @@ def test_the_time_for_which_a_thread_waits_for_a_processor_grows():
     before = waited_for_processor()
     deadline = time.monotonic() + DEADLINE
     while waited_for_processor() == before and time.monotonic() < deadline:
-        time.sleep(0.001)  # every wake-up waits for a moment
+        time.sleep(0.001)  # after each sleep, the thread waits a moment for a processor
     assert waited_for_processor() > before

@@ -33,7 +33,7 @@ def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(graph, monk
             return report if all(text in report.message for text in texts) else None
 
         assert graph.wait(shown, f'the refusal of {topic}').level == 'warn'
-    graph.wait(lambda: 'refused' not in graph.report('controller').values, 'its end')
+    graph.wait(lambda: 'refused' not in graph.report('controller').values, 'the end of the report')
 
 
 def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):
@@ -48,10 +48,10 @@ def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):
         texts.add(graph.report('controller').message.partition('; refused ')[2])
         return any('publish it reliable' in text for text in texts)
 
-    graph.wait(shown, 'the report')
+    graph.wait(shown, 'the report of an unreliable publisher')
     graph.listen(Float64MultiArray, 'muscle_length_command', latching)
 
     def is_shown_too():
         return 'muscle_length_command: incompatible QoS' in graph.report('controller').message
 
-    graph.wait(is_shown_too, 'that of a subscriber')
+    graph.wait(is_shown_too, 'the report of an incompatible subscriber')

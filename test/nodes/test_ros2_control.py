@@ -103,7 +103,7 @@ def test_check_driver_passes_the_robot_and_moves_it(graph):
     options = ['--seconds', '2', '--wait', '--move', '--muscles', 'brachialis']
     process = graph.run('check_driver', '--robot', 'arm26', '--params-file', str(NODES), *options)
     commands = graph.listen(Float64MultiArray, COMMANDS)
-    graph.wait(lambda: not process.alive(), 'its end')
+    graph.wait(lambda: not process.alive(), 'the end of check_driver')
     status, output = process.ended()
     faults = [line.split()[1] for line in output.splitlines() if line.startswith('fault: ')]
     assert set(faults) <= {'latency', 'rate'} and (status == 0 or faults), output
@@ -185,7 +185,10 @@ def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, train
 def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, trained_file):
     controller = host(graph, Controller, checkpoint=trained_file)
     graph.node.create_publisher(Float64MultiArray, COMMANDS, 10)
-    graph.wait(lambda: COMMANDS in controller.core.watchdog.second_publisher, 'its detection')
+    graph.wait(
+        lambda: COMMANDS in controller.core.watchdog.second_publisher,
+        'the detection of the second publisher',
+    )
 
 
 def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(graph):
@@ -193,7 +196,7 @@ def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(grap
     for name in ('first', 'second'):
         other = graph.host(partial(Node, name))
         other.create_publisher(JointState, STATES, 10)
-    graph.wait(lambda: node.intruders, 'their detection')
+    graph.wait(lambda: node.intruders, 'the detection of the second publisher')
     assert node.intruders.startswith(f'{STATES} come from ')
 
 

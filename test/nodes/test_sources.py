@@ -98,7 +98,7 @@ def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
             condition.cause.identifier == 'stale_estimate' for condition in present
         )
 
-    graph.wait(is_stale, 'the age')
+    graph.wait(is_stale, 'the data to become stale')
 
 
 def test_two_publishers_of_one_link_are_noticed_but_two_links_are_not():
@@ -190,6 +190,6 @@ def test_the_end_of_an_anomaly_counts_once_the_estimator_confirms_it(graph, conf
     detected.publish(Bool(data=True))
     graph.wait(lambda: watchdog.has_anomaly, 'the anomaly')
     detected.publish(Bool(data=False))
-    graph.wait(lambda: asked, 'the question')
+    graph.wait(lambda: asked, 'the call of the service')
     graph.spin(0.2)
     assert watchdog.has_anomaly is not confirmed

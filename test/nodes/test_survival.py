@@ -67,7 +67,7 @@ def node(request, graph):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     own = {'state_directory': ''} if request.param == 'learner' else {}
     graph.start(request.param, robot='arm26', use_sim_time=True, **own)
-    graph.wait(lambda: states(graph, request.param), 'its diagnostics')
+    graph.wait(lambda: states(graph, request.param), 'the first report of the node')
     return request.param
 
 
@@ -117,7 +117,7 @@ def test_no_request_or_clock_ends_a_node(graph, node):
         graph.spin(0.1)
     assert graph.set_parameter(node, 'use_sim_time', False)[0]
     before = len(states(graph, node))
-    graph.wait(lambda: len(states(graph, node)) > before + 1, 'its diagnostics')
+    graph.wait(lambda: len(states(graph, node)) > before + 1, 'the next reports of the node')
     process, own = graph.processes[-1].process.pid, os.nice(0)
     second = node in ('learner', 'sim')  # low priority, because commands do not depend on them
     assert os.getpriority(os.PRIO_PROCESS, process) == (max(own, NICENESS) if second else own)
@@ -168,7 +168,7 @@ def test_the_status_line_waits_for_a_slow_start_for_a_limited_time(graph):
 def test_a_crash_of_the_interpreter_prints_where_it_happened(graph):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     process = graph.start('hardware_emulator', robot='arm26')
-    graph.wait(lambda: states(graph, 'hardware_emulator'), 'its diagnostics')
+    graph.wait(lambda: states(graph, 'hardware_emulator'), 'the first report of the emulator')
     status, output = graph.ended(process, signal.SIGSEGV)
     assert status == -signal.SIGSEGV
     assert 'Segmentation fault' in output and 'File "' in output

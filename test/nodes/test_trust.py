@@ -69,7 +69,7 @@ def test_of_networks_received_during_a_validation_the_last_is_used_by_all_nodes(
         mae = replace(trained['default'], version=version)
         arm.graph.send_network(checkpoint.to_bytes(mae))
         arm.graph.executor.spin_once(LOOK)
-    arm.graph.wait(lambda: all(node.core.mae.version == 20 for node in nodes), 'the last')
+    arm.graph.wait(lambda: all(node.core.mae.version == 20 for node in nodes), 'the last network')
     for name in ('controller', 'estimator'):
         arm.graph.wait(
             lambda name=name: arm.graph.report(name).values.get('checkpoint version') == '20',
@@ -106,9 +106,9 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
             arm.graph.send_network(checkpoint.to_bytes(network))
         return all(node.core.mae.version == first + 1 for node in nodes)
 
-    arm.graph.wait(is_used, 'the new one')
+    arm.graph.wait(is_used, 'the new network')
     arm.estimator.candidates.on_anomaly(True)
-    arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven one')
+    arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven network')
 
 
 def test_impossible_length_offsets_are_refused(graph, trained_file):
@@ -129,7 +129,9 @@ def test_a_second_publisher_of_muscle_states_stops_the_arm_until_it_is_gone(arm)
     assert f'{space}/hardware_emulator and {space}/test' in arm.state().message
     assert not arm.graph.call(Trigger, 'controller/reset').success
     refused = arm.estimator.rejected
-    arm.graph.wait(lambda: refused['muscle_states: several publishers'], 'a refusal')
+    arm.graph.wait(
+        lambda: refused['muscle_states: several publishers'], 'the rejection of a message'
+    )
     arm.graph.node.destroy_publisher(stranger)
     arm.graph.wait(lambda: arm.graph.call(Trigger, 'controller/reset').success, 'the reset')
     arm.goes_to(HERE)

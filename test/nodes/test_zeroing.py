@@ -36,7 +36,7 @@ def test_length_offsets_are_found_and_reach_every_node(
     nodes = [node, controller, learner]
     graph.wait(
         lambda: all(n.body.offsets.known and n.body.offsets.offset.any() for n in nodes),
-        'the zeros',
+        'the length offsets',
         8 * DEADLINE,
     )
     offset = hardware.arm.faults.zero
@@ -66,11 +66,11 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
                 == controller.core.stream.body.offsets.known
                 == expected
             ),
-            'the zeros',
+            'the length offsets',
         )
 
     reported(0.05, 0.0)
-    graph.wait(lambda: controller.body.offsets.offset.all(), 'the zeros')
+    graph.wait(lambda: controller.body.offsets.offset.all(), 'the length offsets')
     # A restarted estimator publishes these offsets, but they contradict the earlier ones.
     reported(0.0, 0.0)
     known(False)
@@ -78,7 +78,7 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
     graph.spin(0.3)
     known(False)
     reported(0.01, 1.0)
-    graph.wait(lambda: controller.body.offsets.offset.all(), 'a guess')
+    graph.wait(lambda: controller.body.offsets.offset.all(), 'the uncertain length offsets')
     reported(0.05, 0.001)
     known(True)
 
@@ -87,5 +87,8 @@ def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, train
     common = {'robot': 'arm26', 'checkpoint': trained_file}
     controller = graph.host(Controller, **common)
     estimator = graph.host(Estimator, **common, zero_at_start=True)
-    graph.wait(lambda: not controller.body.offsets.known, 'the controller to know of it')
+    graph.wait(
+        lambda: not controller.body.offsets.known,
+        'the controller to receive unknown length offsets',
+    )
     assert not estimator.core.body.offsets.known

@@ -478,8 +478,8 @@ def test_a_remedy_written_into_muscles_yaml_does_what_it_says(tmp_path, case):
         changed = {key: dict(v) if isinstance(v, dict) else v for key, v in top.items()}
         changes = number.findall(line)
         if len(changes) != line.split('→')[0].count(',') + 1:
-            # The remedy also changes masses, moment arms or joint limits, which muscles.yaml does
-            # not contain.
+            # The remedy also changes masses, moment arms or joint limits, which no number in
+            # muscles.yaml states.
             continue
         for owner, name, value in changes:
             (changed.setdefault(owner, {}) if owner else changed)[name] = float(value)

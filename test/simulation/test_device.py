@@ -95,7 +95,7 @@ def test_the_network_is_computed_on_the_device(robot, mae):
     assert devices.types == {'meta'}
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason='it simulates there')
+@pytest.mark.skipif(torch.cuda.is_available(), reason='this machine has a GPU')
 def test_device_cuda_is_refused_without_a_gpu(robot, mae):
     with pytest.raises(MusculoskeletalError, match=r"device 'cuda'.*cannot use it; legal: cpu"):
         Simulation(robot, mae, device='cuda')

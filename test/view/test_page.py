@@ -219,7 +219,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         assert page.screenshot(SCREENSHOTS / 'moving.png') != before
         assert not targets and not any(message.data for message in detected)
         page.click(*page.centre('End exploring'))
-        graph.wait(lambda: modes[-1].data == 'idle', 'the end')
+        graph.wait(lambda: modes[-1].data == 'idle', 'the end of the exploration')
         page.click(*page.centre('Explore'))
         see('exploring')
         page.click(*page.centre('Rupture'))
@@ -235,7 +235,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.screenshot(SCREENSHOTS / 'rupture.png')
     finally:
         page.close()
-    graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'nobody to look any more')
+    graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'the page to unsubscribe')
 
 
 @chromium
@@ -248,7 +248,7 @@ def test_muscles_are_shown_although_an_isolated_one_sends_nan(graph, view, arm26
             publish()
             return '61 N' in page.text
 
-        graph.wait(shown, 'the tension of the others')
+        graph.wait(shown, 'the tensions of the other muscles')
         page.wait_for('isolated: brachialis')
         assert page.evaluate('document.title') == 'arm26 – musculoskeletal_ae'
         assert 'brachialis' in page.text and 'nan' not in page.text
@@ -277,7 +277,7 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
     port, asked = view(), []
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.wait(
-        lambda: graph.report('view').message == 'the page has no visitors', 'its diagnostics'
+        lambda: graph.report('view').message == 'the page has no visitors', 'the report of the page'
     )
 
     def answer(request, response):  # answer as a node that does not have these parameters
@@ -297,7 +297,9 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
 
         graph.wait(shown, 'the page to go on')
         rate = 'estimated_joint_states rate'
-        graph.wait(lambda: rate in graph.report('view').values, 'what it says of them')
+        graph.wait(
+            lambda: rate in graph.report('view').values, 'the rate of the estimates in the report'
+        )
     assert graph.processes[-1].alive()
 
 
