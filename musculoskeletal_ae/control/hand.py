@@ -24,7 +24,8 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import TrajectoryPoints
 
-#: tolerances [m] and [rad] of the inverse kinematics for a whole pose, and for its position only
+#: tolerances [m] and [rad] of the inverse kinematics: for a whole pose, and for a position only,
+#: with which any orientation is legal
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
 FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
 TURNED = 0.05  # a pose is unreachable if the hand's orientation differs by more than this [rad]

@@ -31,11 +31,11 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 # Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
-# RACK and become [m], and torques are divided by RACK and become [N].
+# `kinematics.RACK` and become [m], and torques are divided by it and become [N].
 NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
 HALVINGS = 6  # bisection steps in the search for the last holdable posture of a path
 
-PRICE = 20.0  # cost of missing torque [rad/(N·m)]
+PRICE = 20.0  # cost of missing torque, per radian of the path [1/(N·m)]
 USED = 0.85  # fraction of the tension range above T_bias that a path may use
 POSTURES = 300  # number of random postures of the roadmap
 NEIGHBOURS = 12  # number of neighbours of each posture to which the roadmap has edges

@@ -28,7 +28,7 @@ SLOWER = tuple(1.1**k for k in range(17))
 SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: smallest lag λ for which a motion is planned [s]; λ is measured only after the motion has begun
 LEAST_LAG = 0.02
-MOMENT_SPACING = 0.06  # least distance between moments at which tensions are computed [rad]
+MOMENT_SPACING = 0.06  # shortest motion between moments at which tensions are computed [rad]
 #: largest number of moments at which tensions are computed; 500 moments take about 30 ms
 MOST_EXERTIONS = 500
 

@@ -59,7 +59,7 @@ class SafeStop:
     def leave(self) -> None:
         """End a stop."""
         self.is_entered = False
-        self._held = 0.0  # time since the start of the stop, as far as it counts (`step`) [s]
+        self._held = 0.0  # counted time since the start of the stop (see `step`) [s]
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]
         self._released_from: Array | None = None  # lengths at the start of the release [m], (M,)
 

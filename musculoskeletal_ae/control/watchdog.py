@@ -55,7 +55,7 @@ class DataAge:
     def __init__(self) -> None:
         self.stepped_at = -math.inf
         self._came_at = {MUSCLE_STATES: -math.inf, ESTIMATE: -math.inf}
-        self._time = math.nan  # time of the messages at the last step [s]
+        self._time = math.nan  # time of the messages' clock at the last step [s]
         self._awake = AwakeClock(OWN_PAUSE)
         self.pace = 1.0  # pace of the messages' clock relative to the steady clock
 

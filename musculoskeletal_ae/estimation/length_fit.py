@@ -29,7 +29,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 # Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
-# RACK and become [m], and torques are divided by RACK and become [N].
+# `kinematics.RACK` and become [m], and torques are divided by it and become [N].
 
 LENGTH_NOISE = 0.0004  # standard deviation of the network's error of a length [m]
 #: standard deviation of the network's error of a joint torque, apart from friction [N·m]

@@ -68,7 +68,7 @@ class MomentCollector:
         self._angles: list[Array] = []  # measured θ in the same window
         self._span = 0.0  # duration of the present window so far [s]
         self._moments: list[tuple[Array, ...]] = []
-        self._last_length: Array = np.zeros(len(used))  # l when the arm had moved last [m]
+        self._last_length: Array = np.zeros(len(used))  # l from which motion is measured [m]
         self.time = 0.0
         self.has_moved_away = False
 

@@ -33,7 +33,8 @@ from musculoskeletal_ae.signals.pairing import Paired, Pairing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 NO_MESSAGES = 'no muscle_states are received'
 NO_JOINTS = 'muscle_states are received without usable joint angles'
-#: standard deviation of θ measured by a camera [rad]; for prismatic joints times RACK [m]
+#: standard deviation of θ measured by a camera [rad]; for prismatic joints times `kinematics.RACK`
+#: [m]
 SPREAD = 0.02
 
 

@@ -35,7 +35,7 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 
 ROUNDS = 30  # largest number of Gauss–Newton iterations for one muscle
-LEAST_DECREASE = 1e-11  # decrease of the cost per length below which the iterations end
+LEAST_DECREASE = 1e-11  # decrease of the cost, per measured length, that ends the iterations
 LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
 #: number of samples from before the change of a muscle that are required to derive a new prior
 LEAST_BEFORE_CHANGE = 8

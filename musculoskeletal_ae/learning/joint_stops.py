@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.learning.posture_model import PostureModel
 
 # The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
-# RACK [m].
+# `kinematics.RACK` [m].
 ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
 ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
 STOP_SPREAD = 0.01  # standard deviation of the distance between a stop and its limit [rad]

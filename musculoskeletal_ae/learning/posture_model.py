@@ -27,7 +27,7 @@ from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 DIFFERENCE = 1e-6  # step of the finite differences [rad] or [m]
 #: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]; for prismatic
-#: joints times RACK [m]
+#: joints times `kinematics.RACK` [m]
 REUSED_MOTION = 0.05
 SMALL = 1e-6  # smallest divisor
 

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.learning.body import CalibratedBody
 
 # The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
-# RACK [m].
+# `kinematics.RACK` [m].
 GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
 FIRST_NOISE = 0.002  # initial σ of a length [m]
 LEAST_NOISE = 0.0008  # smallest σ of a length in the weights, for errors of the body model [m]
@@ -62,9 +62,9 @@ TORQUE_NOISE = 0.3
 LEAST_TORQUE = 0.01
 SCALINGS = 2  # number of iterations that compute the Birge ratio
 ROUNDS = 12  # largest number of Gauss–Newton iterations
-#: Decrease of the cost per length below which the iterations end. The step is then far shorter than
-#: the posterior spread, and the noise has settled. With ten times this value, the fit mistakes a
-#: slipped joint sensor for a changed muscle more often.
+#: Decrease of the cost, per measured length, below which the iterations end. The step is then far
+#: shorter than the posterior spread, and the noise has settled. With ten times this value, the fit
+#: mistakes a slipped joint sensor for a changed muscle more often.
 LEAST_DECREASE = 3e-4
 TYPICAL_STEP = 0.3  # typical step of a posture [rad]
 

@@ -21,7 +21,7 @@ from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREA
 #: of joints without a sensor.
 INDEPENDENT_SAMPLES = 10.0
 # The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
-# RACK [m].
+# `kinematics.RACK` [m].
 SENSOR_NOISE = 0.002  # σ_y of a joint sensor [rad]
 LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
 

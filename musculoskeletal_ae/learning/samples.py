@@ -28,7 +28,7 @@ CAPACITY = 400  # default of the largest number of samples in a store
 #: if the same share of the samples has all joint angles.
 CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
-#: typical moment arm, which converts lengths to angles where no joint angle was measured [m]
+#: typical moment arm, which converts lengths to angles where not all joint angles were measured [m]
 MOMENT_ARM = 0.04
 #: smallest threshold [rad or N]; it replaces a threshold of 0, with which any sample is new
 LEAST_DISTANCE = 1e-6
@@ -254,7 +254,7 @@ class SampleStore:
         distances = self._settings.new_joint_distance, self._settings.new_tension_distance
         joint, newton = (max(distance, LEAST_DISTANCE) for distance in distances)
         unread = np.isnan(theta).any(axis=1, keepdims=True)
-        # Where the posture was not measured, compare the muscle lengths instead.
+        # Where not all joint angles were measured, compare the muscle lengths as well.
         by_length = np.where(unread, length / (MOMENT_ARM * joint), np.nan)
         by_angle, by_tension = theta / (joint * self._radian), tension / newton
         return np.concatenate([by_angle, by_tension, by_length], axis=1)

@@ -24,7 +24,7 @@ class Limits(NamedTuple):
     Nodes and tools that process muscle states or estimates all use these limits.
     """
 
-    #: largest excess of a joint sensor over the joint's range, as a fraction of the range
+    #: largest excess of a measured angle over the joint's range, as a fraction of the range
     joint_outside: float = 0.1
     #: largest excess of an estimated angle over the joint's range, as a fraction of the range
     estimate_outside: float = 0.5

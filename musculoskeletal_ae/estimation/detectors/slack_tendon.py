@@ -36,7 +36,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: number of standard deviations by which a tendon without tension is stretched if it is ruptured
+#: number of standard deviations of the stretch above which a tendon without tension is ruptured
 SIGMAS = 3.0
 #: Number of standard deviations by which a tension has to exceed T_slack, so that its tendon is
 #: surely taut. Tensions from motor currents have a standard deviation; that of sensors counts as 0.
