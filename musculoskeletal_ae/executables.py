@@ -3,8 +3,8 @@
 
 This module imports nothing heavy. Hence `--help` answers at once, and signals are handled before
 torch and rclpy are loaded. On Ctrl-C or SIGTERM, nodes exit with status 0 and tools with 130.
-`record` and `replay` exit with 0, because Ctrl-C is how a user normally ends them. A tool then
-prints what it has written. No executable prints a traceback.
+`record` and `replay` exit with 0, because Ctrl-C is how a user normally ends them. An interrupted
+tool prints what it has written. No executable prints a traceback.
 """
 
 import ast

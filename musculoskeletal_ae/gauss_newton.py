@@ -222,7 +222,7 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
         enough: The fit ends when a step lowers the cost by less than this value.
 
     Returns:
-        The state after the last round. The weights of the problem are those of its point.
+        The state after the last round. The weights of the problem then belong to its point.
     """
     fit = Result(start)
     for _ in range(rounds):

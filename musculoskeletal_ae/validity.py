@@ -219,7 +219,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
     The frame of the message must be `root_link`, or empty, which means the same.
     """
     if message.header.frame_id not in ('', root_link):
-        raise MessageError('wrong frame', f'{message.header.frame_id!r}, not {root_link!r}')
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {root_link!r}')
     wrench = message.wrench
     return _six(wrench.force, wrench.torque, MOST_WRENCH, 'a force or torque')
 
@@ -230,7 +230,7 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
     if not np.isfinite(values).all():
         raise MessageError('not finite', what)
     if (np.abs(values) > most).any():
-        raise MessageError('oversized', f'{values}, at most {most}')
+        raise MessageError('oversized', f'{values}; legal: magnitudes of at most {most}')
     return values
 
 
@@ -350,6 +350,7 @@ def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
         raise MessageError('not finite', 'a position or orientation')
     norm = np.linalg.norm(values[:4])
     if abs(norm - 1.0) > UNIT_TOLERANCE:
-        raise MessageError('not a unit quaternion', str(values[:4]))
+        detail = f'{values[:4]} has the norm {norm:.4g}; legal: 1 ± {UNIT_TOLERANCE:g}'
+        raise MessageError('not a unit quaternion', detail)
     values[:4] /= norm
     return pin.XYZQUATToSE3(np.concatenate([values[4:], values[:4]]))

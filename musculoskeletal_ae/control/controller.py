@@ -723,7 +723,7 @@ class Controller:
         return known and self.estimate is not None and self.mae is not None
 
     def _ready(self, delay: float = 0.0) -> tuple[Setpoint, Mae]:
-        """Return the setpoint from which a trajectory starts in `delay` [s], and the network.
+        """Return the setpoint from which a trajectory starts `delay` [s] from now, and the network.
 
         Raises:
             MessageError: If no trajectory may start.

@@ -146,7 +146,7 @@ class MotionFeedback:
 
         Args:
             error: Desired − estimated θ [rad], (D,).
-            is_held_back: Whether the limiter holds a muscle of the whole arm back.
+            is_held_back: Whether the limiter holds a muscle back (`Follower._is_held_back`).
             dt: Time for which the error lasted [s].
         """
         rest = self._rest

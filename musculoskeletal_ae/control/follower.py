@@ -101,7 +101,7 @@ class Follower(ActivityControl):
     # -- requests -------------------------------------------------------------------------------
 
     def follow(self, trajectory: Trajectory, delay: float = 0.0) -> None:
-        """Follow a trajectory that starts in `delay` [s] and then replaces the present one."""
+        """Follow a trajectory that starts `delay` [s] from now and replaces the present one."""
         if delay > 0.0:
             self.progress.next = trajectory, delay
         else:
@@ -190,10 +190,10 @@ class Follower(ActivityControl):
         return self.plan.step(trajectory, self.progress.time, shift, self.winches.lag, inputs)
 
     def _is_held_back(self, inputs: Inputs) -> bool:
-        """Return whether the limiter did not let a muscle of the whole arm wind in as desired.
+        """Return whether the limiter did not let a muscle wind in as far as desired.
 
-        With isolated muscles, some of the others are often at their limit. The integral may then
-        still grow, because it lets the remaining muscles hold up the arm.
+        With isolated muscles, the result is False. Some of the other muscles are then often at
+        their limit, but the integral has to grow, so that they hold up the arm.
         """
         if self._desired is None or not self._robot.used.all():
             return False

@@ -113,6 +113,6 @@ class Progress:
         return self.next[0] if self.next is not None else self.trajectory
 
     def ahead(self, delay: float) -> Setpoint:
-        """Return the setpoint of the present trajectory in `delay` [s]."""
+        """Return the setpoint of the present trajectory `delay` [s] from now."""
         assert self.trajectory is not None
         return self.trajectory.sample(self.time + delay)

@@ -109,7 +109,7 @@ class LengthRamps:
         return None if self.solution is None else self.solution.missing_torque
 
     def is_over_after(self, dt: float) -> bool:
-        """Return whether the time of the last goal will have passed in dt [s]."""
+        """Return whether the time of the last goal will have passed dt [s] from now."""
         return self._remaining - dt <= 0.0 and not self._goals
 
     def start_from(self, command: Array) -> None:

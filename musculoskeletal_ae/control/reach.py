@@ -9,11 +9,11 @@ a roadmap of random postures, with
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
 where τ_missing,j is the torque of joint j that muscles and stops do not provide. Prismatic joints
-count as if a pinion of radius RACK turned them. Tensions are limited to
-T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no path can keep
-it, the cost favours postures in which little torque is missing. On an edge, tendon friction opposes
-the motion (`Limits`). A joint that is at a stop at the start is also at this stop in some postures
-of the roadmap. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and
+count as if a pinion of radius `kinematics.RACK` turned them. Tensions are limited to T_bias + USED
+(T_limit − T_bias), so that the path keeps a reserve of tension. If no path can keep the reserve,
+the cost favours postures in which little torque is missing. On an edge, tendon friction opposes the
+motion (`Limits`). A joint that is at a stop at the start is also at this stop in some postures of
+the roadmap. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and
 Kavraki 2000); until then its cost is approximated from the postures at its ends.
 
 `slowness` slows the motion along the path until the muscles can accelerate the arm.
@@ -144,7 +144,7 @@ class Limits:
 class PathCost:
     """Computes the cost of straight paths, which rises with the missing torque.
 
-    That is the torque that muscles and joint stops do not provide.
+    The missing torque is the one that neither muscles nor joint stops provide.
     """
 
     def __init__(self, robot: Robot, mae: Mae) -> None:

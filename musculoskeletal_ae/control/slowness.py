@@ -56,9 +56,9 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
 
     The factor s is the smallest of `SLOWER` for which the missing torque, at every moment of the
     motion, is at most `reach.NOTABLE` above that of a very slow motion; if there is none, it is the
-    largest of `SLOWER`. Where no tension is known, s is 1. The whole arm may use all tensions up to
-    T_limit. With isolated muscles, the factors are `SLOWER_ISOLATED`, and tensions are limited as
-    on a path. `reach.Limits` defines loss.
+    largest of `SLOWER`. Where no tension is known, s is 1. An arm without isolated muscles may use
+    all tensions up to T_limit. With isolated muscles, the factors are `SLOWER_ISOLATED`, and
+    tensions are limited as on a path. `reach.Limits` defines loss.
 
     Args:
         robot: The robot; isolated muscles have no tension.

@@ -31,9 +31,9 @@ class TorqueControl(ActivityControl):
             whose torque −Gᵀ T is nearest to τ
 
     The network computes G at (θ, T) (paper, §III-E, third; Kawamura 2016), and θ is the
-    low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius RACK.
-    With both gains zero, the muscles only compensate gravity and exert `effort`; the arm then does
-    not keep its posture.
+    low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius
+    `kinematics.RACK`. With both gains zero, the muscles only compensate gravity and exert `effort`;
+    the arm then does not keep its posture.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

@@ -73,13 +73,13 @@ class DataAge:
         return max(awake - before, 0.0) if before > -math.inf else 0.0
 
     def expect_later(self, cause: StopCause, now: float, within: float) -> None:
-        """Let data that will pause become old later, as if it arrived `within` [s] from now."""
+        """Expect a pause of some data: count its age as if it arrived `within` [s] from now."""
         self._came_at[cause] = self.awake(now) + within
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
         """Return a stop condition for each kind of data that is older than `max_age` [s].
 
-        If the clock of the messages runs slowly, older data are permitted accordingly.
+        If the messages' clock runs slowly, `max_age` is extended accordingly.
         """
         allowed = max_age / min(max(self.pace, SLOWEST), 1.0)
         return [
@@ -179,7 +179,7 @@ class HeatLimit:
         self.momentary = self.planned
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
-        """Update the thermal model from muscle states; `elapsed` [s] have passed since the last."""
+        """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
         # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because the
         # module is commanded to exert T_bias.
         bias = robot.description.tension.bias

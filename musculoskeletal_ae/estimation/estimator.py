@@ -97,8 +97,8 @@ class Estimator:
             start of a length calibration until its first estimate.
         measured: θ from joint sensors [rad], (D,), at the last message with an estimate; None
             unless all joint sensors reported a value within the JOINTS_AGE seconds before it.
-        stepped_at: Time of the last accepted message since there is a network, on the steady
-            clock [s].
+        stepped_at: Time on the steady clock at which the last message was accepted while there was
+            a network [s].
     """
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:

@@ -50,7 +50,8 @@ class Finding:
     """A fault, and the muscle that it is attributed to.
 
     Attributes:
-        muscle: Index of the muscle; one of those affected if the fault is not that of one muscle.
+        muscle: Index of the muscle; of one of the affected muscles if the fault is not that of a
+            single one.
         kind: Kind of the fault.
         evidence: The evidence as a text for users.
     """

@@ -339,8 +339,9 @@ def _noise_factors(mae: Mae) -> Array:
 
     It is the variance of the muscle's length residual, relative to the median variance. For
     independent errors, the ratio of standard deviations would be correct. But the errors of a
-    network in neighbouring postures are correlated, so that a muscle with large errors would then
-    bias the offsets of all other muscles. The ratio of variances gives such a muscle less weight.
+    network in neighbouring postures are correlated. With that ratio, a muscle with large errors
+    would therefore bias the offsets of all other muscles. The ratio of variances gives such a
+    muscle less weight.
     """
     if mae.anomaly is None:
         return np.ones(len(mae.muscles))

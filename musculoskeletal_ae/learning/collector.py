@@ -112,7 +112,7 @@ class SampleCollector:
     def joints(self, time: float, theta: Array) -> None:
         """Record θ [rad] (D,) received at `time` [s], with NaN for unmeasured joints.
 
-        The next message of muscle_states is paired with it.
+        It is paired with the message of muscle_states that is nearest in time.
         """
         self._measure(time, 0, theta)
 

@@ -17,7 +17,7 @@ except for a constant. What happens if the clock of the publisher is wrong:
     it drifts                          the minimum rises by DRIFT
 
 Hence d grows no faster than r does. Whatever times a publisher states, the pauses between its
-messages add up to at most twice the time of reception.
+messages add up to at most twice the time in which the messages were received.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Largest(NamedTuple):
     all: float  # largest root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return the largest ratio of a change [m] (M,) to the limits; above 1, one is exceeded."""
+        """Return the largest ratio of a change [m] (M,) to the limits; above 1, it is too large."""
         size = float(np.sqrt(np.square(change[used]).mean())) if used.any() else 0.0
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
