@@ -9,10 +9,10 @@ It runs `./bringup.sh --view` with `on_anomaly: isolate` and takes screenshots o
 2. A click on the button "Rupture" ruptures the muscle that is selected on the page.
 3. The estimator isolates the muscle, and the arm moves on.
 
-All data in the film come over ROS topics from the nodes of a real run. Needs Chromium and about
-three minutes; a busy machine takes fewer pictures. Writes `view.gif` and three of its pictures:
-`view.png` at the end of learning, `view_rupture.png` when the ruptured muscle is named, and
-`view_isolated.png` when the arm moves on.
+All data in the film come over ROS topics from the nodes of a real run. The bench requires Chromium
+and takes about three minutes; a busy machine takes fewer pictures. It writes `view.gif` and three
+of its pictures: `view.png` at the end of learning, `view_rupture.png` when the ruptured muscle is
+named, and `view_isolated.png` when the arm moves on.
 """
 
 import io

@@ -3,9 +3,9 @@
 
     python -m bench stops [--count 70] [--seed 0]
 
-Passes if every node ends with status 0 and without a traceback. A signal may arrive before Python
-runs the first line of the package, which takes about 0.1 s or more on a busy machine. Such a signal
-ends the process, and Python may print a traceback; these cases are counted separately.
+Passes if every node ends with status 0 and without a traceback. Python reaches the first line of
+the package about 0.1 s after the start, or later on a busy machine. A signal before that ends the
+process, and Python may print a traceback; these cases are counted separately.
 """
 
 import os

@@ -30,7 +30,7 @@ def imported(file: Path) -> set[str]:
 
 
 def runtime_imports(file: Path) -> set[str]:
-    """Return all modules that a file may import when it runs; names within them, too."""
+    """Return all modules, and names within modules, that a file may import when it runs."""
     names = set()
     open_nodes = [ast.parse(file.read_text(encoding='utf-8'))]
     while open_nodes:

@@ -44,7 +44,7 @@ class Loop:
         return str(self.controller.supervisor.condition or '')
 
     def run(self, seconds):
-        """Step all parts at the rates of their nodes."""
+        """Step all parts every 10 ms, and exchange messages as their nodes do."""
         for _ in range(round(seconds / DT)):
             self.now += DT
             self.arm.step(DT)
@@ -115,7 +115,7 @@ PROMISES = {
     f'bias:length:{MUSCLE}:0.3': 'muscle_states',
     f'bias:tension:{MUSCLE}:400': 'overload: tension of',
     f'bias:temperature:{MUSCLE}:90': 'overheated',
-    f'overheat:{MUSCLE}': '',  # the module protects itself: it exerts T_bias only
+    f'overheat:{MUSCLE}': '',  # 90 °C: the controller only limits the tension of this muscle
     f'overheat:{MUSCLE}:120': 'overheated',
     f'freeze:{MUSCLE}': None,
     'freeze': None,

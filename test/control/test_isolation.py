@@ -278,7 +278,7 @@ def test_an_arm_without_a_muscle_that_falls_on_the_way_starts_again_before_the_e
 
 @pytest.fixture(scope='module')
 def sliding(tmp_path_factory):
-    """Return an arm with a prismatic last joint without muscles, and the force of its weight."""
+    """Return an arm whose last joint slides and has no muscles, postures, and the joint's load."""
     robot = Robot.load(write_robot(tmp_path_factory.mktemp('slider'), slider=True))
     robot = robot.without(robot.muscle_indices(['slider_in', 'slider_out']))
     postures = robot.random_postures(100, np.random.default_rng(0))
@@ -396,7 +396,7 @@ def test_exploration_resumes_after_the_suspect_was_verified():
     bench = Bench()
     bench.core.explore(True)
     bench.step(20)
-    # In the other tests, the isolation arrives before the anomaly. Both orders are legal.
+    # In most tests, the isolation arrives before the anomaly. Both orders are legal.
     bench.core.anomaly(True)
     bench.isolate([0])
     bench.step(300)

@@ -335,7 +335,7 @@ def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
 
 
 def test_the_feedback_of_a_blocked_arm_does_not_wind_up_against_the_tension_limit(bench):
-    """Someone holds the arm, so that its muscles reach their limit; then the arm is let go."""
+    """The arm does not move, as if someone held it, so its muscles reach their tension limit."""
     bench.core.trajectory(points(OTHER))
     wound_up = []
     for _ in range(170):

@@ -35,8 +35,8 @@ def test_the_model_read_off_an_exact_network_is_the_geometric_one(robot, mae):
     jacobian = robot.routes.muscle_jacobian
     k = robot.muscle_stiffness(THETA, tension)
     true = joint_stiffness(jacobian(THETA), muscle_hessian(jacobian, THETA), k, tension)
-    # The model approximates the elongation by a cubic polynomial, neglects the stretch of the
-    # tendon and differentiates G numerically. Together these errors reach 1 %.
+    # The model approximates the elongation by a cubic polynomial. The geometric moment arms do not
+    # include the stretch of the tendons. Together these differences reach 1 %.
     np.testing.assert_allclose(model.joint_stiffness(tension), true, atol=0.01 * np.trace(true))
     np.testing.assert_allclose(model.muscle_stiffness(tension)[0], k, rtol=0.05)
 

@@ -257,7 +257,7 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
 
 @pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
 def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(pause):
-    """Messages read before the first step after the pause must not count as newer by its length."""
+    """The pause must not make messages that are read before the next step count as newer."""
     bench = DistortingBench(max_age=0.2, hold_time=0.5)
     bench.step()
     bench.now += pause

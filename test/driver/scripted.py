@@ -66,7 +66,7 @@ class Driver:
     def listen(
         self, seconds: float = 3.0, moved: bool = False, joints: bool = True, zeroed: bool = True
     ) -> Verdict:
-        """Return the verdict of `Listening` after some seconds; `moved` pushes the hand about."""
+        """Return the verdict of `Listening` after some seconds; `moved` pushes the hand."""
         listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)
         for k in range(round(seconds / PERIOD)):
             if moved:

@@ -48,7 +48,7 @@ LENGTHS_WRONG = 0.02 * np.array([1, -1, 1, -1, 1, -1])  # errors of the network'
 
 
 def findings_after_tension(mae, before, after, spread=0.0):
-    """Return what the detector finds in a second of slack, after a moment with tension.
+    """Return what the detector finds in a second without tension, after a second with tension.
 
     Every length of the arm differs from that of the network by 20 mm.
 

@@ -181,7 +181,7 @@ def test_a_failed_part_is_reported_everywhere_and_the_others_continue(
 
 
 def is_killed(name, study, seed):
-    """Kill the process that measures individual 0; the first time, individual 1 is measured too."""
+    """Kill the process that measures individual 0; the first time, 1 is still being measured."""
     if name == 'body_change':
         begun = study.folder / f'{seed}'
         first = not begun.exists()

@@ -151,7 +151,7 @@ def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
         history.interrupt()
     history.use(np.zeros(6))
     # Two samples are corrected when the wrong offsets arrive. If the right ones follow without an
-    # interruption, all four samples are corrected.
+    # interruption, all four samples are corrected, so there are six corrections.
     assert history.corrected == corrected
     if not is_interrupted:
         for sample, expected in zip(store.samples, true, strict=True):

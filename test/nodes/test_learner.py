@@ -55,7 +55,7 @@ class Arm:
             self.graph.node.destroy_publisher(publisher)
 
     def publish(self):
-        """Publish muscle and joint states 10 ms later; after each rest the arm moves on."""
+        """Advance the arm by 10 ms, and publish its states; after each rest, the arm moves on."""
         self.time += DT
         if self.time > self.until:
             self.before, self.begun = (self.theta, self.tension), self.time

@@ -79,7 +79,7 @@ def test_every_number_has_a_range_in_which_its_default_is(node):
 def test_every_parameter_that_is_settable_is_followed(graph, kind):
     node = graph.host(kind, robot='arm26')
     settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
-    # No callback follows stop_recordings: the nodes read it at every stop.
+    # No callback follows stop_recordings: the controller reads it at every stop.
     assert settable - {'stop_recordings'} == node.parameters.followed
 
 

@@ -14,7 +14,7 @@ PROGRAMS = re.findall(r'```python\n(.*?)```', PAGE.read_text('utf-8'), re.S)
 
 
 def run(graph, folder, program, **values):
-    """Run a program with these values of its constants to its end, and return what it prints."""
+    """Set constants of a program, run it to its end, and return what it prints."""
     for name, value in values.items():
         program, count = re.subn(rf'(?m)^{name} = .*$', f'{name} = {value!r}', program)
         assert count == 1

@@ -234,8 +234,8 @@ SPRUNG = '<joint name="elbow" stiffness="2" springref="0.4" damping="0.5" '
 def test_springs_are_learned_from_rest_samples(springy):
     """The true springs have other stiffnesses and rest angles than stated; 60 samples correct them.
 
-    The torque balance has a σ of 0.3 of the muscles' torques, so weak springs beside strong
-    muscles keep their stated values.
+    The fit assumes that a torque balance has a standard deviation of 0.3 times the torques of the
+    muscles, so weak springs beside strong muscles keep their stated values.
     """
     true = springy.kinematics.elasticity.deviating(
         np.array([0.5, 0.6, 1.8]), np.array([0.2, -0.2, 0.15])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How late messages are, by times of sending whose clock nobody has checked."""
+"""Delays of messages, computed from times of sending by a clock that is not synchronised."""
 
 import pytest
 from hypothesis import given

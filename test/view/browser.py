@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A headless Chromium that tests control by the DevTools protocol."""
+"""Control of a headless Chromium by the DevTools protocol, for tests."""
 
 import base64
 import itertools
