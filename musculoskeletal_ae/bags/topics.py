@@ -82,8 +82,9 @@ def select(
 
     Args:
         bag: The recording.
-        wanted: ['default'] for topics that hardware, vision, user and controller sent, ['all'] for
-            every topic of the interface, or relative or recorded names of any topics.
+        wanted: ['default'] for measurements, requests of users, and commands to the muscle
+            modules, ['all'] for every topic of the interface, or names of any topics, relative or
+            as recorded.
         namespace: The namespace of the arm; required only if the bag has several.
         keep_names: Whether to publish on the recorded names.
         motors: How the motors of a ros2_control robot are connected.

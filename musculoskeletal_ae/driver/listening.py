@@ -307,7 +307,7 @@ class Listening:
         verdict.add(lengths_verdict)
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return a note that names the joints whose angle with the other sign explains all l.
+        """Return a note that names the joints whose negated angle would explain all l.
 
         The list is empty if there are no such joints. `theta` is θ [rad], (N, D).
         """

@@ -73,9 +73,10 @@ class Winding(MotionTest):
         Args:
             verdict: Receives the results.
             muscles: Indices of the muscles to test. Without any, all muscles are tested.
-            highest: Highest demanded tension [N] of a muscle for which T_bias is demanded before
-                its test; the check of the clip demands more. None: ABOVE_BIAS above T_bias (more
-                if K is large), but at most tension.max.
+            highest: Highest demanded tension [N]; None: ABOVE_BIAS above T_bias (more if K is
+                large), but at most tension.max. If more than T_bias is demanded before the test of
+                a muscle, the highest demand is larger by the excess. The check of the clip demands
+                more as well.
 
         Raises:
             MusculoskeletalError: If the response to `highest` could not be distinguished from

@@ -19,7 +19,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CONTACT_STREAM = 7000
-POSTURES, COLLISIONS, FLOATS = 15, 20, 4  # numbers of tests at rest, in motion, and with `float`
+#: numbers of postures with two pushes at rest, of collisions in motion, and of tests with `float`
+POSTURES, COLLISIONS, FLOATS = 15, 20, 4
 #: largest number of tries for each collision; a try fails if the arm hardly moves, or if a contact
 #: is detected before the push
 TRIES_PER_COLLISION = 20

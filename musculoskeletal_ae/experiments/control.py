@@ -148,9 +148,9 @@ def measure(study: Study, seed: int) -> Measured:
 def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
     """Return what `proposed` plans, and its result on the same body without friction.
 
-    The ratio of the planned ‖T‖ to the bound shows the error of the learned body. The additional
-    ‖T‖ of the frictionless arm arises because tensions are commanded as lengths. What the arm with
-    friction adds to this is due to friction.
+    The ratio of the planned ‖T‖ to the bound shows the error of the learned body. The frictionless
+    arm needs more than planned because tensions are commanded as lengths. The arm with friction
+    needs still more because of the friction.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:

@@ -170,8 +170,8 @@ def bounds(arm: Arm, motion: Setpoint) -> Array:
     """Return the least ‖T‖ [N] that moves the true, exactly known body along a path.
 
     Returns:
-        Three rows (3, N): by inverse dynamics alone; also with the drag of the winches; and also
-        with the friction of tendons and joints. The third exists only for emulator model `kin`.
+        Rows (2, N) or (3, N): by inverse dynamics alone; also with the drag of the winches; and,
+        for emulator model `kin` only, also with the friction of tendons and joints.
     """
     robot, limits, true = arm.robot, arm.robot.tension, arm.individual
     jacobian, bias = true.muscle_jacobian(motion.theta), limits.bias

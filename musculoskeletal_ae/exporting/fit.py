@@ -101,7 +101,7 @@ class _Muscle:
             _, by_parameters = self._linearised(parameters, states)
             return np.concatenate([by_parameters / NOISE, np.diag(1.0 / self._spread)])
 
-        found = least_squares(
+        solution = least_squares(
             residuals,
             np.zeros(len(self._spread)),
             jacobian,
@@ -109,7 +109,7 @@ class _Muscle:
             ftol=ENOUGH,
             method='lm',
         )
-        return found.x, NOISE * found.fun[: len(states.length)]
+        return solution.x, NOISE * solution.fun[: len(states.length)]
 
     def _linearised(self, parameters: Array, states: _States) -> tuple[Array, Array]:
         """Return the muscle's lengths [m], (N,), and their derivatives (N, K) by K parameters."""

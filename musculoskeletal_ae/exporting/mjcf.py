@@ -53,7 +53,8 @@ the elastic elements, friction proportional to tension, creep, sensor errors and
 class Report(NamedTuple):
     """Differences between an exported model and the network, over the workspace.
 
-    Only the torque is compared with that of the robot description, with the learned springs.
+    The torque is compared with that of the robot description, with the learned springs, instead of
+    the network.
     """
 
     lengths: Array  # standard deviation of each muscle's length error at T_mid [m], (M,)

@@ -124,8 +124,8 @@ def tie_rims(model: Any) -> list[tuple[int, int]]:
 def far_end(model: Any, data: Any, body: int) -> Array | None:
     """Return the point of a body's geometry that is farthest from the body's last joint.
 
-    Without a joint, it is the point that is farthest from the origin of the body.
-    Geoms that tendons wrap around count only if the body has no other geoms.
+    Without a joint, it is the point that is farthest from the origin of the body. Geoms that
+    tendons wrap around count only if the body has no other geoms.
 
     Returns:
         The point in the frame of the body [m], (3,); None if the body has no geometry, or if the

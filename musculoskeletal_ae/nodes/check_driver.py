@@ -190,7 +190,8 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
     The test is a `Winding`, or a `Positioning` for modules that follow positions.
 
     Raises:
-        MusculoskeletalError: If the options name an unknown muscle, or a tension that is too low.
+        MusculoskeletalError: If the options name an unknown muscle, or if the test cannot use
+            their tension.
     """
     muscles = robot.muscle_indices(options.muscles or [])
     winding: Any = import_heavy('musculoskeletal_ae.driver.winding').Winding
