@@ -14,7 +14,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
 TRIES = 1000  # largest number of random postures among which holdable ones are sought
-AT_LIMITS = 0.25  # fraction of each joint's targets that are at one of its limits
+AT_LIMITS = 0.25  # fraction of each joint's random angles that are at one of its limits
 SMALL = 1e-9  # smallest torque by which torques are divided, to avoid a division by zero [N·m]
 PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
 

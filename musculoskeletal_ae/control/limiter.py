@@ -71,8 +71,8 @@ POSTURES = 200  # number of random postures from which the longest muscle length
 LENGTH_MARGIN = 0.03
 LONGEST_INTERVAL = 0.05  # longest time between two messages from which dT/dt is computed [s]
 CONFIDENCE = 2.0  # number of standard deviations by which a measured tension may be too low
-#: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the 30 ms
-#: of a module
+#: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the lag of
+#: a module, which is about 30 ms
 RELIEF = 5.0
 
 

@@ -180,8 +180,8 @@ class HeatLimit:
 
     def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
         """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
-        # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because the
-        # module is commanded to exert T_bias.
+        # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because its
+        # module is commanded to exert no more, except briefly during a verification.
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest[1], bias)
         tension = np.where(np.isnan(tension), sample.model_tension, tension)

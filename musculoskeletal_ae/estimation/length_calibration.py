@@ -24,8 +24,8 @@ STANDING = 1.0  # required duration of standing in a stated posture [s]
 FIRST_FIT = 0.5  # time until the first fit, and between fits of an arm that stands [s]
 FIT_INTERVAL = 2.0  # time between two later fits [s]
 #: A fit consists of short pieces of work, each of which takes 1 to 2 ms. At each message, one piece
-#: is done for every PIECE_TIME [s] since the previous message. A fit therefore takes equally long
-#: at any rate of the messages.
+#: is done for every PIECE_TIME [s] since the previous message, but at least one and at most
+#: MOST_PIECES. A fit therefore takes equally long with messages at 50 to 200 Hz.
 PIECE_TIME = 0.005
 MOST_PIECES = 4  # largest number of pieces of work for one message
 #: median residual of a length above which a fit is rejected [m]; correct offsets leave 0.0003 m
