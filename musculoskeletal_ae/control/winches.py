@@ -61,8 +61,8 @@ class Winches:
         """
         # Messages that have waited arrive together, so a speed needs the times of sending.
         dt, self._delay = max(dt + self._delay - delay, 0.0), delay
-        # `length` is a median of three messages, so it belongs to the time of the previous call.
-        # The time between two lengths therefore counts each `dt` one call later.
+        # `length` is the controller's median of three messages. It therefore belongs to the time of
+        # the previous call, and each `dt` is added to the time between two lengths one call later.
         self._since, self._last = self._since + self._last, dt
         if self._length is not None and self._since < SPAN:
             return

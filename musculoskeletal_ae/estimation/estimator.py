@@ -116,7 +116,8 @@ class Estimator:
         self.output: Output | None = None
         self.measured: Array | None = None
         self.stepped_at = -math.inf
-        self._stated_posture: tuple[float, ...] = ()  # posture of the last length calibration [rad]
+        #: posture stated for the last length calibration [rad]; () without one
+        self._stated_posture: tuple[float, ...] = ()
         self._jumps = 0  # number of length jumps handled so far
         self._valid_offsets = self.body.offsets  # the last known offsets
         self._commands = ModuleCommands()

@@ -136,9 +136,9 @@ class Stops:
         self._radian = robot.kinematics.radian
         self._by_sensor = model.by_sensor
         self._near = self._radian * np.where(model.by_sensor, 2.0 * ROUGH_OFFSET, NEAR_STOP)
-        # Samples from before the change of a muscle give no torque balance, because its earlier
-        # torque cannot be computed from its new parameters. A tension of 0 N, however, means that
-        # the muscle was only isolated.
+        # Samples from before the change of a muscle give no torque balance, because the earlier
+        # torque of the muscle cannot be computed from its new parameters. A tension of 0 N,
+        # however, means that the muscle was only isolated.
         changed = ~observed.known & (observed.tension != 0.0)
         #: joints whose torque balance is informative, (N, D)
         self.is_balanced = ~(changed @ robot.routes.crossed)
