@@ -48,13 +48,13 @@ doc/howto/your_robot.md is the guide for your own robot.
   --joint-source sensor|marker|none
                              joint angles for the learner: from sensors, from a camera that observes
                              the hand, or none (the first network then takes 20 samples, about two
-                             minutes); the status line shows the emulator's own angles
+                             minutes); the status line still compares with the emulator's angles
                              (default: sensor)
   --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml, including
                              the connection of the motors of a ros2_control robot
                              (doc/howto/ros2_control.md)
   -p NODE:NAME:=VALUE        one parameter of one node, such as -p estimator:on_anomaly:=isolate;
-                             it and --params-file may be repeated, and take precedence
+                             like --params-file, it may be repeated, and overrides other options
   --namespace NS             run everything under /NS
   --network                  make an emulated arm visible in the network as far as
                              ROS_AUTOMATIC_DISCOVERY_RANGE permits, as with --hardware (default: on

@@ -55,8 +55,8 @@ BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'contro
                  'learner': 338}  # fmt: skip
 PAGE = """# Performance
 
-Written by `python -m bench performance --out doc` on {day}, on {machine}. The columns "before" show
-the first version that was measured (be0daee), on an idle machine of two cores.
+This page was written by `python -m bench performance --out doc` on {day}, on {machine}. The columns "before" show the first version that was measured
+(commit be0daee), on an idle machine of two cores.
 
 ## Goals
 
@@ -76,18 +76,20 @@ explanation:
 
 The times "before" were measured on another machine, on which an estimate in torch took
 {torch_before:.0f} µs; on this machine it takes {slower:.1f} times as long. Therefore do not compare
-times of different days, but their ratios to torch or to "messages alone".
+times of different days, but their ratios to the times of torch here, and of "messages alone" in the
+next table.
 
 {core}
 
 ## At the wire
 
-The table was measured by `bench wire`. Its words mean:
+The table was measured by `bench wire`. Terms in it:
 
 - *latency*: time from the publishing of `muscle_states` to that of the next command
 - *late*: commands that came after more than two periods
 - *missed*: messages that did not arrive
-- *CPU*: of all nodes, including the training process of the learner
+- *CPU*: processor time of all nodes, including the training process of the learner, as a share of one
+  core
 - *combined*: estimator and controller in one process (`bringup.sh --combined`)
 - *plain node*: a minimal rclpy node with uncompiled PyTorch, without safety checks or control
 - *messages alone*: five nodes that exchange the same messages without any computation
@@ -105,7 +107,7 @@ minimum for a Python node that uses them.
 
 ## Learning
 
-Times were measured on one core. The update uses a full store of samples.
+These times were measured on one core. The updates were made with a full store of samples.
 
 | | before | now |
 |---|---|---|

@@ -119,7 +119,8 @@ def _class(node: ast.ClassDef) -> list[str]:
     lines = [f'**{_signature(made, node.name) if made else f"`{node.name}`"}** {_first(node)}', '']
     fields = [ast.unparse(m.target) for m in node.body if isinstance(m, ast.AnnAssign)]
     for member in methods:
-        plain = any(ast.unparse(mark) == 'property' for mark in member.decorator_list)
+        marks = [ast.unparse(mark) for mark in member.decorator_list]
+        plain = 'property' in marks or 'cached_property' in marks
         fields.append(member.name + '()' * (not plain))
     public = ' '.join(f'`{name}`' for name in fields if not name.startswith('_'))
     return [*lines[:1], public, ''] if public else lines
@@ -130,9 +131,10 @@ def api() -> str:
     lines = [
         '# Python, without ROS',
         '',
-        'What a program may build on; `python doc/make.py` writes this page from the code. Arrays',
-        "are numpy's, units SI; θ, T and l have the order of `muscles.yaml`. Docstrings, which",
-        '`help()` shows, say what each takes and returns.',
+        'This page lists the classes and functions that a program may use; `python doc/make.py`',
+        'writes it from the code. Arrays are arrays of numpy, and units are SI units. θ has the order',
+        'of `joints` in `muscles.yaml`, and T and l have the order of its muscles. `help()` shows the',
+        'docstrings, which describe arguments and results.',
         '',
     ]
     for file, names in MODULES.items():
