@@ -55,8 +55,9 @@ BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'contro
                  'learner': 338}  # fmt: skip
 PAGE = """# Performance
 
-This page was written by `python -m bench performance --out doc` on {day}, on {machine}. The columns "before" show the first version that was measured
-(commit be0daee), on an idle machine of two cores.
+This page was written by `python -m bench performance --out doc` on {day}, on {machine}. The
+columns "before" show the first version that was measured (commit be0daee), on an idle machine of
+two cores.
 
 ## Goals
 
@@ -88,8 +89,8 @@ The table was measured by `bench wire`. Terms in it:
 - *latency*: time from the publishing of `muscle_states` to that of the next command
 - *late*: commands that came after more than two periods
 - *missed*: messages that did not arrive
-- *CPU*: processor time of all nodes, including the training process of the learner, as a share of one
-  core
+- *CPU*: processor time of all nodes, including the training process of the learner, as a share of
+  one core
 - *combined*: estimator and controller in one process (`bringup.sh --combined`)
 - *plain node*: a minimal rclpy node with uncompiled PyTorch, without safety checks or control
 - *messages alone*: five nodes that exchange the same messages without any computation

@@ -132,9 +132,9 @@ def api() -> str:
         '# Python, without ROS',
         '',
         'This page lists the classes and functions that a program may use; `python doc/make.py`',
-        'writes it from the code. Arrays are arrays of numpy, and units are SI units. θ has the order',
-        'of `joints` in `muscles.yaml`, and T and l have the order of its muscles. `help()` shows the',
-        'docstrings, which describe arguments and results.',
+        'writes it from the code. Arrays are arrays of numpy, and units are SI units. θ has the',
+        'order of `joints` in `muscles.yaml`, and T and l have the order of its muscles. `help()`',
+        'shows the docstrings, which describe arguments and results.',
         '',
     ]
     for file, names in MODULES.items():
