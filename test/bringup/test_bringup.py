@@ -25,7 +25,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED
 REPOSITORY = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures('both_cores')
 #: numbers of checkpoints before learning has an effect, and after
-INITIAL, LEARNED = range(2), range(5, 1000)
+INITIAL, LEARNED = range(2), range(3, 1000)
 STATUS = re.compile(
     r'^ *\d+ s  error (?P<error>\d+\.\d+) rad  A (?P<a>\d+\.\d+)  '
     r'samples (?P<samples>\d+)  checkpoints (?P<checkpoints>\d+)'
@@ -215,16 +215,23 @@ def test_of_two_arms_one_learns_and_the_other_detects_a_rupture_and_names_a_dead
     a_rupture_is_shown_and_a_dead_node_named(graph, '/right_arm', right)
     assert left_behind(right) == ''
 
-    graph.wait(lambda: len(learned) > 4, 'four updates of the network', 8 * DEADLINE)
+    graph.wait(lambda: len(learned) > 1, 'an update of the network', 8 * DEADLINE)
     assert ports_in_shared_memory(left) == []
-    graph.wait(lambda: len(errors(left.output, LEARNED)) >= 5, 'five status lines')
+    graph.wait(lambda: has_learned(left.output), 'the error to fall', 8 * DEADLINE)
     # Even SIGKILL of bringup.sh must leave no process behind.
-    _, output = graph.ended(left, signal.SIGKILL)
-    before, after = errors(output, INITIAL), errors(output, LEARNED)
-    # Measured over seeds and runs: an error of 0.05 to 0.13 rad falls to between a tenth and a
-    # third of that within 20 s.
-    assert np.mean(after) < 0.7 * np.mean(before), output
+    graph.ended(left, signal.SIGKILL)
     assert left_behind(left) == ''
+
+
+def has_learned(output):
+    """Return whether the error has fallen by 30 % in the mean of five status lines in a row.
+
+    Measured over seeds and runs: an error of 0.05 to 0.13 rad falls to between a tenth and a third
+    of that within 20 s. While there are few samples, it may rise again for some seconds where the
+    arm has not been before.
+    """
+    before, after = errors(output, INITIAL), errors(output, LEARNED)[-5:]
+    return len(after) == 5 and np.mean(after) < 0.7 * np.mean(before)
 
 
 def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
