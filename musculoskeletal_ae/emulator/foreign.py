@@ -297,8 +297,9 @@ class ForeignArm(Arm):
         span = body.absolute_lengths(theta) - at_zero
         if file and not deviates:
             model_lengths = robot.muscle_lengths(theta, no_tension)
-            routes = _route_warnings(robot, file, span - model_lengths)
-            self.warnings = *routes, *_limit_warnings(robot, file, model)
+            self.warnings = _route_warnings(robot, file, span - model_lengths)
+        if file:  # an individual that deviates has the joint limits of the file, too
+            self.warnings = *self.warnings, *_limit_warnings(robot, file, model)
         self.tendons = tendons.make_tendons(robot, body.elastic, at_zero, span, bend, draw)
         stretch = body.elastic.elongation(robot.tension.max)
         self._module_constants = self._make_modules(span, stretch)

@@ -181,8 +181,8 @@ class JointDisagreement(Detector):
         size = float(np.sqrt(np.square(change[self._used]).mean()))
         evidence = (
             f'length differs from that at the measured posture by '
-            f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * largest.single:.0f} mm), and all '
-            f'lengths by {1e3 * size:.0f} mm (limit {1e3 * largest.all:.0f} mm)'
+            f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * largest.single:.0f} mm); root mean '
+            f'square over all muscles: {1e3 * size:.0f} mm (limit {1e3 * largest.all:.0f} mm)'
         )
         if np.linalg.norm(unexplained) > UNEXPLAINED * np.linalg.norm(change):
             return Finding(muscle, Kind.LENGTHS_DISAGREE, f'its {evidence}')
