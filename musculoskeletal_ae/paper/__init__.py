@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The method exactly as the paper describes it, arranged by the paper's sections.
+"""The method of the paper, arranged by the paper's sections.
 
 K. Kawaharazuka et al., "Musculoskeletal AutoEncoder: A Unified Online Acquisition Method of
 Intersensory Networks for State Estimation, Control, and Simulation of Musculoskeletal Humanoids",
@@ -16,7 +16,7 @@ IEEE Robotics and Automation Letters, 2020. Section and equation numbers are the
     §IV-A           exploration.py        the three steps of random motion
 
 `constants.py` holds the numbers of the paper, and the values that this project chose where the
-paper gives none. Preset `paper` runs the code of this folder. No folder except `presets/` imports
-from it. Parts that both presets share (the network's arithmetic, Adam, the geometric model) are
-imported from other folders.
+paper gives none. doc/explanation/method.md lists the deliberate deviations. Preset `paper` runs
+the code of this folder. No folder except `presets/` imports from it. Parts that both presets share
+(the network's arithmetic, Adam, the geometric model) are imported from other folders.
 """

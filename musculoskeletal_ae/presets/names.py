@@ -5,6 +5,6 @@ These need no preset itself. `registry.py` contains the presets.
 """
 
 DEFAULT = 'default'
-#: name of the preset that follows the paper exactly, with which experiments compare other presets
+#: name of the preset that follows the paper, with which experiments compare other presets
 PAPER_PRESET = 'paper'
 PRESET_NAMES = DEFAULT, PAPER_PRESET

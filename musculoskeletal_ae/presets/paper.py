@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Preset `paper`: the methods exactly as the paper describes them, from the folder `paper/`."""
+"""Preset `paper`: the methods of the paper, from the folder `paper/`."""
 
 from __future__ import annotations
 
