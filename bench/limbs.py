@@ -40,7 +40,8 @@ WRIST = """<r>
   <joint name="wrist_deviation" type="revolute"><parent link="carpus"/><child link="hand"/>
     <origin xyz="0 0 0"/><axis xyz="0 1 0"/>
     <limit lower="-0.45" upper="0.45" effort="8" velocity="6"/></joint></r>"""
-#: tendons of a wrist, by their number: name, and angle on the forearm [degrees] from front to left
+#: tendons of a wrist with four or three tendons: name, and angle around the forearm [degrees], from
+#: the front towards the left
 WRIST_WIRES = {
     4: {'extensor_carpi_radialis': 45, 'extensor_carpi_ulnaris': 135,
         'flexor_carpi_ulnaris': 225, 'flexor_carpi_radialis': 315},

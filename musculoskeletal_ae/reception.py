@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accept messages, live or from a bag, or reject them and count the reasons."""
+"""Accepts or rejects messages, live or from a bag, and counts the reasons for rejection."""
 
 import math
 import time

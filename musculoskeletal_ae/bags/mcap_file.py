@@ -42,7 +42,7 @@ _LONGEST_QOS = 10_000  # largest length of the QoS profiles, as YAML [characters
 
 
 class _Span(NamedTuple):
-    """Times and topics of a chunk, which tell whether it needs decompression."""
+    """Log times and topics of a chunk, by which the reader decides whether to decompress it."""
 
     start: int  # earliest log time [ns]
     end: int  # latest log time [ns]

@@ -90,7 +90,9 @@ class Trajectory:
             MessageError: If no point remains, or two points are too close in time.
         """
         kept = points.time > passed + 1e-9
-        if not kept.any() and passed == 0.0:  # the planner slows it as far as necessary
+        # If all points are at time 0, they are requested after AT_ONCE instead. The planner then
+        # slows the trajectory as far as necessary.
+        if not kept.any() and passed == 0.0:
             points = points._replace(time=points.time + AT_ONCE)
             kept = points.time >= AT_ONCE
         if not kept.any():

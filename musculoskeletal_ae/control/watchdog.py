@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The watchdog: detects stop causes from the age of data, load and temperature.
+"""The watchdog: detects stop causes from load, temperature, and the age of data.
 
-`now` is the time of a steady clock [s], which determines ages. `time` is the time of the messages'
-clock [s], which determines the change of commands. If the messages' clock is slow, as in a slow
-simulator, the allowed age grows by the same factor, at most 1/`SLOWEST`. A fast clock does not
-shorten it.
+`now` is the time of a steady clock [s], by which ages are measured. `time` is the time of the
+messages' clock [s], by whose steps commands advance. If the messages' clock runs at a fraction of
+real time, as in a slow simulator, the allowed age is divided by this fraction, but by no less than
+`SLOWEST`. A fast clock does not shorten the allowed age.
 Pauses of the controller itself do not count as age (`AwakeClock`).
 """
 

@@ -48,7 +48,8 @@ TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
 LENGTH_ERROR = 2.0e-4  # two standard deviations of noise and resolution of l [m]
 SLOPES = 0.7, 1.4  # legal range of the change of T, divided by that of the demand
 CLIP = 20.0, 0.05  # demand beyond tension.max [N], and tolerance relative to tension.max
-#: distance from −l within which a muscle with the wrong sign of l gets tight [m]
+#: If a muscle becomes taut at an l_target within this distance of −l [m], the sign of l or of the
+#: command is wrong.
 MIRROR_TOLERANCE = 0.008
 MOST_BEYOND = 0.3  # highest demand beyond tension.max, relative to tension.max
 

@@ -94,7 +94,7 @@ class CheckpointValidator:
         self._messages.forget()
 
     def check(self, mae: Mae, is_chosen: bool = False) -> None:
-        """Check a network at once.
+        """Check a network in a single call; `trial` does the same in steps.
 
         Args:
             mae: The candidate.

@@ -215,7 +215,7 @@ def ablation(_: Study | None, rows: Rows) -> Plot:
     if repeated:
         largest = float(np.max(np.abs(repeated)))
         panel.axvspan(-largest, largest, color=plots.MARK, alpha=0.15, lw=0.0)
-        spread = f' Grey: the largest change of a repeated run, {largest:.1f} mrad.'
+        spread = f' Grey: the largest change when a run is repeated, {largest:.1f} mrad.'
     return figure, (
         'Change of the error after learning if one group of effects is removed from emulator model '
         f'foreign. The error with all effects is {1e3 * whole:.0f} mrad (individuals '

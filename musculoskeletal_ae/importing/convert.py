@@ -174,7 +174,7 @@ def length_verdict(comparison: Comparison | None) -> str:
     """Return a text on the muscles whose lengths differ most from those of the source's engine."""
     errors = comparison.lengths if comparison else None
     if not errors:
-        return 'lengths: not compared, because the source computes none'
+        return 'lengths: not compared, because no engine of the source format computes lengths'
     worst = sorted(errors.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
     verdict = f'largest length error over {POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'

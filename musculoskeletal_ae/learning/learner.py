@@ -310,7 +310,11 @@ class Learner:
     # -- samples → checkpoints ------------------------------------------------------------------
 
     def poll(self, now: float) -> bytes | None:
-        """Begin and finish updates at `now` [s]; return a checkpoint if one is due."""
+        """Start an update if one is due, take over a finished one; return a checkpoint if one is due.
+
+        Args:
+            now: Time of a steady clock [s].
+        """
         self._polled_at = now
         if self.collector.used_at != self._used_at:
             self._used_at, self._progress_at = self.collector.used_at, now

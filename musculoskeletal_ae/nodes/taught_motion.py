@@ -67,13 +67,13 @@ class _Answers:
 
     @property
     def listeners(self) -> set[str]:
-        """Status names of the nodes that subscribe to the topic."""
+        """Full names of the nodes that subscribe to the topic."""
         infos = self._node.get_subscriptions_info_by_topic(self._topic)
-        return {f'{info.node_namespace.rstrip("/")}/{info.node_name}: state' for info in infos}
+        return {f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in infos}
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name in self.listeners:
+            if status.name.removesuffix(': state') in self.listeners:
                 self.reports.append({value.key: value.value for value in status.values})
 
     def begin(self) -> None:
@@ -115,7 +115,7 @@ def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wa
     if not publisher.get_subscription_count():
         listeners = ', '.join(sorted(answers.listeners))
         raise MusculoskeletalError(
-            f'no connection to {listeners} within {wait:g} s: try again with a longer --wait'
+            f'no connection to {listeners} within {wait:g} s; try again with a longer --wait'
             if listeners
             else f'{topic} has no subscriber: start the controller first'
         )

@@ -81,7 +81,7 @@ def jump_warning(robot: Robot) -> str:
 
 
 def jump_choices(robot: Robot) -> list[str]:
-    """Return lines that name jumping muscles and their postures, and the possible remedies."""
+    """Return lines on each muscle whose length jumps: where it jumps, and possible remedies."""
     if robot.routes.objects is None:
         return []
     bends, theta = _second_differences(robot.routes.absolute_lengths, robot.lower, robot.upper)

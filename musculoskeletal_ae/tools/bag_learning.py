@@ -90,7 +90,12 @@ def train(args: Namespace) -> None:
 
 
 def offset_text(robot: Robot, zero: Array) -> str:
-    """Return the joint-sensor offsets [rad or m] (D,) that are worth showing, by joint."""
+    """Return a text with the joint-sensor offsets that are large enough to show, by joint.
+
+    Args:
+        robot: The geometric model.
+        zero: Offset of each joint sensor [rad or m], (D,).
+    """
     shown = np.flatnonzero(np.abs(zero) >= LEAST_OFFSET * robot.kinematics.radian)
     return ', '.join(f'{robot.joints[j]} {zero[j]:.4f} {robot.units[j].theta}' for j in shown)
 
