@@ -38,7 +38,8 @@ PAGES = (
     *(str(file.relative_to(ROOT)) for file in sorted(ROOT.glob('doc/howto/*.md'))),
 )
 BACKGROUND = 'Ctrl-C ends it'
-KEPT = ('LANG', 'ROS_DOMAIN_ID', 'PIP_CACHE_DIR', 'PIP_INDEX_URL', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
+#: variables that the commands get from the environment, besides those of pip
+KEPT = ('LANG', 'ROS_DOMAIN_ID', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
 START_PATIENCE = 1800  # longest wait for the first status line, installation included [s]
 COMMAND_PATIENCE = 900  # longest duration of all commands of a page after that [s]
 #: longest duration of a `ros2` command [s]; if the system has ended, the command would never end
@@ -152,7 +153,9 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
     print(f'\n== {page}', flush=True)
     paths = os.environ['PATH'].split(os.pathsep)
     paths = [path for path in paths if not path.startswith(sys.prefix)]
-    environment = {name: os.environ[name] for name in KEPT if name in os.environ}
+    environment = {
+        name: value for name, value in os.environ.items() if name in KEPT or name.startswith('PIP_')
+    }
     environment |= {'HOME': str(home), 'PATH': os.pathsep.join(paths)}
     folder = clone.parent if page == 'README.md' else clone
     if not clone.exists() and folder == clone:
@@ -160,7 +163,7 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
     patience = str(START_PATIENCE + COMMAND_PATIENCE)
     with subprocess.Popen(
         ['timeout', patience, 'bash', '-c', script(ROOT / page, str(repository))],
-        cwd=folder, env=environment, text=True,
+        cwd=folder, env=environment, text=True, errors='replace',
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     ) as shell:  # fmt: skip
         for line in shell.stdout or ():

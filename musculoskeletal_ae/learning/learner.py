@@ -310,7 +310,7 @@ class Learner:
     # -- samples → checkpoints ------------------------------------------------------------------
 
     def poll(self, now: float) -> bytes | None:
-        """Start an update if one is due, take over a finished one; return a checkpoint if one is due.
+        """Start an update if due, take over a finished one, and return a checkpoint if due.
 
         Args:
             now: Time of a steady clock [s].
