@@ -13,7 +13,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class Inputs(NamedTuple):
-    """Inputs of an activity at one step; all of them are available in every step."""
+    """Inputs of an activity at one step; none of them is ever missing."""
 
     mae: Mae
     sample: MuscleSample  # the newest muscle states

@@ -36,9 +36,9 @@ class Calibrating(ActivityControl):
 
     Only differences of lengths are used, so that the length offsets cancel. θ_est and G may be
     wrong; muscle stiffness control turns these errors into tension errors, which are limited.
-    Each step leads a short way towards a random goal in the joint range. The arm is held there with
-    random tensions. The calibration needs varied postures and tensions, because it infers the
-    posture from the torques that the tensions exert through G.
+    Each step leads a short way towards a random goal in the joint range. At the end of the step,
+    the arm rests for a moment with random tensions. The calibration needs varied postures and
+    tensions, because it infers the posture from the torques that the tensions exert through G.
     """
 
     def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
@@ -73,7 +73,7 @@ class Calibrating(ActivityControl):
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:
-        """Return the length command [m], (M,), at the end of a step towards a random goal.
+        """Return the length command [m], (M,), with which a step towards a random goal ends.
 
         The step leads towards the first of GOALS random goals for which it ends in a holdable
         posture. If there is no such goal, it leads towards the goal with the least missing torque.

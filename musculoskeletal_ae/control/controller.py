@@ -271,7 +271,7 @@ class Controller:
 
     @contextmanager
     def _relieving(self, now: float, delay: float = 0.0) -> Iterator[None]:
-        """Keep the tensions of a message that is rejected.
+        """Keep the tensions of a message that is rejected within this context.
 
         The limiter and the watchdog then still react to a tension that is too high.
         """
@@ -290,7 +290,7 @@ class Controller:
         self.watchdog.take_sample(sample, now)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
-        """Check the estimated posture θ [rad], (D,), and control the arm by it from now on.
+        """Check the estimated posture θ [rad], (D,), and use it for control from now on.
 
         A repeated estimate, with `is_new` false, does not count as new data for the watchdog.
 
@@ -528,7 +528,7 @@ class Controller:
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:
-        """Return the present command, or None before the first command.
+        """Advance all parts to `now`, and return the command to publish; None before the first.
 
         Args:
             now: Time of the steady clock [s].
@@ -564,8 +564,8 @@ class Controller:
     def _desired(self, dt: float) -> Command | None:
         """Return the activity's command, or None if it has none.
 
-        An exception stops the arm. Only an exploration without enough holdable postures merely
-        ends.
+        If the activity raises an exception, the arm stops. Only an exploration for which too few
+        postures are holdable ends without a stop.
         """
         if self.estimate is None:  # wait for the next estimate, which a length calibration provides
             self.activities.leave()

@@ -21,7 +21,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 class Exploration:
-    """A reproducible stream of steps; a new iterator continues the stream at a new posture."""
+    """An endless sequence of steps, which is the same for the same seed.
+
+    A new iterator does not repeat the sequence: it continues the sequence at a new posture.
+    """
 
     def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
         """Draw the steps of a preset for `robot`."""

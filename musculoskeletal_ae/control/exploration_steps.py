@@ -39,7 +39,7 @@ def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_
 
 
 def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:
-    """Return the random tensions that press joints most strongly against their stops.
+    """Return random tensions that press the joints at their limits strongly against the stops.
 
     They are the best of PRESSES draws. If no joint is at a limit, there is only one draw.
 
@@ -72,7 +72,7 @@ def holdable_postures(
         count: Number of postures to return.
         others: Further functions that return G (N, M, D) for postures (N, D). A posture has to be
             holdable with the nominal G and with the G of each of these functions. T is computed
-            with the G of the last function.
+            with the G of the last function, or with the nominal G if there is none.
 
     Raises:
         RobotDescriptionError: If fewer than `count` of the postures are holdable.

@@ -147,7 +147,7 @@ class MotionFeedback:
         Args:
             error: Desired − estimated θ [rad], (D,).
             is_held_back: Whether the limiter holds a muscle back (`Follower._is_held_back`).
-            dt: Time for which the error lasted [s].
+            dt: Time since the last call [s].
         """
         rest = self._rest
         change = INTEGRAL * dt * error

@@ -16,7 +16,8 @@ dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/d
 drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This
 tension is T_low. λ is measured while the arm moves (`winches`).
 
-Position-controlled modules resist no motion beyond their lag λ; l_comp and K_stiff λ dl/dt are 0.
+Position-controlled modules turn without tension and only lag by λ. For them, l_comp and
+K_stiff λ dl/dt are 0.
 
 A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
 (`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
@@ -115,7 +116,10 @@ class Follower(ActivityControl):
             self.plan_anew()
 
     def plan_anew(self) -> None:
-        """Plan again and blend the last command into the new plan; at rest, settle again."""
+        """Plan again, with a smooth transition from the last command to the new plan.
+
+        An arm at rest settles again.
+        """
         if self._held is not None and self.progress.trajectory is not None:
             self.progress.return_to_end()
             self.feedback.relief = np.zeros(self._robot.muscle_count)
@@ -193,7 +197,7 @@ class Follower(ActivityControl):
         """Return whether the limiter did not let a muscle wind in as far as desired.
 
         With isolated muscles, the result is False. Some of the other muscles are then often at
-        their limit, but the integral has to grow, so that they hold up the arm.
+        their limit, but c has to grow nevertheless, because the arm would otherwise sag.
         """
         if self._desired is None or not self._robot.used.all():
             return False

@@ -36,7 +36,7 @@ def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
 
 
 class FollowedGoal:
-    """Monitors the latest trajectory of a controller as an action's goal."""
+    """Monitors the latest trajectory of a controller, which is the goal of an action."""
 
     def __init__(
         self, core: Controller, joints: Sequence[str], path: Array, goal: Array, patience: float

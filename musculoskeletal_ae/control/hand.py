@@ -88,11 +88,11 @@ class Hand:
         return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
-        """Return the trajectory to the posture in which the hand has a pose.
+        """Return the trajectory to a received pose, which may continue a path of earlier poses.
 
         Args:
             start: Setpoint from which the trajectory starts.
-            theta: The posture θ [rad], (D,).
+            theta: Posture in which the hand has the pose, θ [rad], (D,).
             speed: Largest speed of the hand to a single pose [m/s].
             now: Time at which the pose was received [s].
         """

@@ -17,9 +17,9 @@ winding in, or as soon as the measured tension is above the limit.
 
 If the measured tension exceeds the limit nevertheless, for example because K_stiff or a sensor is
 wrong, the feedback r pays the muscle out further. A muscle whose measured tension is above
-`tension.limit` is paid out faster than the rate limit. No muscle is wound in faster than the rate
-limit. Tensions in messages that are rejected because their lengths jumped are limited in the same
-way.
+`tension.limit` may be paid out faster than the rate limit. No muscle is wound in faster than the
+rate limit. A muscle is also paid out if its tension is above `tension.limit` in a rejected message,
+for example after a jump of lengths.
 
 Position-controlled modules turn a command into tension by stretching the series elastic elements:
 
@@ -113,7 +113,7 @@ class CommandLimiter:
         return self.slack_length if self.offsets_known else np.full_like(self.slack_length, np.inf)
 
     def shift(self, offset: Array) -> None:
-        """Convert the last commands to length offsets that have grown by `offset` [m], (M,)."""
+        """Adapt the last commands after the length offsets have grown by `offset` [m], (M,)."""
         self._exceeded = self._exceeded - offset
         if self._last_length is not None:
             self._last_length = self._last_length[0] - offset, self._last_length[1]
@@ -176,7 +176,8 @@ class CommandLimiter:
         Args:
             desired: The desired command.
             sample: The newest muscle states.
-            tension_limit: Tension limit of each muscle in addition to `tension.limit` [N], (M,).
+            tension_limit: Another limit of each tension [N], (M,); the lower one of this and
+                `tension.limit` applies.
             dt: Time since the last command [s].
             lead: λ max(0, −dl/dt) of each muscle [m], (M,).
             rejected: l [m] and T [N], (2, M), as in `RejectionError.pull`, if the newest message

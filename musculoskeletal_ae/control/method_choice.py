@@ -39,7 +39,7 @@ def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
 
 
 def by_follower(settings: Settings) -> bool:
-    """Return whether the control method moves to targets by the `Follower`.
+    """Return whether the `Follower` moves the arm to targets with the control method.
 
     All other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
     """

@@ -202,8 +202,8 @@ def stiffness_command(
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
     `robot/stiffness.py` defines K_θ; here K_θ includes the springs of the joints. G, ∂²l/∂θ² and
-    L_e(T) = −l(θ, T) + const in K_θ come from ① of the network (paper, §III-E, third: variable
-    stiffness).
+    L_e(T) = −l(θ, T) + const in K_θ come from ① of the network (paper, §III-E, variable
+    stiffness control).
     Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. T_low lies
     above T_bias by the largest of MARGINS with which the torque is possible, because a muscle that
     muscle stiffness control (MSC) holds at T_bias is stiff in one direction only. K is nearly
@@ -270,9 +270,10 @@ def _approach(
 def _extreme(
     model: StiffnessModel, programme: TensionProgramme, tension: Array, joint: int, sign: float
 ) -> float:
-    """Return the extreme stiffness of a joint, by the Frank–Wolfe method with a line search.
+    """Return the largest or smallest stiffness of a joint [N·m/rad] that is possible.
 
-    `sign` is 1 for the largest and −1 for the smallest stiffness.
+    It is found by the Frank–Wolfe method with a line search. `sign` is 1 for the largest and −1 for
+    the smallest stiffness.
     """
 
     def value(tension: Array) -> float:

@@ -147,10 +147,10 @@ class Planner:
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return θ if it is holdable without the isolated muscles, else another posture.
+        """Return θ if the muscles in use can hold it, else another posture.
 
-        The other posture is that of `reach.nearest_held`. Without isolated muscles, θ is not
-        checked.
+        The other posture is that of `reach.nearest_held`. If no muscle is isolated, θ is returned
+        without a check.
 
         Args:
             mae: The network in use.

@@ -29,8 +29,8 @@ class Progress:
         next: The trajectory that will replace the present one, and the time until then [s]; None if
             no other trajectory is due.
         time: Time since the start of the trajectory [s].
-        over: Time since the end of the trajectory [s].
-        lost_time: Time for which the error has exceeded LOST [s].
+        over: Time since the end of the trajectory [s]; 0 before its end.
+        lost_time: Time [s] for which the largest error of a joint has exceeded LOST.
         desired: The present setpoint.
         error: Desired − estimated θ [rad], (D,).
     """

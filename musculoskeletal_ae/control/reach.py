@@ -3,8 +3,8 @@
 
 All functions use the learned G and the least tensions within the limits. An arm with isolated
 muscles falls where the remaining muscles cannot hold it, until a joint's stop supports it. From
-there, a straight path to a holdable posture may not exist. `way` returns the cheapest path through
-a roadmap of random postures, with
+there, the straight path to a target may lead through postures that are not holdable. `way` returns
+the cheapest path through a roadmap of random postures, with
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
@@ -63,8 +63,8 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
     """Return a holdable posture on the straight path from `start` to θ [rad], (D,).
 
-    This is θ, or the end of a holdable part of the path, found by bisection. `start` itself is not
-    checked.
+    This is θ, or the end of a holdable part of the path, found by bisection. If no holdable posture
+    is found, it is `start`, which is not checked.
 
     Returns:
         The posture, and a text on the missing torque at θ, or '' if θ is holdable.
@@ -81,7 +81,7 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
-    """Return the postures of a path after `start` [rad], (K, D); the last posture is θ."""
+    """Return the path from `start` to θ as postures [rad], (K, D), without `start` itself."""
     if robot.used.all():
         return theta[None]
     cost = PathCost(robot, mae)
@@ -117,8 +117,9 @@ class Limits:
 
         Args:
             jacobian: G [m/rad], (M, D).
-            direction: Direction in which the joints move, of any length; 0 at rest, (D,).
-            resistance: Additional lowest tension [N], (M,).
+            direction: Direction in which the joints move, (D,); 0 at rest. The length of this
+                vector has no effect.
+            resistance: Tension by which the lowest tension is raised [N], (M,).
         """
         length = max(float(np.linalg.norm(direction / self._radian)), 1e-9)
         loss = np.exp(-self._friction * np.tanh(jacobian @ direction / (length * CERTAIN)))
@@ -153,7 +154,9 @@ class PathCost:
         self._limits = Limits(robot, mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
-        """Return m, the largest missing torque [N·m] of each posture, (N,); 0 up to NOTABLE.
+        """Return m, the largest missing torque [N·m] of each posture, (N,).
+
+        Missing torques up to NOTABLE count as 0.
 
         Args:
             postures: Postures θ [rad], (N, D).
@@ -177,7 +180,7 @@ class PathCost:
         return np.where(m > NOTABLE, m, 0.0)
 
     def _stops(self, theta: Array) -> Array:
-        """Return the G of the stops at which joints rest, with a row for each stop, (stops, D)."""
+        """Return G of the stops at which joints rest, each modelled as a muscle, (stops, D)."""
         robot, joints = self._robot, np.eye(self._robot.joint_count)
         at_stop = AT_STOP * self._radian
         is_low, is_high = theta < robot.lower + at_stop, theta > robot.upper - at_stop
@@ -232,7 +235,7 @@ class Roadmap:
         return self._postures[path]
 
     def _apparently_cheapest(self) -> list[int]:
-        """Return the numbers of the postures of the cheapest path at the present costs."""
+        """Return the indices of the postures on the path that is cheapest at the present costs."""
         # Import here, because scipy loads slowly, and an arm with all muscles does not need it.
         from scipy.sparse.csgraph import dijkstra
 

@@ -122,7 +122,7 @@ class Settings:
     )
 
     def desired_stiffness(self, radian: Iterable[float]) -> tuple[float, ...]:
-        """Return the desired stiffness of each joint; 0 for unconstrained joints.
+        """Return the desired stiffness of each joint [N·m/rad or N/m]; 0 for unconstrained joints.
 
         Args:
             radian: Displacement of each joint that counts as one radian, as in `Kinematics`

@@ -38,7 +38,7 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
 
     Only the lengths at T_bias count. Changes of the tensions are ignored, because they are sudden,
     at any speed, near postures that are hard to hold; `SHARE` reserves speed for them. A trajectory
-    that starts in motion keeps its initial speed. It may therefore have to be slowed by more.
+    that starts in motion keeps its initial speed. It may therefore need a larger factor.
     """
     # Skip moments of very long trajectories, which would otherwise delay a command by 0.1 s.
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
@@ -64,7 +64,7 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
         robot: The robot; isolated muscles have no tension.
         mae: The network in use.
         trajectory: The motion.
-        lag: λ, time by which the muscle modules lag behind [s].
+        lag: λ, time by which the muscle modules lag behind their commands [s].
     """
     time, theta = trajectory.path
     is_still = (theta == theta[0]).all()

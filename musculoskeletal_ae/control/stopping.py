@@ -80,7 +80,7 @@ class SafeStop:
 
         Args:
             sample: The newest muscle states.
-            dt: Time since the last call [s]; 0 if this time does not count towards the stop.
+            dt: Time since the last call [s]; 0 while the arm waits to resume.
             is_fresh: Whether the sample is still up to date.
             may_wind: Whether the suspect may be wound in.
             releases_at_once: Whether to release the arm without holding the last command.

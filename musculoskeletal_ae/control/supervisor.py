@@ -188,9 +188,10 @@ class Supervisor:
             self._fire(Event.RELEASED)
 
     def on_suspect(self, is_isolated: bool) -> None:
-        """Start the verification of an isolated suspect, or end it if the estimator has stopped.
+        """Start the verification of an isolated suspect, or abandon it.
 
-        If the suspect is restored as healthy, `on_verified` ends the verification instead.
+        It is abandoned (`is_isolated` false) when estimates are missing, because an estimator that
+        has restarted no longer has a suspect. `on_verified` ends a complete verification.
         """
         self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
 

@@ -29,7 +29,10 @@ AHEAD = 0.2  # T_K is computed at this interval, for a setpoint that is the same
 
 
 class Stiffening:
-    """Computes the tensions T_K that method `stiffness` approaches, AHEAD seconds in advance."""
+    """Computes T_K, the tensions with the desired joint stiffness, for the method `stiffness`.
+
+    T_K approaches the solution for a setpoint that is AHEAD seconds ahead.
+    """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self.use(robot, settings)
@@ -51,7 +54,7 @@ class Stiffening:
         """Return T_K [N], (M,).
 
         The change of T_K per step is limited: the lengths of trajectories may use the fraction
-        SHARE of the rate limit, so only the remaining fraction is left for T_K.
+        SHARE of the rate limit, and T_K may use half of the remaining fraction.
         """
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt

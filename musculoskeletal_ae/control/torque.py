@@ -30,10 +30,10 @@ class TorqueControl(ActivityControl):
         T = least tension with −Gᵀ T = τ within [T_bias, T_limit]; if there is none, the tension
             whose torque −Gᵀ T is nearest to τ
 
-    The network computes G at (θ, T) (paper, §III-E, third; Kawamura 2016), and θ is the
-    low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of radius
-    `kinematics.RACK`. With both gains zero, the muscles only compensate gravity and exert `effort`;
-    the arm then does not keep its posture.
+    The network computes G at (θ, T) (paper, §III-E, muscle tension-based control; Kawamura 2016),
+    and θ is the low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of
+    radius `kinematics.RACK`. With both gains zero, the muscles only compensate gravity and exert
+    `effort`; the arm then does not keep its posture.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

@@ -145,7 +145,7 @@ class Trajectory:
 
     @classmethod
     def stopping(cls, start: Setpoint, robot: Robot) -> Trajectory:
-        """Return a trajectory that comes to rest within `STOPPING`."""
+        """Return a trajectory that comes to rest within STOPPING seconds."""
         return cls.to(start, _halt(start, robot), STOPPING)
 
     def after_rest(self, robot: Robot) -> Trajectory:
@@ -223,5 +223,5 @@ class Trajectory:
 
 
 def _halt(start: Setpoint, robot: Robot) -> Array:
-    """Return the posture [rad], (D,), at which a motion comes to rest after `STOPPING`."""
+    """Return the posture [rad], (D,), at which a motion comes to rest STOPPING seconds later."""
     return np.clip(start.theta + 0.5 * STOPPING * start.velocity, robot.lower, robot.upper)

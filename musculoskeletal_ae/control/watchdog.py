@@ -40,7 +40,7 @@ MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMAT
 
 
 class Step(NamedTuple):
-    """Duration of one step of control; on both clocks, it counts as at most LONGEST_STEP."""
+    """Duration of one step of control by both clocks, at most LONGEST_STEP each."""
 
     #: duration on the messages' clock [s]; of a stopped arm, it is that on the steady clock if the
     #: pace of the messages' clock is below SLOWEST
@@ -60,20 +60,23 @@ class DataAge:
         self.pace = 1.0  # pace of the messages' clock relative to the steady clock
 
     def awake(self, now: float) -> float:
-        """Return the time without the controller's own pauses [s]."""
+        """Return the time `now` of the steady clock minus the controller's own pauses [s]."""
         return self._awake.at(now)
 
     def received(self, cause: StopCause, now: float) -> float:
         """Record that data was received; return the time since the previous data [s].
 
-        `cause` is the stop cause for the age of this data.
+        `cause` is the stop cause that occurs when this data is too old.
         """
         awake, before = self.awake(now), self._came_at[cause]
         self._came_at[cause] = awake
         return max(awake - before, 0.0) if before > -math.inf else 0.0
 
     def expect_later(self, cause: StopCause, now: float, within: float) -> None:
-        """Expect a pause of some data: count its age as if it arrived `within` [s] from now."""
+        """Allow a pause of some data: its age counts only from `within` [s] after `now`.
+
+        `cause` is the stop cause that occurs when this data is too old.
+        """
         self._came_at[cause] = self.awake(now) + within
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
@@ -148,12 +151,12 @@ class Overload:
 
     @property
     def tense(self) -> list[str]:
-        """Names of the muscles with too much tension, and their levels."""
+        """Texts, each with the name of a muscle with too much tension and the level exceeded."""
         each = zip(self._robot.muscles, self._level, self._since, strict=True)
         return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the overload if it has lasted longer than OVERLOAD_TIME."""
+        """Return the stop condition of an overload that has lasted longer than OVERLOAD_TIME."""
         m = int(self._since.argmin())
         age = min(now - self._received_at, LONGEST_STEP)
         if self._sent_at + age - self._since[m] <= OVERLOAD_TIME:
@@ -199,10 +202,10 @@ class HeatLimit:
         self.momentary = np.maximum(momentary, self.momentary - fall)
 
     def conditions(self, robot: Robot, highest: float) -> list[Condition]:
-        """Return overheating, if present.
+        """Return the stop condition of overheating, if windings are overheated.
 
-        It ends when no winding is above `highest` [°C], and at least one muscle may be planned with
-        more than T_bias.
+        Overheating ends when no winding is above `highest` [°C], and at least one muscle may be
+        planned with more than T_bias.
         """
         winding = np.fmax(self.heat.core, -np.inf)  # a temperature that is unknown is NaN
         m = int(winding.argmax())

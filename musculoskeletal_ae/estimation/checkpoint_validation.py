@@ -5,7 +5,7 @@ Four checks compare a candidate with the geometric model, the arm and the networ
 
     validation/postures.py        errors on fixed states of the geometric model
     validation/message_errors.py  errors on the healthy messages of the last seconds
-    validation/agreement.py       difference of θ and of lengths from joint sensors, or else from
+    validation/agreement.py       differences of θ and l; the reference is joint sensors, or else
                                   the network in use
     validation/detector.py        a calibrated detector is silent on these messages, and would
                                   detect a rupture
@@ -85,7 +85,7 @@ class CheckpointValidator:
         self._messages.note(tension, length, now, theta, is_healthy=not self._is_anomaly)
 
     def start(self) -> None:
-        """Discard all networks and messages, and start again."""
+        """Discard all networks and messages, so that the next network counts as the first one."""
         self._used.clear()
         self.forget()
 
@@ -175,9 +175,10 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def detector_measures(self, mae: Mae) -> Iterator[float]:
-        """Yield the measures of a network's detector, see `validation/detector.py`.
+        """Yield the measures of a network's detector (`validation/detector.py` defines them).
 
-        The first one is that on the recent messages; then each muscle is ruptured in turn.
+        The first measure is of the recent messages. Each following measure is of the same messages
+        with the tension of one muscle set to 0, as if it were ruptured.
         """
         return detector.measures(mae, self._messages, self.isolated)
 

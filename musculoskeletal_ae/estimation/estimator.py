@@ -80,7 +80,7 @@ class Output(NamedTuple):
 class Estimator:
     """Estimates the joint angles from each message, and monitors the health of the body.
 
-    `time` is the clock of the messages [s], `now` a steady clock [s].
+    `time` is a time of the messages' clock [s], `now` a time of a steady clock [s].
 
     Attributes:
         robot: The nominal body, with all muscles.
@@ -193,8 +193,8 @@ class Estimator:
             posture: θ in which the arm stands [rad], (D,); () if it moves gently.
 
         Raises:
-            MusculoskeletalError: If there is no network, if the posture is not valid, or if it is
-                missing on a robot whose tensions are unknown.
+            MusculoskeletalError: If there is no network, if the posture is not valid, or if no
+                posture is stated for a robot whose tensions are unknown.
         """
         if self.mae is None:
             raise MusculoskeletalError(
@@ -334,7 +334,7 @@ class Estimator:
         Args:
             sample: The sample.
             elapsed: Time between the receptions of this sample and the one before [s].
-            sent_apart: Time between their sendings [s].
+            sent_apart: Time between the sendings of these two samples [s].
             now: Time on the steady clock [s].
         """
         dt, guess = min(elapsed, LONGEST_PERIOD), self.body.offsets

@@ -47,11 +47,11 @@ _REMEDIES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault, and the muscle that it is attributed to.
+    """A fault that a detector has found, and the muscle to which it is attributed.
 
     Attributes:
-        muscle: Index of the muscle; of one of the affected muscles if the fault is not that of a
-            single one.
+        muscle: Index of the muscle. If the fault is of several muscles or of a joint sensor, it is
+            the index of one muscle whose readings the fault affects.
         kind: Kind of the fault.
         evidence: The evidence as a text for users.
     """

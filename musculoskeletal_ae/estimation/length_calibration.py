@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Length calibration: determine the offset of every length sensor after power-on.
+"""Length calibration: determines the offset of every length sensor after power-on.
 
 The arm moves gently, with or without measured joint angles, or it stands in a stated posture.
 `length_moments.py` collects the readings, and `length_fit.py` fits the offsets to them. This file

@@ -13,13 +13,13 @@ N is the variance of the elongation and of the sensor noise. θ̄ and P are mean
 the training data. If few tendons are taut, θ is uncertain and so is d.
 
 Errors of a network vary smoothly with the posture, and errors of an elastic constant persist. If d₀
-was known at another moment, where the tendon was taut, a part of the error of d is therefore known:
+was known at another moment, when the tendon was taut, a part of the error of d is therefore known:
 
     d | d₀ has the mean c d₀ / s₀² and the variance s² − c² / s₀²
     c = ρ aᵀ Σ a₀ + Σ_j a_j a₀_j ε_j ε₀_j,   ρ = exp(−‖(θ − θ₀) / range‖² / (2 SMOOTHNESS²))
 
 s² is the variance of d, a the row of A that belongs to the muscle, and ε_j the standard deviation
-of the elongation of muscle j.
+of the elongation of muscle j. `range` is the range of each joint.
 
 Σ. Without learning, it is the variance of the geometric model (`robot/model_errors.py`). After
 learning, it is the second moment of the residuals on the healthy arm, plus the variance by which
@@ -60,12 +60,12 @@ class Prediction(NamedTuple):
     elastic: Array  # ε, standard deviation of the elongations [m], (M,)
 
     def limit(self, muscle: int, sigmas: float) -> float:
-        """Return the d [m] of one muscle that is `sigmas` standard deviations above 0."""
+        """Return `sigmas` standard deviations of the d of one muscle [m]."""
         return sigmas * math.sqrt(self.variance[muscle])
 
 
 class LengthErrors:
-    """Predicts lengths with a network, and how far the prediction may be wrong.
+    """Predicts lengths with a network, and states how uncertain each prediction is.
 
     Attributes:
         covariance: Σ [m²], (M, M).
@@ -106,7 +106,7 @@ class LengthErrors:
             length: l [m], (M,).
             tension: T_end at which the lengths are predicted [N], (M,).
             spread: Standard deviation of T_end [N], (M,) or scalar.
-            used: The muscles whose lengths are used, (M,).
+            used: The muscles to whose lengths the posture is fitted, (M,).
             start: Posture with which the fit starts [rad], (D,).
         """
         robot, tension = self._robot, np.maximum(tension, 0.0)
@@ -155,8 +155,8 @@ class LengthErrors:
     def given(self, now: Prediction, taut: Prediction, muscle: int) -> Prediction:
         """Correct the prediction for one muscle by the error that it had while it was taut.
 
-        The correction is smaller the further the arm has moved from the posture at that time. The
-        variance decreases accordingly.
+        The correction also reduces the variance of the prediction. Both effects become smaller the
+        farther the arm has moved from the posture at that time.
 
         Args:
             now: The prediction to correct.

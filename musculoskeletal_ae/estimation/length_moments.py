@@ -26,7 +26,7 @@ class Moments(NamedTuple):
     """Means of K short windows.
 
     Attributes:
-        tension: T [N], (K, M).
+        tension: T [N], 0 for isolated muscles, (K, M).
         length: Raw l [m], 0 for isolated muscles, (K, M).
         sliding: Direction s in which each tendon slid last, (K, M): 1 when wound in, −1 when paid
             out.

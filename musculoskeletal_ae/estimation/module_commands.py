@@ -28,7 +28,7 @@ class ModuleCommands:
     def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
         """Return the tension [N] (M,) that the newest command demands of the modules, or None.
 
-        Length commands demand a tension that depends on `length`, which is l [m] (M,). The result
+        A length command demands a tension that depends on l; `length` is l [m] (M,). The result
         is None if the command is out of date, or if the modules follow positions.
         """
         if now - self._time > COMMAND_AGE:

@@ -7,7 +7,7 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
  2. Finding. A detector of `health.py` names the muscle: after about half a second if the modules
     keep T_bias, otherwise as soon as the tendon should carry load. The finding is latched: the
     estimator publishes `anomaly_detected`, and the controller stops the arm.
- 3. Isolation. The suspect is isolated at once: estimation and control continue without it.
+ 3. Isolation. The suspect is isolated immediately: estimation and control continue without it.
  4. Verification. The controller winds the suspect in by a few millimetres. `verification.py`
     classifies its response: ruptured, jammed, sensor fault, or healthy.
  5. Resuming. A faulty muscle stays isolated, a healthy one is restored. Either way the anomaly is

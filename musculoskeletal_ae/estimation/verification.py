@@ -138,8 +138,9 @@ class ModuleLaw:
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return l' − l [m]; only the verdict on position-controlled modules uses the stretch x.
+        """Return the length difference l' − l [m].
 
+        Only the verdict on position-controlled modules uses the result, and for these,
         `PositionLaw` overrides this method.
         """
         return row.likely - row.length
@@ -205,7 +206,7 @@ class Verification:
             tension: T [N].
             length: l [m].
             command: l_target [m]; None if no length is commanded.
-            likely: l' [m].
+            likely: l', the length of the suspect estimated from the other muscles [m].
             dt: Time since the previous message [s].
 
         Returns:

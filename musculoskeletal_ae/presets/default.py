@@ -91,7 +91,8 @@ class DefaultPreset:
     def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
         """Return a function that draws the paper's three steps.
 
-        Some joints of the targets are at their limits, and the third step presses them there.
+        In the targets, some joints are at their limits. The tensions of the third step press these
+        joints against their stops.
         """
         from musculoskeletal_ae.control.exploration_steps import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps

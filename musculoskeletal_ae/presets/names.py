@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The names of all presets, for options, parameters and checks of files.
 
-These need no preset itself. `registry.py` contains the presets.
+The names are separate, so that they can be imported without the presets, which `registry.py`
+contains.
 """
 
 DEFAULT = 'default'

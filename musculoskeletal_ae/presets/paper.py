@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 class PaperPreset:
     """The methods of the paper; see `Preset` for the meaning of each part.
 
-    `hidden` is the number of units of each hidden layer of the encoder. The default is the paper's
-    choice; `experiments/layers.py` varies it.
+    `hidden` contains the number of units of each hidden layer of the encoder. The default is the
+    paper's choice; `experiments/layers.py` varies it.
     """
 
     name = PAPER_PRESET
@@ -69,7 +69,7 @@ class PaperPreset:
     def residual_detectors(
         self, robot: Robot, settings: Detection
     ) -> tuple[ResidualDistance, list[Detector]]:
-        """Return a detector that decides by A alone (§III-D)."""
+        """Return a detector that decides by A alone (§III-D), and no physics-based detectors."""
         from musculoskeletal_ae.paper.state_estimation import AnomalyNorm
 
         return AnomalyNorm(robot, settings), []

@@ -2,8 +2,8 @@
 """The body state: isolated muscles and length offsets as one immutable value.
 
 The estimator owns the body state and publishes it on the latched topics `isolated_muscles` and
-`muscle_length_zeros`. All other nodes receive it. Every change creates a new object with the next
-version number.
+`muscle_length_zeros`. The nodes that use muscle states receive it. Every change creates a new
+object with the next version number.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class LengthOffsets:
 
 @dataclass(frozen=True)
 class BodyState:
-    """State of the body that all nodes share.
+    """Isolated muscles and length offsets, as all nodes use them.
 
     Attributes:
         offsets: Length offsets of all muscles.

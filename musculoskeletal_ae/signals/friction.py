@@ -31,7 +31,7 @@ DRIVE_FRICTION_MEAN = 0.08
 
 
 def slid(direction: Array, way: Array, moved: Array) -> Array:
-    """Return s after tendons have slid.
+    """Return the sliding directions s, (..., M), after tendons have slid.
 
     Args:
         direction: s before the sliding, (..., M).
@@ -72,7 +72,7 @@ class Transmission:
     def unknown(cls, limit: Array) -> Transmission:
         """Return the transmission of motor currents before anything is learned.
 
-        F is assumed to be 0, and the prior mean of F is added to the uncertainty of F.
+        F is assumed to be 0. The prior mean of F therefore contributes to the uncertainty of F.
 
         Args:
             limit: T_limit [N], (M,).

@@ -14,9 +14,9 @@ the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a. P
 change slowly. The ratio r = R₁/R₂ cannot be estimated (doc/explanation/control_and_safety.md).
 
 The highest permitted tension of a muscle is the tension that brings the winding to the temperature
-limit when this tension is held for a certain time. If an estimated constant departs from its first
-known value, the module has changed: its motor drags, its housing is covered, or its tension sensor
-is faulty.
+limit when this tension is held for a certain time. If κ or τ₂ departs from its first known value by
+the factor CHANGED, the module has changed: its motor drags, its housing is covered, or its tension
+sensor is faulty.
 """
 
 import numpy as np
@@ -50,7 +50,7 @@ CHANGED = 1.5  # factor by which a known constant must change to be reported
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:
-    """Return the state of the filter after a time in which the tension is constant.
+    """Return the state of the thermal model after a time in which the tension is constant.
 
     Args:
         state: c₁ − c₂ [K], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C] at the beginning, (6, ...).
@@ -108,7 +108,7 @@ class Heat:
             del self.changed[m]
 
     def limits(self, highest: float) -> tuple[Array, Array]:
-        """Return the highest tensions that keep every winding below a temperature.
+        """Return the highest tensions at which no winding exceeds a temperature.
 
         The tensions lie between T_bias and tension.max. A muscle with unknown temperature is
         limited by tension.max only.

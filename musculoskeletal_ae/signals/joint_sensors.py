@@ -12,8 +12,8 @@ of c, the fit does not depend on length offsets. For a correct sensor a_j is abo
 (jackknife).
 
 A sign cannot be judged from lengths if the joint hardly moves, or if the lengths of its muscles are
-the same at θ and −θ. In the second case, the limits of the joint are on one side of 0, so that a
-reading with the wrong sign is beyond these limits.
+the same at θ and −θ. In the second case, a wrong sign is found only if the limits of the joint are
+on one side of 0, because readings with the wrong sign are then beyond the limits.
 """
 
 from collections.abc import Iterator
@@ -305,7 +305,9 @@ def _rows_outside(theta: Array, begin: int, end: int) -> Ints:
 
 
 def _hidden_motion(error: Array, jacobian: Array) -> Array:
-    """Return the motion of joints that explains errors of lengths; 0 if it explains too little.
+    """Return the motion of S joints [rad], (N, S), that best explains errors of lengths.
+
+    The result is 0 if no motion explains enough of the errors.
 
     Args:
         error: l − l̂ without a constant for each muscle, such as its mean [m], (N, M).

@@ -139,8 +139,9 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
 class Persistence:
     """Distinguishes a lasting fault from a glitch. Times are of a steady clock [s].
 
-    A fault lasts from its first message to its newest one, and for up to half of a glitch
-    afterwards. A pause of this process therefore does not turn a glitch into a lasting fault.
+    A fault counts from its first message to its newest one, and at most for half the time
+    `LIMITS.glitch` after that. A pause of this process therefore does not turn a glitch into a
+    lasting fault.
     """
 
     def __init__(self) -> None:
@@ -152,6 +153,6 @@ class Persistence:
         self._problem, self._newest = problem, now
 
     def lasting(self, now: float) -> str:
-        """Return the newest fault if faults have lasted for longer than a glitch, else ''."""
+        """Return the newest fault if faults have lasted longer than `LIMITS.glitch`, else ''."""
         until = min(now, self._newest + 0.5 * LIMITS.glitch)
         return self._problem if until - self._since > LIMITS.glitch else ''

@@ -185,7 +185,7 @@ def _refused(name: str, problem: str) -> MusculoskeletalError:
 
 
 def _each(name: str, values: Sequence[float], count: int) -> Array:
-    """Return `values` as one value for each muscle, (M,)."""
+    """Return one value for each muscle, (M,); a single value in `values` is for all muscles."""
     if len(values) not in (1, count):
         raise _refused(name, f'got {len(values)} values; expected 1, or {count} for all muscles')
     each: Array = np.full(count, values[0]) if len(values) == 1 else np.array(values)

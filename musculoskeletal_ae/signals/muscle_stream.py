@@ -10,8 +10,8 @@ implausibly fast does not reject a message: the sample has the last accepted tem
 bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits. Values of isolated
 muscles are not checked. A rejected message may contain valid tensions, for example if only a length
 jumped. `RejectionError.pull` contains these tensions for the limiter. After a jump, messages are
-rejected until the new level has lasted (`length_jumps`). While the length offsets are unknown,
-jumps and levels of lengths reject no message.
+rejected until the new level has lasted (`length_jumps`). While the length offsets are unknown, no
+message is rejected because of a jump or the level of a length.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Pairs messages of muscles with θ; returns a message when the next message has arrived."""
+    """Pairs each muscle message with θ, and returns the pair when the next message arrives."""
 
     def __init__(self, period: float) -> None:
         """Start; `period` is the period of the muscle messages [s]."""

@@ -12,7 +12,7 @@ A joint sensor with an offset δθ changes g as well, but like a change of postu
 muscles outnumber joints, arbitrary errors of lengths rarely have this form. If some δθ explains
 most of Δ, the joint sensor with the largest δθ is reported; otherwise, the lengths are reported.
 
-A healthy tendon that is shorter than at the measured posture is stretched. If it has no tension, it
+A healthy tendon whose length is below ①(θ, T_end) is stretched. If such a tendon has no tension, it
 is ruptured, and its muscle is reported, provided that the lengths of all others agree with θ. This
 is how a rupture is detected while no commands arrive.
 """
@@ -41,7 +41,7 @@ class Largest(NamedTuple):
     all: float  # largest root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return the largest ratio of a change [m] (M,) to the limits; above 1, it is too large."""
+        """Return the ratio of a change [m] (M,) to its limits; a change above 1 is too large."""
         size = float(np.sqrt(np.square(change[used]).mean())) if used.any() else 0.0
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
@@ -202,7 +202,7 @@ class JointDisagreement(Detector):
             muscle: Index of the muscle with the largest Δ.
             sample: The readings.
             change: Δ [m], (M,).
-            largest: Its limits.
+            largest: The limits of Δ.
         """
         slack_tension = LIMITS.slack_share * self._robot.tension.bias[muscle]
         is_slack = sample.motor_tension[muscle] < slack_tension

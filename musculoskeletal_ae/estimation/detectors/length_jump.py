@@ -9,10 +9,10 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Obser
 
 
 class LengthJump(Detector):
-    """Reports the muscles that the muscle stream has named."""
+    """Reports muscles whose lengths have jumped and have stayed at the new values."""
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the muscles whose lengths have jumped according to the sample."""
+        """Report the muscles that the sample names as having jumped (`MuscleSample.jumped`)."""
         jumped = observation.sample.jumped
         if not jumped or not observation.lengths_known:
             return None

@@ -131,9 +131,10 @@ class SlackTendon(Detector):
 
 
 class StretchedTendon(SlackTendon):
-    """Measures how long each tendon has been stretched without tension.
+    """Measures how long each tendon has had no tension although it is stretched.
 
-    This class is for position-controlled modules. They do not wind in slack by themselves, so
+    A tendon is stretched if its length is so short that a healthy tendon would have tension. This
+    class is for position-controlled modules. They do not wind in slack by themselves, so
     `is_winding_in` stays False.
     """
 
@@ -208,9 +209,9 @@ class StretchedTendon(SlackTendon):
         return is_stretched
 
     def _taut_prediction(self, muscle: int, used: Bools, start: Array) -> Prediction:
-        """Return the prediction from the readings with which a slack tendon was last taut.
+        """Return the prediction from the readings at which a slack tendon was last taut.
 
-        It uses the lengths of the same muscles as the prediction with which it is compared.
+        The prediction uses the lengths of the muscles in `used`, as does the present prediction.
         """
         sample = self._taut[muscle]
         if muscle in self._taut_predictions:

@@ -161,7 +161,10 @@ class AgreementCheck:
         return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
 
     def _shape(self, mae: Mae) -> Comparison:
-        """Compare how l through ① varies over the fixed states by `mae` and the network in use."""
+        """Compare the change of l over the fixed states between `mae` and the network in use.
+
+        Both networks compute l through ①.
+        """
         theta, tension = self._postures.theta, self._postures.tension
         used = np.delete(np.arange(self._robot.muscle_count), self._isolated)
         new, old = (each.lengths(theta, tension)[:, used] for each in (mae, self._in_use))

@@ -23,7 +23,9 @@ WIDENED = 3.5  # smallest ratio of an inherited threshold to the highest d of th
 
 
 def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Iterator[float]:
-    """Yield the measure on the messages, and then with each muscle ruptured in turn.
+    """Yield the measure of the messages, and then of the messages with each muscle ruptured.
+
+    A rupture is imitated by setting the tension of the muscle to 0.
 
     Nothing is yielded for a network without a calibrated detector, or with too few messages.
     """
