@@ -77,7 +77,7 @@ class CheckpointValidator:
         """Record a measurement on which candidates are tested.
 
         Args:
-            tension: T [N], (M,).
+            tension: T_read [N], (M,).
             length: l [m], (M,).
             now: Time of the measurement [s].
             theta: Measured θ [rad], (D,), or None.

@@ -62,7 +62,8 @@ def second(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) 
 def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
     """Return the command (12) for T_current.
 
-    The method does not enforce tension limits and always reports a torque error of zero.
+    The method does not enforce tension limits. It reports a missing torque of 0, whatever torque is
+    missing.
     """
     terms = control_loss(robot, mae, theta, torque, tension)
     z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
