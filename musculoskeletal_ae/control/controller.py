@@ -78,7 +78,7 @@ class Target:
         clamped: Joints whose target was changed, because it was beyond the joint limits or because
             the posture was not holdable.
         unreachable_reason: Why the arm goes to another posture than requested, or ''.
-        approaches_left: Number of further attempts if the arm falls on the way.
+        approaches_left: Number of further attempts to reach the target if the arm falls.
     """
 
     effort: Array

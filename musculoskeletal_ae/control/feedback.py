@@ -85,12 +85,12 @@ class RestFeedback:
         self._robot = robot
 
     def reset(self) -> None:
-        """Set the corrections to zero, for a new target."""
+        """Set the corrections c and r to zero."""
         self.correction: Array = np.zeros(self._robot.joint_count)
         self.relief: Array = np.zeros(self._robot.muscle_count)
 
     def moving(self) -> None:
-        """Freeze the corrections until the arm has settled again."""
+        """Interrupt the integration at rest until the arm has settled again."""
         self._rested = self._unsolved = 0.0
 
     def step(

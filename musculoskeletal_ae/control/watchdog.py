@@ -172,7 +172,7 @@ class HeatLimit:
     Attributes:
         heat: The thermal model of all muscle modules.
         planned: Highest tension that may be planned for each muscle [N], (M,).
-        momentary: Highest tension that may be commanded to each muscle [N], (M,).
+        momentary: Highest tension that each muscle may be commanded to exert [N], (M,).
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -75,7 +75,7 @@ class JammedModule(Detector):
 
 
 class JammedPosition(JammedModule):
-    """Measures how long each position-controlled winch has been stationary in the wrong place."""
+    """Measures how long each position-controlled winch has been stationary off its l_target."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
         """Return a mask (M,) of modules that are far from l_target and could pull harder, or None.
