@@ -52,7 +52,12 @@ class _Document(Struct):
 
 
 def offered_qos(latched: bool, reliable: bool = True) -> Qos:
-    """Return the QoS profile of a publisher whose topic is latched or not, and reliable or not."""
+    """Return the QoS profile of a publisher.
+
+    Args:
+        latched: Whether late joiners receive the last message.
+        reliable: Whether lost messages are sent again.
+    """
     return Qos(
         history=QosHistory.KEEP_LAST,
         depth=1 if latched else 10,

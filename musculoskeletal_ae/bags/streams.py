@@ -319,8 +319,8 @@ def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:
     """Return the index of the newest message of a latched topic at each time of `when`.
 
-    Before the first message, the index is 0, because that message was published before it was
-    recorded.
+    For times before the first message, the index is 0, because the first message of a latched topic
+    may have been published before recording began.
     """
     return np.maximum(np.searchsorted(times, when, side='right') - 1, 0)
 

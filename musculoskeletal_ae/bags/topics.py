@@ -157,8 +157,8 @@ def interface_name(name: str) -> str:
 def _motor_topics(bag: Bag, motors: MotorSettings) -> dict[str, str]:
     """Return the topics of motors in a bag: by recorded name, the name in the motor settings.
 
-    Topics that have a name of the interface are left out, unless the motor settings have the full
-    name.
+    If the motor settings have a relative name that the interface uses too, such as `joint_states`,
+    its topics are left out.
     """
     stated = [motors.motor_state_topic, motors.motor_command_topic]
     return {
@@ -216,7 +216,8 @@ def _around(namespace: str) -> list[str]:
 def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
     """Return the namespace that lies within all others.
 
-    The result is None without such a namespace, or if a topic is in two of the namespaces.
+    The result is None without such a namespace, or if two namespaces contain the same topic other
+    than /diagnostics.
     """
     innermost = max(nested, key=len)
     if not set(nested) <= {innermost, *_around(innermost)}:

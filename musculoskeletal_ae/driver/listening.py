@@ -151,7 +151,7 @@ class Listening:
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
 
     def tick(self, now: float) -> None:
-        """Record that this process runs; call this more often than every `pace.LONGEST_TICK`."""
+        """Record that this process runs; call this at intervals below `pace.LONGEST_TICK`."""
         self._pace.tick(now)
 
     @contextmanager
@@ -255,7 +255,10 @@ class Listening:
         return False
 
     def _of_source(self, fault: str) -> str:
-        """Return the name of a fault of tensions, or of currents if the driver reports these."""
+        """Return the name of a fault for the quantity that the driver reports.
+
+        If the driver reports currents, 'current' replaces 'tension' in the name.
+        """
         if not self._robot.tension_source.is_current:
             return fault
         return fault.replace('tension', 'current')
@@ -307,9 +310,9 @@ class Listening:
         verdict.add(lengths_verdict)
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return a note that names the joints whose negated angle would explain all l.
+        """Return one note that names each joint whose reversed sign alone would explain all l.
 
-        The list is empty if there are no such joints. `theta` is θ [rad], (N, D).
+        Without such a joint, the list is empty. `theta` is θ [rad], (N, D).
         """
         names = []
         for j, name in enumerate(self._robot.joints):
@@ -329,9 +332,9 @@ class Listening:
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
         """Yield possible corrections of θ (N, D), each with its fault and joints.
 
-        Single signs and the order of joints that did not move are not questioned, because an arm at
-        rest would fit too many corrections. If several joints moved, one correction reverses the
-        signs of all joints.
+        No correction reverses the sign of a single joint that did not move, or exchanges such a
+        joint with another one, because too many corrections would fit an arm at rest. If several
+        joints moved, one correction reverses the signs of all joints.
         """
         robot, radian = self._robot, self._robot.kinematics.radian
         joints = range(robot.joint_count)

@@ -166,7 +166,7 @@ class MotionTest(ABC):
     def _lasting(self, is_beyond: Bools) -> int | None:
         """Return a muscle that has been beyond its limits for longer than MOMENT, or None.
 
-        `is_beyond` (M,) is valid for the newest message.
+        `is_beyond` (M,) says which muscles are beyond their limits in the newest message.
         """
         self._tame_at[~is_beyond] = self._now
         is_wild = self._now - self._tame_at > MOMENT

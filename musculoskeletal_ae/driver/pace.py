@@ -46,11 +46,11 @@ class Pace:
         return len(self._messages)
 
     def message(self, came: float, sent: float, number: int) -> None:
-        """Record times [s] and sequence number of a message."""
+        """Record when a message was received and when it was sent [s], and its sequence number."""
         self._messages.append(_Message(came, self._awake.at(came), sent, number))
 
     def tick(self, now: float) -> None:
-        """Record that this process runs; call this more often than every LONGEST_TICK."""
+        """Record that this process runs; call this at intervals below LONGEST_TICK."""
         self._awake.tick(now)
 
     def judge(self, verdict: Verdict, now: float) -> None:

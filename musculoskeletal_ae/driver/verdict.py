@@ -19,7 +19,7 @@ LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g
 
 
 class FaultTexts(Strict, frozen=True, array_like=True):
-    """An entry of faults.yaml."""
+    """Texts about one fault: an entry of faults.yaml."""
 
     check: Check
     observation: str
@@ -90,10 +90,10 @@ class Verdict:
 
     @property
     def allows_motion(self) -> bool:
-        """Whether the motion test is safe: no fault but wrong length zeros or another rate.
+        """Whether the motion test is safe in spite of the faults that were found.
 
-        At another rate, all motions are only slower or coarser. A driver that publishes with long
-        gaps has another fault.
+        Wrong length offsets do not endanger the arm. At an unexpected rate, motions are only slower
+        or coarser. All other faults forbid motion, among them long gaps between messages.
         """
         return all(fault.check == 'zero' or fault.name == 'rate' for fault in self.faults)
 

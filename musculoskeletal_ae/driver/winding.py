@@ -9,9 +9,9 @@ steps inwards until the MSC law
 demands a low tension at the measured l. The target then returns, and moves beyond l, where T must
 stay at T_bias.
 
-The law amplifies an error of l by K. If K exceeds 50 kN/m, the resulting error of T exceeds
-TENSION_TOLERANCE. This error then replaces the tolerance, and detection thresholds and the default
-of the demanded tensions grow by the same factor.
+The law multiplies an error of l (LENGTH_ERROR) by K. If K exceeds 50 kN/m, the resulting error of T
+exceeds TENSION_TOLERANCE. This error then replaces the tolerance, and the detection thresholds and
+the default of the demanded tensions grow in proportion to it.
 """
 
 from collections.abc import Generator, Sequence
@@ -76,8 +76,8 @@ class Winding(MotionTest):
             muscles: Indices of the muscles to test. Without any, all muscles are tested.
             highest: Highest demanded tension [N]; None: ABOVE_BIAS above T_bias (more if K is
                 large), but at most tension.max. If more than T_bias is demanded before the test of
-                a muscle, the highest demand is larger by the excess. The check of the clip demands
-                more as well.
+                a muscle, the highest demand is larger by the excess. If `highest` reaches
+                tension.max, a last step demands more, to check that T stays at tension.max.
 
         Raises:
             MusculoskeletalError: If the response to `highest` could not be distinguished from
@@ -270,11 +270,11 @@ class Winding(MotionTest):
         return other if SLOPES[0] < (got - asked)[other] / asked[m] < SLOPES[1] else m
 
     def _find_onset(self, m: int, home: _Reading) -> Generator[None, None, float | None]:
-        """Search for the l_target [m] at which muscle m gets tight; return None without a response.
+        """Return the l_target [m] at which T of muscle m begins to rise; None without a response.
 
-        The target moves slowly inwards and outwards, past −l, where the muscle would get tight if a
-        sign were wrong. The search ends at the first response, or when l or T stops changing, that
-        is, when its sensor is not read any more.
+        The target moves slowly inwards and outwards, past −l, where T would rise if a sign were
+        wrong. The search ends at the first response. It also ends if l or T stays exactly constant,
+        which shows that the sensor is not read any more.
         """
         home_length, far = (
             home.length[m],

@@ -53,7 +53,7 @@ def without_elongation(robot: Robot, tension: Array, length: Array) -> Array:
     """Return the length if the series elastic element were not stretched, l + L_e(l_abs, T) [m].
 
     The stretch shortens the measured l, so L_e is added. L_e is evaluated at the measured length
-    first, and then at the length that the first L_e corrects.
+    first. It is then evaluated again at the length corrected by this first L_e.
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)

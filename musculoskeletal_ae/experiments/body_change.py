@@ -114,9 +114,9 @@ def _changes(
 
     `curves` are the lengths 'before' and 'after' learning and those of the 'true' body [m],
     (points, M) each. The change of a muscle is the largest difference between the curves before and
-    after learning. "Relative" is the change of l − l(origin), because the curves in the paper pass
-    the origin. "All" refers to the range of the paper's figure, the other numbers to the range of
-    the training.
+    after learning. A key with "relative" stands for the change of l − l(origin), because the curves
+    in the paper pass the origin. A key with "all" stands for the range of the paper's figure, every
+    other key for the range of the training.
     """
     change = curves['after'] - curves['before']
     relative = change - change[origin]

@@ -54,7 +54,7 @@ class ContactLoop(ClosedLoop):
         self._contact.use(mae)
 
     def contact(self, exploring: bool = False) -> Contact:
-        """Advance by one message; return its contact estimate."""
+        """Advance by one message, and return the estimated contact at this message."""
         _ = self.explore() if exploring else self.step()
         length, transmission = self._read.length, self.mae.transmission
         end = self._friction.end_tension(transmission, self._read.tension, length)

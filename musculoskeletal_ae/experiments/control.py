@@ -146,11 +146,12 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
-    """Return what `proposed` plans, and its result on the same body without friction.
+    """Return how far `proposed` exceeds the least tension, split by cause.
 
-    The ratio of the planned ‖T‖ to the bound shows the error of the learned body. The frictionless
-    arm needs more than planned because tensions are commanded as lengths. The arm with friction
-    needs still more because of the friction.
+    For this, `proposed` plans the tensions, and then moves the same body without friction. The
+    ratio of the planned ‖T‖ to the bound shows the error of the learned body. The frictionless arm
+    needs more than planned because tensions are commanded as lengths. The arm with friction needs
+    still more because of the friction.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:

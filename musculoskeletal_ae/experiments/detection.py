@@ -89,12 +89,12 @@ class GraspAndRupture:
         return [m for m in self.muscles if self.carried[m]] or self.muscles
 
     def while_ruptured(self, muscle: int) -> slice:
-        """Return the messages during which a muscle was ruptured and had no tension left."""
+        """Return the slice of messages in which a muscle was ruptured and had lost its tension."""
         start = float(self.rupture[muscle])
         return rows_between(start + SLACKENING, start + RUPTURE_TIME)
 
     def disturbed(self, count: int) -> Bools:
-        """Return a mask of `count` messages: whether a muscle is ruptured or the arm recovers."""
+        """Return a mask (count,) of messages during a rupture, or shortly after its repair."""
         disturbed = np.zeros(count, dtype=bool)
         for start in self.rupture[self.order].tolist():
             disturbed[rows_between(start, start + RUPTURE_TIME + RECOVERY)] = True
@@ -223,12 +223,12 @@ def anomaly_levels(
     healthy_outputs: Mapping[str, DetectorOutput],
     fault: str,
 ) -> dict[str, Any]:
-    """Return measures of A and d on healthy messages and in ruptures, before and after learning.
+    """Return measures of A and d without and with ruptures, before and after learning.
 
-    The measures are the largest and the median value of healthy messages, the level of each rupture
-    and the smallest of them, and the AUROC. The level of a rupture is the median over the messages
-    of `GraspAndRupture.while_ruptured`. The levels have the order of `plan.muscles`. `fault` is the
-    name of the fault in the keys.
+    The measures are the largest and the median value of healthy messages, the level of each
+    rupture, the smallest level of a muscle in `plan.counted`, and the AUROC. The level of a rupture
+    is the median over the messages of `GraspAndRupture.while_ruptured`. The levels have the order
+    of `plan.muscles`. `fault` is the name of the fault in the keys.
     """
     numbers: dict[str, Any] = {}
     for when, prefix in (('before', '_before'), ('after', '')):

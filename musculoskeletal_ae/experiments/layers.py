@@ -72,7 +72,7 @@ def measure(study: Study, seed: int) -> Measured:
 def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     """Return the mean of each number over trainings, and the ranges of the numbers in ERRORS.
 
-    `learned` is the number of trainings after which learning started.
+    `learned` is the number of trainings whose network was accepted, so that it learned online.
     """
     learned = [row for row in rows if row['after_rad'] is not None]
     summary: dict[str, float | None] = {'learned': len(learned)}

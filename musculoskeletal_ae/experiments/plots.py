@@ -108,9 +108,10 @@ def ranked_bars(
     title: str,
     digits: int = 3,
 ) -> None:
-    """Draw one bar per name: the mean over individuals, a dot for each, and the mean in a column.
+    """Draw one bar per name: the mean over individuals, with a dot for each individual.
 
-    `values` maps names to the individuals' values; None stands for no value (`mean_of_known`).
+    A column beside the axes shows the means as numbers. `values` maps names to the individuals'
+    values; None stands for no value (`mean_of_known`).
     """
     place = np.arange(len(values))
     numbers = {name: np.array(each, dtype=float) for name, each in values.items()}

@@ -111,10 +111,10 @@ class ClosedLoop:
         return self.step()
 
     def go(self, theta: Array, duration: float) -> None:
-        """Move to θ [rad] (D,) within `duration` [s].
+        """Move towards θ [rad] (D,) for `duration` [s].
 
         Raises:
-            MusculoskeletalError: If the controller stopped on the way.
+            MusculoskeletalError: If the controller stopped meanwhile.
         """
         self.approach(theta, duration)
         self.check()

@@ -191,7 +191,7 @@ class Row(Strict, frozen=True):
         return worst(known, default=None)
 
     def cells(self, result: Mapping[str, Any]) -> Cells:
-        """Return the row for a result.json."""
+        """Return the cells of this row, with the numbers of a result.json."""
         paper_key = self.paper.format(preset=PAPER_PRESET)
         numbers = [self.number(result, key) for key in (paper_key, self.default, self.bound)]
         paper, default, bound = (NOTHING if n is None else f'{n:.{self.digits}f}' for n in numbers)
@@ -227,7 +227,7 @@ def individuals(seeds: Sequence[int]) -> str:
 
 
 def readme_table(results: Results) -> str:
-    """Return the text between the markers of a page."""
+    """Return the results table as Markdown, with an introduction and the failed experiments."""
     if not results:
         return '\n\nThere are no results yet; run `experiment all --readme doc/results.md`.\n\n'
     about = next(iter(results.values()))['about']

@@ -12,7 +12,11 @@ ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
 
 
 def elbow(robot: Robot) -> int:
-    """Return the joint to flex: elbow_pitch, or else an elbow, or else the last revolute joint."""
+    """Return the joint to flex, in the role of elbow_pitch.
+
+    This is the first revolute joint with "elbow_pitch" in its name, or else with "elbow", or else
+    the last revolute joint. Without revolute joints, it is the last joint.
+    """
     return _named(robot, ELBOW, -1)
 
 
@@ -28,7 +32,11 @@ def elbows(robot: Robot) -> Bools:
 
 
 def shoulder(robot: Robot) -> int:
-    """Return the joint to sweep: shoulder_pitch, or a shoulder, or the first revolute joint."""
+    """Return the joint to sweep, in the role of shoulder_pitch.
+
+    This is the first revolute joint with "shoulder_pitch" in its name, or else with "shoulder", or
+    else the first revolute joint. Without revolute joints, it is the first joint.
+    """
     return _named(robot, SHOULDER, 0)
 
 

@@ -190,7 +190,7 @@ class _Workers:
         return ended
 
     def abort(self) -> None:
-        """End all processes at once."""
+        """End all processes immediately, without waiting for the parts that run."""
         # End the processes before the pool. Otherwise, a process that is just starting would print
         # a traceback.
         for child in multiprocessing.active_children():

@@ -81,7 +81,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def sighted(learner: Learner) -> bool:
-    """Whether the camera detects the marker until the next sample is stored."""
+    """Return whether the camera detects the marker in the messages up to the next sample."""
     # Count accepted samples, because the number of stored ones is bounded.
     return learner.samples.accepted % SIGHTED == 0
 

@@ -53,8 +53,8 @@ the elastic elements, friction proportional to tension, creep, sensor errors and
 class Report(NamedTuple):
     """Differences between an exported model and the network, over the workspace.
 
-    The torque is compared with that of the robot description, with the learned springs, instead of
-    the network.
+    Lengths and moment arms are compared with those of the network. The torque is compared with that
+    of the robot description, which includes the learned springs of the joints.
     """
 
     lengths: Array  # standard deviation of each muscle's length error at T_mid [m], (M,)

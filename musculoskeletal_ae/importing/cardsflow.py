@@ -5,7 +5,7 @@ CARDSflow states via points relative to a link's centre of mass, in the axes of 
 the link 'world' are fixed. SPHERICAL and CYLINDRICAL via points (axis z) become wraps, and a MESH
 via point becomes a fixed point. `joint_limits.yaml` in the same directory may list angles of each
 joint; the smallest and the largest of them become the limits of the joint. A URDF alone gives a
-skeleton of muscles.yaml, with a placeholder muscle for each joint. The user has to replace it.
+skeleton of muscles.yaml, with a placeholder muscle for each joint. The user replaces these muscles.
 """
 
 import os

@@ -91,9 +91,9 @@ def resting_joints(model: Any) -> list[float]:
 
 
 def tie_rims(model: Any) -> list[tuple[int, int]]:
-    """Reduce the radius of each geom on whose rim a site of a wrapping tendon lies.
+    """Reduce the radius of each geom on whose rim a tendon that wraps around it has a site.
 
-    The tendon of the site must wrap around the geom. The radius is reduced by a share 2·RIM.
+    The radius is reduced by a share 2·RIM.
 
     Returns:
         Indices (tendon, geom) for each site on a rim.

@@ -101,10 +101,10 @@ class Source:
             self.note('renamed', f'{kind} {original} is {name} here')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
-        """Return the limits of a joint.
+        """Return the limits of a joint whose limits in the source are `low` and `high`.
 
-        These are the limits in the separate file, else `low` and `high` if they are usable, else
-        those of UNLIMITED, with a note.
+        Limits of the joint in a separate file take precedence. If `low` and `high` are needed, but
+        not usable, those of UNLIMITED replace them, with a note.
         """
         if joint in self.given_limits:
             return self.given_limits[joint]
@@ -187,8 +187,8 @@ def tip_name(link: str) -> str:
 def tip(source: Source) -> str:
     """Return the link at the end of the longest chain.
 
-    The longest chain has the most joints that are not coupled, and then the most links after the
-    last joint.
+    The longest chain has the most joints that are not coupled. Among chains with equally many of
+    them, it has the most links after the last joint.
     """
     model, depth = source.model, [0]
     for i in range(1, model.njoints):
@@ -521,7 +521,7 @@ def compare(source: Source, robot: Robot) -> Comparison | None:
 
     The source's moment arms are numerical derivatives of its lengths. MuJoCo computes the lengths
     of an MJCF file, and `cardsflow` those of straight routes on the URDF itself. The result is None
-    if the source computes no lengths.
+    if nothing computes the lengths of the source.
     """
     if source.lengths is None:
         return None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Latches an anomaly until the estimator confirms that it has ended.
 
-A message `true` on `anomaly_detected` latches an anomaly at once. A message `false` does not clear
-the latch, because any node could publish it. Instead, the latch calls the estimator's service
+A message `true` on `anomaly_detected` latches an anomaly immediately. A message `false` does not
+clear the latch, because any node could publish it. Instead, the latch calls the estimator's service
 `estimator/check_health`, and is cleared if that succeeds.
 """
 

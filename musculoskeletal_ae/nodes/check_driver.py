@@ -112,7 +112,7 @@ class CheckDriver:
         """Return True if no other node publishes commands to the arm.
 
         Args:
-            own: Number of publishers of commands that this tool has itself.
+            own: Number of this tool's own publishers of commands.
 
         Raises:
             MusculoskeletalError: If another node publishes commands.
@@ -190,8 +190,8 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
     The test is a `Winding`, or a `Positioning` for modules that follow positions.
 
     Raises:
-        MusculoskeletalError: If the options name an unknown muscle, or if the test cannot use
-            their tension.
+        MusculoskeletalError: If the options name an unknown muscle, or a tension at which the
+            muscles cannot be tested.
     """
     muscles = robot.muscle_indices(options.muscles or [])
     winding: Any = import_heavy('musculoskeletal_ae.driver.winding').Winding

@@ -181,7 +181,11 @@ class Estimator(Shell):
         return f'cleared: {cause}' if cause else 'no anomaly was detected'
 
     def _check_health(self, _: Trigger.Request) -> str:
-        """Confirm that no anomaly is detected; without this, other nodes keep their latch."""
+        """Confirm that no anomaly is detected; other nodes then clear the anomaly they latched.
+
+        Raises:
+            MusculoskeletalError: If an anomaly is detected.
+        """
         if cause := self.core.cause:
             raise MusculoskeletalError(f'anomaly detected: {cause}')
         return 'no anomaly is detected'

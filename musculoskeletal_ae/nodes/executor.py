@@ -65,8 +65,8 @@ class LeanExecutor(SingleThreadedExecutor):
     """Runs the callbacks of timers, subscriptions, services and clients with little overhead.
 
     rclpy handles everything else in a *full round*. Changes of entities, unfinished asynchronous
-    callbacks, other tasks and actions trigger a full round at once. QoS events wait for the next
-    one, at most a second.
+    callbacks, other tasks and actions trigger a full round immediately. QoS events are handled in
+    the next full round, which begins at most a second later.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:

@@ -83,7 +83,7 @@ class Learner(Shell):
     def _begin(self) -> None:
         """Continue from the saved state, or begin with the network that `checkpoint` names.
 
-        With `fresh`, the saved state is first replaced; a backup of it is kept.
+        With `fresh`, the saved state is first discarded; a backup of it is kept.
 
         `relearn_muscles` is checked but not obeyed: a parameter file that sets it would otherwise
         cause the muscles to be relearned at every start.

@@ -122,9 +122,9 @@ class NeededTopics:
             self._node.get_logger().info(text)
 
     def _is_silent(self, topic: str) -> bool:
-        """Return whether a topic is a stream without usable messages.
+        """Return whether no usable message of a stream has arrived for longer than SILENCE.
 
-        A stream that was never used and has no publisher is missing, not silent.
+        A stream without a publisher that has never had a usable message is missing, not silent.
         """
         if topic not in STREAMS or self._reception.silence(topic) <= SILENCE:
             return False

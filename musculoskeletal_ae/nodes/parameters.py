@@ -234,8 +234,8 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
         files: The files; values in later files replace those in earlier ones.
 
     Raises:
-        MusculoskeletalError: If a file cannot be read, has a parameter that no node has, or has
-            motor parameters of some nodes only.
+        MusculoskeletalError: If a file cannot be read, has no section for all nodes, names a
+            parameter that no node has, or sets a motor parameter for a single node.
     """
     values = dict[str, Any]()
     for file in files:

@@ -2,17 +2,17 @@
 """Ends a node that hangs, and writes the stacks of its threads to stderr.
 
 A timer callback of the node calls `ProgressWatch.note` ten times a second. A watching thread checks
-twice a second when the last call was. After 10 s without a call, the thread dumps the stacks of all
-threads to stderr and ends the process with status 70. By then, other nodes have long treated the
-topics of this node as stale.
+twice a second how long ago the last call was. After 10 s without a call, the thread dumps the
+stacks of all threads to stderr and ends the process with status 70. By then, other nodes have long
+treated the topics of this node as stale.
 
 A native call that never returns and holds Python's global interpreter lock blocks the watching
-thread as well. A timer of CPU time covers this case: it ends the process by SIGVTALRM, after a dump
-of the stacks.
+thread as well. For this case, the watching thread restarts a timer at each check. After 10 s of CPU
+time without a restart, the timer sends SIGVTALRM, which dumps the stacks and ends the process.
 
-Time in which the process was suspended does not count, nor does time in which the main thread was
-ready to run but an overloaded computer gave it no processor, nor time in a debugger or in numba's
-compiler.
+The watching thread does not count the time in which the process was suspended, or in which the main
+thread was ready to run but an overloaded computer gave it no processor. It does not end a process
+whose main thread is in a debugger or in numba's compiler.
 """
 
 import faulthandler

@@ -142,7 +142,11 @@ class Record(Node):
         self.writer.write(name, now, info['source_timestamp'], data)
 
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
-        """Return the QoS that the publishers of a topic offer, without the unknown queue depth."""
+        """Return the durability and reliability that the publishers of a topic offer.
+
+        If the graph shows no publisher, the QoS of the interface is returned. The graph does not
+        show queue depths, so each of them is a default.
+        """
         offered = [
             offered_qos(
                 info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,

@@ -447,7 +447,10 @@ class Shell(Node):
 
     @property
     def intruders(self) -> str:
-        """Other nodes that publish topics of this arm's nodes, or have this node's name; or ''."""
+        """Other nodes that publish topics of this arm's nodes or have this node's name, as text.
+
+        The text is empty if there are no such nodes.
+        """
         problems = [self.sources.intruders]
         if not self.twins.is_alone(time.monotonic()):
             problems.append(f'two nodes are named {self.get_fully_qualified_name()}')
@@ -576,7 +579,7 @@ class Shell(Node):
 def _recorded(
     recording: StopRecording, topic: str, kind: type, callback: Callable[[Any], Any]
 ) -> Callable[[bytes], Any]:
-    """Return a callback for serialized messages that records them before `callback`."""
+    """Return a callback that records a serialized message, then passes it to `callback`."""
 
     def read(data: bytes) -> Any:
         message = deserialize_message(data, kind)

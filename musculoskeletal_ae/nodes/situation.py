@@ -315,9 +315,9 @@ class Situation:
 
     @property
     def _stands_still(self) -> bool:
-        """Whether the controller is not stopped, but does not explore either.
+        """Whether the controller is neither stopped nor exploring.
 
-        While the length offsets are unknown, the arm then stands still, also in mode `moving`.
+        In these modes, even in `moving`, the arm stands still while length offsets are unknown.
         """
         mode = self._values('controller').get('mode')
         return mode in [activity.value for activity in STANDING_STILL]

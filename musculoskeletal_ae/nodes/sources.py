@@ -2,8 +2,9 @@
 """Detects several publishers of a topic that should have exactly one publisher.
 
 A message does not name its sender, so this module looks at the ROS graph. While several nodes
-publish a topic of `AUTHORS`, its messages are rejected, every node that uses it reports an ERROR,
+publish a topic of `AUTHORS`, the nodes that use the topic reject its messages and report an ERROR,
 and the controller stops. Afterwards nodes resubscribe to latched topics to receive the value again.
+Only a node that takes the place of an arm follows commands of several publishers (`arm.Arm`).
 
 Two publishers with the same node name do not prove that two nodes run. A killed node stays in the
 graph for up to 20 s beside its successor, but sends no more messages. Any of these signs proves
@@ -79,8 +80,9 @@ class Authorship:
 
     Attributes:
         intruders: The publishing nodes if there are several, as `/a and /b`; else ''.
-        is_certain: Whether the graph knows the nodes of all publishers. If it does not, latched
-            messages are rejected, and requested again later.
+        is_certain: False while the graph does not know the node of one of several publishers, which
+            it discovered less than NAMING ago. Meanwhile, latched messages are rejected, and are
+            requested again later.
     """
 
     def __init__(self) -> None:
@@ -186,7 +188,12 @@ class LinkSensors:
 
 
 def publishers_of(node: Node, topic: str) -> list[Publisher]:
-    """Return the publishers of a topic (full name, or ''), or nothing if there is at most one."""
+    """Return the publishers of a topic if there are at least two, otherwise [].
+
+    Args:
+        node: Node whose view of the graph is used.
+        topic: Full name of the topic; '' stands for a topic that does not exist.
+    """
     if not topic or node.count_publishers(topic) < 2:
         return []
     return [
@@ -196,7 +203,7 @@ def publishers_of(node: Node, topic: str) -> list[Publisher]:
 
 
 class Sources:
-    """Watches the publishers of all topics that a node uses."""
+    """Watches the publishers of the topics of `AUTHORS` that a node uses or publishes."""
 
     def __init__(
         self,
@@ -253,7 +260,7 @@ class Sources:
 
     @property
     def intruders(self) -> str:
-        """Topics that several nodes publish, with the names of those nodes; or ''."""
+        """Topics that several nodes publish, with the names of the nodes; '' if there are none."""
         topics: dict[str, set[str]] = {}  # motors and joints may share a topic
         for topic, each in self._authorships.items():
             if each.intruders:
@@ -270,7 +277,7 @@ class Sources:
         return f'stop all of them except {" and ".join(sorted(authors))} of this arm'
 
     def _shown(self, topic: str) -> str:
-        """Return the name of a topic without our namespace, as `resolve` returns it."""
+        """Return the name of a topic in the graph, without the namespace of this node."""
         return self._resolve(topic).removeprefix(f'{self._node.get_namespace().rstrip("/")}/')
 
     def _look(self, topic: str) -> None:

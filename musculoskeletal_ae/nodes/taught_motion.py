@@ -77,7 +77,7 @@ class _Answers:
                 self.reports.append({value.key: value.value for value in status.values})
 
     def begin(self) -> None:
-        """Forget the reports so far; refusals that they count concern earlier messages."""
+        """Forget the reports so far, and ignore the refusals that they count from now on."""
         self._refused_before = self._refused
         self.reports.clear()
 

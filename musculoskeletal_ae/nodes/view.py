@@ -317,7 +317,14 @@ class View(Node):
         quiet: bool = False,
         **fields: Any,
     ) -> None:
-        """Call a service; show its response unless `quiet`, then call `then` with it."""
+        """Call a service if it is available.
+
+        Args:
+            name: Name of the service.
+            then: Called with the response.
+            quiet: Whether to hide the response from the visitors.
+            fields: Fields of the request.
+        """
 
         def answered(answer: Any) -> None:
             if not quiet:

@@ -77,7 +77,7 @@ def _suggested(robot: Robot, args: Namespace) -> int:
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
-    """Return the holding and stiffness part of the report."""
+    """Return the part of the report that says how many postures are held and how many are stiff."""
     count, held = len(result.setting.theta), result.held
     share = f'{100 * REQUIRED_SHARE:.0f} %'
     need = f'{share} of the postures must be held, and {share} must be stiff'
@@ -147,7 +147,7 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
 
 
 def plot(robot: Robot, result: RobotCheck) -> Any:
-    """Return a figure of the moment arms over each joint's range, stiffness and held share."""
+    """Return a figure with a panel of moment arms for each joint, and a panel of stiffness."""
     from matplotlib.figure import Figure
 
     columns = min(3, robot.joint_count + 1)

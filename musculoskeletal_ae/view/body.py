@@ -125,7 +125,7 @@ def _capsules(robot: Robot) -> list[Solid]:
 
 
 def space(robot: Robot, solids: list[Solid]) -> Array:
-    """Return points [m], (N, 3), between which the arm moves.
+    """Return points [m], (N, 3), that span the space in which the arm moves.
 
     They are the corners of the solids' bounding boxes, the route points and the end effectors, in
     random postures within the joint limits. In half of the postures, every joint is at a limit.

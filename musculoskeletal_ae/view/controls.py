@@ -169,7 +169,7 @@ class Controls:
         Args:
             theta: The estimated θ [rad] (D,), which the sliders show until a visitor sets a target.
             payload: Payload of the emulated arm [kg].
-            played: Position and length of the replay [s].
+            played: Position and length of the replay [s]; None without a replay.
         """
         if theta is not None and not self._is_targeted:
             for angle, slider in zip(theta, self.sliders):

@@ -113,7 +113,7 @@ class Page:
         gui.main_panel.set_width(RIGHT_PANEL)
 
     def draw(self, posture: dict[str, Array], tension: Array | None, kinds: Ints) -> None:
-        """Draw the arms in `posture` at θ [rad] (D,), and the muscles at T [N] (M,)."""
+        """Draw the arms and the muscles; see `Scene.draw`."""
         theta = self.scene.draw(posture, tension, kinds)
         if self.controls is not None and theta is not None:
             self.controls.draw(theta)

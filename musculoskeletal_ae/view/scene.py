@@ -115,7 +115,12 @@ class Scene:
         return body.viewpoint(self._space, VIEW_DIRECTION, (FILLED * side, FILLED * up))
 
     def draw(self, posture: dict[str, Array], tension: Array | None, kinds: Ints) -> Array | None:
-        """Draw the arms in `posture` at θ [rad] (D,), and the muscles at T [N] (M,).
+        """Draw arms and muscles.
+
+        Args:
+            posture: θ [rad] (D,) of each arm to draw, by name of the arm.
+            tension: T [N] (M,); None hides the muscles.
+            kinds: The `body.Kind` of each muscle, (M,).
 
         Returns:
             θ at which the muscles are drawn; None if they are not drawn.

@@ -89,7 +89,7 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
         title: Title of the page.
 
     Raises:
-        MusculoskeletalError: If websockets has served nothing, because visits would be unchecked.
+        MusculoskeletalError: If websockets did not serve the page, so that nothing checks visits.
     """
     serve, served = server.serve, False
 
