@@ -60,7 +60,8 @@ class McapFile:
         """Read the whole file and verify its checksums.
 
         Raises:
-            BagError: If the file is damaged, or its messages are not in chronological order.
+            BagError: If the file is damaged, or if its log times go back too far to be
+                sorted (LONGEST_DISORDER within a topic, LONGEST_PAUSE among topics).
         """
         self.path = path
         self.topics: dict[str, BagTopic] = {}

@@ -53,8 +53,8 @@ def interface_topics(
         motors: How the motors of a ros2_control robot are connected.
 
     Raises:
-        BagError: If the namespace is ambiguous, or a topic is missing or has another type than the
-            interface.
+        BagError: If the namespace is ambiguous or not in the bag, if the topic of the motors is
+            missing, or if a topic has another type than the interface.
     """
     names = _relative_names(bag, namespace, motors)
     topics = topics_with(motors)
@@ -90,7 +90,8 @@ def select(
         motors: How the motors of a ros2_control robot are connected.
 
     Raises:
-        BagError: If the namespace is ambiguous, or a topic is missing or cannot be replayed.
+        BagError: If the namespace is ambiguous or not in the bag, or if a topic is missing or
+            cannot be replayed.
     """
     topics = topics_with(motors)
     if keep_names and namespace is None:

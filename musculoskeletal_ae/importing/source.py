@@ -365,7 +365,7 @@ def cut(
 
 
 def _choose_end(source: Source) -> None:
-    """Choose the far end of the last link (`tip`) as the end effector; note the alternatives."""
+    """Choose the far end of the longest chain (`tip`) as the end effector; note other choices."""
     link = tip(source)
     leaves = [name for name in source.links if name not in source.above.values()]
     others = [name for each in leaves for name in (tip_name(each), each)]

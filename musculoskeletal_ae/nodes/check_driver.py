@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tool `check_driver`: checks the driver of a real arm against its contract.
 
-It reads muscle_states and joint_states, and with --move it publishes muscle_length_command. For a
-ros2_control robot, it instead reads the JointState of the motors and commands their positions.
+It reads muscle_states and joint_states, and with --move it publishes muscle_length_command. On a
+ros2_control robot, it reads the JointState of the motors instead of muscle_states, and commands the
+positions of the motors.
 """
 
 from __future__ import annotations

@@ -206,7 +206,10 @@ class LeanExecutor(SingleThreadedExecutor):
 
 
 def make_executor(context: Context | None = None) -> Executor:
-    """Return the executor that the environment selects, or else the best one for this rclpy.
+    """Return a `LeanExecutor` if it supports this rclpy, otherwise a `SingleThreadedExecutor`.
+
+    The environment can select either of them. If rclpy lacks a private name, `LeanExecutor` cannot
+    be selected either.
 
     Raises:
         MusculoskeletalError: If the environment selects an unknown executor.
