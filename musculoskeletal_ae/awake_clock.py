@@ -45,5 +45,5 @@ class AwakeClock:
         return now - self._paused - self._pause(now)
 
     def _pause(self, now: float) -> float:
-        """Return the pause since the last tick, which the next tick will record [s]."""
+        """Return the part of the time since the last tick that exceeds `longest` [s]."""
         return max(now - self._ticked_at - self._longest, 0.0)

@@ -18,7 +18,7 @@ def printable(text: object) -> str:
 
 
 def replace_unprintable() -> None:
-    """Print "?" for characters that the terminal's encoding lacks, such as θ in ISO-8859-1."""
+    """Make stdout and stderr show "?" for characters that the encoding of the terminal lacks."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors='replace')
@@ -56,7 +56,7 @@ class GateError(CheckpointError):
 
 
 class InfeasibleError(MusculoskeletalError):
-    """No muscle tensions within the limits achieve the request, or an input is not finite."""
+    """No muscle tensions within the limits produce the given torque, or an input is not finite."""
 
 
 class MessageError(MusculoskeletalError):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executables, one function each; setup.py lists them as console scripts.
 
-This module imports nothing heavy. Hence `--help` answers at once, and signals are handled before
+This module imports nothing heavy. Hence `--help` answers quickly, and signals are handled before
 torch and rclpy are loaded. On Ctrl-C or SIGTERM, nodes exit with status 0 and tools with 130.
 `record` and `replay` exit with 0, because Ctrl-C is how a user normally ends them. An interrupted
 tool prints what it has written. No executable prints a traceback.
@@ -48,9 +48,9 @@ def _run_node(name: str) -> int:
 
 
 def _end_process(status: int) -> None:
-    """Exit at once; nodes, ROS context and child processes must have ended already.
+    """Exit without garbage collection; nodes, ROS context and child processes must have ended.
 
-    An ordinary exit would first garbage-collect the objects of torch, numba and pinocchio. On a
+    An ordinary exit would garbage-collect the objects of torch, numba and pinocchio. On a
     busy machine that takes up to ten seconds, during which the node appears to hang.
     """
     sys.stdout.flush()

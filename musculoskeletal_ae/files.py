@@ -96,12 +96,18 @@ def read_csv(
 
 
 def read_table(code: str, name: str, kind: type[T]) -> T:
-    """Return, as a `kind`, the content of the YAML file `name` beside the Python file `code`."""
+    """Return the content of a YAML file that lies in the folder of a Python file.
+
+    Args:
+        code: Path of the Python file.
+        name: Name of the YAML file.
+        kind: Type to which the content is converted.
+    """
     return msgspec.yaml.decode(Path(code).with_name(name).read_bytes(), type=kind)
 
 
 def parse_yaml(text: str) -> Any:
-    """Return the content of one YAML document: strings, numbers, lists, mappings, dates.
+    """Return the content of one YAML document, after a check of its size and its keys.
 
     Raises:
         ValueError: If the text is not valid YAML, repeats a key, or exceeds MOST_ENTRIES or DEEPEST

@@ -165,7 +165,7 @@ Point = TypeVar('Point')
 
 
 class Problem(Protocol[Point]):
-    """A problem to fit. A point holds the values of all unknowns and their residuals."""
+    """A problem to fit. A point holds values of all unknowns, and the residuals at these values."""
 
     #: e_θ (D,) and e_w (P,): 1 over the square of a typical step
     usual: tuple[Array, Array]
@@ -200,7 +200,7 @@ class Result(Generic[Point]):
     """State of a fit after a round.
 
     Attributes:
-        point: The unknowns and their residuals.
+        point: Values of the unknowns, and the residuals at these values.
         eliminated: The normal equations solved last; None before the first round.
         level: Index into `DAMPING` of the damping in `eliminated`.
         decrease: Decrease of the cost by the last step; 0 if no step was taken.
@@ -219,7 +219,8 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
         problem: The problem to fit.
         start: The first point.
         rounds: Largest number of steps.
-        enough: The fit ends when a step lowers the cost by less than this value.
+        enough: The fit ends when a step lowers the cost, or is predicted to lower it, by less than
+            this value.
 
     Returns:
         The state after the last round. The weights of the problem then belong to its point.

@@ -68,7 +68,7 @@ class Reception:
             topic: The name under which messages are counted.
             callback: Receives the message; raises a MusculoskeletalError to reject it.
             publishers: Returns the number of publishers on the topic.
-            is_used_at_once: If false, the user of the message calls `note_used` later.
+            is_used_at_once: If false, the code that uses the message calls `note_used` later.
         """
         before, last = 0, 0  # source time [ns] and sequence number of the message before
 
@@ -145,7 +145,7 @@ class Reception:
     def take_rates(self) -> dict[str, float]:
         """Return the rate [Hz] of messages that were used since the last call, by topic.
 
-        A topic of which a message was ever used stays in the result.
+        A topic of which a message was ever used stays in the result, with a rate of 0 if necessary.
         """
         now = time.monotonic()
         elapsed, self._rates_taken_at = now - self._rates_taken_at, now
@@ -156,14 +156,14 @@ class Reception:
 class Streams:
     """Distinguishes the first message of a stream from those that follow it.
 
-    A message belongs to a stream if the one before came at most STREAM_GAP seconds earlier.
+    A message follows another in a stream if it arrives at most STREAM_GAP seconds after it.
     """
 
     def __init__(self) -> None:
         self._last: dict[str, float] = {}  # time of the newest message [s], by topic
 
     def begins(self, topic: str, now: float) -> bool:
-        """Note a message that arrived at `now` [s]; return whether it is not part of a stream."""
+        """Note a message that arrived at `now` [s]; return whether it is the first of a stream."""
         before, self._last[topic] = self._last.get(topic, -math.inf), now
         return now - before > STREAM_GAP
 
@@ -175,7 +175,11 @@ class Stamps:
         self._last: int | None = None  # [ns]
 
     def is_new(self, stamp: Any) -> bool:
-        """Whether a stamp is later than the previous stamp, or the clock was set back meanwhile."""
+        """Note a stamp and return whether it is new.
+
+        It is new if it is later than the previous one, or at least REORDERING earlier, because the
+        clock was then set back.
+        """
         time, last = stamp.sec * 1_000_000_000 + stamp.nanosec, self._last
         if last is not None and last - REORDERING < time <= last:
             return False

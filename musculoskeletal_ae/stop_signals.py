@@ -4,8 +4,8 @@
 rclpy's own signal handlers are not installed (`SignalHandlerOptions.NO`), because they shut the ROS
 context down from a native thread at any moment. A node under construction then fails with "context
 is invalid", and a publisher cannot send its last message. Removing the handlers while that thread
-runs can crash. Instead, one Python handler in the main thread reacts as the current work requires
-(`Reaction`). Nodes and tools then end their work and destroy their objects in order.
+runs can crash the process. Instead, one Python handler in the main thread reacts as the current
+work requires (`Reaction`). Nodes and tools then end their work and destroy their objects in order.
 """
 
 import os
@@ -110,6 +110,6 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 def import_heavy(module: str) -> ModuleType:
-    """Import a slow module; a stop signal during the import ends the process at once."""
+    """Import a slow module; a stop signal during the import ends the process immediately."""
     with STOP.reacting(Reaction.EXIT):
         return import_module(module)

@@ -132,7 +132,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
 
 
 def joints_not_finite(message: Any, joints: Sequence[str]) -> list[str]:
-    """Return which of the `joints` have a position of NaN or infinity in a JointState."""
+    """Return the names in `joints` whose position in a JointState is NaN or infinite."""
     return [
         name
         for name, position in zip(message.name, message.position)
@@ -225,7 +225,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def _six(first: Any, second: Any, most: Array, what: str) -> Array:
-    """Return two vectors as one, (6,); check that it is finite and within ±`most`, (6,)."""
+    """Return two vectors as one, (6,), checked to be finite and within ±`most`, (6,)."""
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
         raise MessageError('not finite', what)

@@ -4,13 +4,13 @@
 A built robot never equals its description exactly. The seed draws these differences:
 
     attachment points    σ = 10 % of the muscle's typical moment arm, at most 5 mm, each coordinate
-    slack                σ = 5 % of the typical moment arm, at most 2 mm, of each tendon's length
+    tendon lengths       σ = 5 % of the typical moment arm, at most 2 mm
     elastic elements     up to 20 % stiffer or softer
     tendon friction      15 to 20 % of the tension along the route
     joint friction       1.1 to 1.5 % of the joint's largest load by weight and muscles at T_bias
     masses               σ = 10 % of the mass of each body, with its inertia
-    tension sensors      σ = 2 % of the gain, 1 % of T_limit of the offset
-    joint sensors        σ = 1° of the offset
+    tension sensors      gain: σ = 2 %; offset: σ = 1 % of T_limit
+    joint sensors        offset: σ = 1°
 
 Both kinds of friction are in addition to the friction in the file. The typical moment arm is the
 root mean square over the workspace. The muscles of a finger, which have short moment arms,

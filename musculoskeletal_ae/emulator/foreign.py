@@ -222,7 +222,7 @@ class Ageing:
         self._slips, self._slipped = rng, np.zeros(muscles)
 
     def longer(self, duration: float) -> Array:
-        """Return the lengthening of the tendons [m] (M,); advance the age by `duration` [s]."""
+        """Return how far the tendons have lengthened [m] (M,), then age them by `duration` [s]."""
         age = self._time / BEDDING_TIME
         longer = self._bedding * -np.expm1(-age) + self._knot * (self._time > self._knot_time)
         slipping = self._slips.uniform(size=len(longer)) < duration / SLIP_TIME

@@ -203,7 +203,7 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
 
 
 def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
-    """Return (muscle, obstacle) for every section of every route, with joints at mid-range."""
+    """Return (muscle, belly) for every section of every route, with joints at mid-range."""
     kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
     poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]

@@ -6,9 +6,10 @@
     position   dl/dt = (l_target − l)/POSITION_LAG, within the speed of the module; T ≤ T_max
     heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
 
-In MSC and motor control, l and T are the readings of the module's own sensors. `muscles.yaml` says
-whether the modules follow MSC or positions (`actuation`). A position-controlled module holds its
-length while it gets no commands, and pays out while its tension exceeds T_max.
+c₁, c₂ and c_a are the temperatures of winding, housing and surroundings. In MSC and motor control,
+l and T are the readings of the module's own sensors. `muscles.yaml` says whether the modules follow
+MSC or positions (`actuation`). A position-controlled module holds its length while it gets no
+commands, and pays out while its tension exceeds T_max.
 """
 
 import math
@@ -86,7 +87,7 @@ class Modules(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Commands to the modules and their faults, each of shape (M,)."""
+    """Commands to the modules, and faults of the modules, each of shape (M,)."""
 
     value: Array  # target lengths [m] or tensions [N]
     length_error: Array  # reading of the length sensor minus the true l [m]
@@ -111,7 +112,7 @@ class MuscleState(NamedTuple):
 
 @njit(cache=True)
 def friction_state(state: float, moved: float, distance: float) -> float:
-    """Return Dahl's friction state in [−1, 1] after sliding by `moved`.
+    """Return the state in [−1, 1] of Dahl's friction, which was `state`, after sliding by `moved`.
 
     `distance` is the sliding distance over which the state changes, in the unit of `moved`.
     """
@@ -124,7 +125,7 @@ def wind(
     modules: Modules, muscle: MuscleState, kind: int, command: Command, m: int,
     reading: float, tension: float,
 ) -> float:  # fmt: skip
-    """Turn motor m for one STEP as its control law demands; return the wound-in length [m].
+    """Turn motor m for one STEP as its control law demands; return how far it has wound in [m].
 
     `reading` [m] and `tension` [N] are what the sensors of the module read; `kind` is SAFE,
     FOLLOW_LENGTH or FOLLOW_TENSION.
@@ -154,7 +155,7 @@ def wind(
 
 @njit(cache=True)
 def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
-    """Turn motor m at a speed [m/s] for one STEP; return the wound-in length [m]."""
+    """Turn motor m at a speed [m/s] for one STEP; return how far it has wound in [m]."""
     before = muscle.length[m]
     after = min(modules.length_high[m], max(modules.length_low[m], before + STEP * speed))
     muscle.length[m] = after
@@ -245,9 +246,8 @@ class Arm(ABC):
     def reset(self, theta: Array | None = None) -> None:
         """Put the arm at rest at θ and at ambient temperature; mend ruptured tendons.
 
-        The external wrench ends, and the modules are in the safe state at T_bias.
-        The default θ is 0, clipped to the joint limits. Payload, length offsets and `faults` are
-        kept.
+        The external wrench ends, and the modules are in the safe state at T_bias. The default θ is
+        0, clipped to the joint limits. Payload, length offsets and `faults` are kept.
         """
         posture = np.zeros(self.robot.joint_count) if theta is None else np.asarray(theta, float)
         self._stand(np.clip(posture, self.robot.lower, self.robot.upper))

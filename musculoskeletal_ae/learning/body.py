@@ -50,7 +50,8 @@ LARGEST_LOG = 1.5  # largest |κ|
 class Layout:
     """Positions of the parameters δ, κ, μ, o, r and v in the vector of one muscle.
 
-    δ has three values for each route point.
+    δ has three values for each route point. If motor currents are measured, the vector also
+    contains γ, b and F of `Transmission`.
     """
 
     def __init__(
@@ -227,10 +228,9 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return T_end [N] (N,) of one muscle, and its derivatives by its parameters, (N, 4).
+        """Return T_end [N] (N,) of one muscle, and ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4).
 
-        The parameters are μ, γ, b/T_limit and F/T_limit. With tension sensors, only the derivative
-        by μ is returned, (N, 1).
+        With tension sensors, the derivatives are only ∂T_end/∂μ, (N, 1).
 
         Args:
             m: The muscle.

@@ -76,7 +76,10 @@ class BodyFit:
         return fit_body(self.body, observed, self._prior_mean, guess)
 
     def lengthened(self) -> Array:
-        """Return the growth of each muscle's mean length since the previous call [m], (M,)."""
+        """Return the growth of each muscle's mean length since the previous call [m], (M,).
+
+        The mean is over a fixed set of postures and tensions.
+        """
         before, self._mean_length = self._mean_length, self._probe_lengths()
         return self._mean_length - before
 

@@ -4,13 +4,16 @@
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold of d = margin · (1 + n_few/samples) · max d
                                    threshold of A = margin · (1 + n_few/samples) · max A
 
+e are the residuals of a message, and A is their score in the paper (`mae.residuals`). μ and Σ are
+mean and covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
+
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
 because friction gives d heavy tails. This maximum includes messages that were not used to
 compute Σ. Single messages far beyond all others count as sensor glitches and are excluded.
 
-Where joint sensors read all angles, the network also learns from every second message (`update`).
-The other messages, which are not used for training, serve to validate its estimates.
+Where joint sensors read all angles, the network also learns from every second recent message
+(`update`). The other recent messages serve to validate its estimates.
 """
 
 from collections.abc import Iterable
@@ -117,7 +120,7 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Forget all messages if some lack a muscle that is not among the `isolated` ones."""
+        """Forget all messages if some lack the values of a muscle that is not in `isolated`."""
         if self._missing - frozenset(isolated):
             self.clear()
 

@@ -237,7 +237,7 @@ class SampleCollector:
         return False
 
     def accept(self, sample: Sample) -> None:
-        """Store a sample as one that describes the muscles that are not isolated."""
+        """Store a sample; it describes only the muscles that are not isolated."""
         self.samples.add(sample, self.body.used.copy())
 
     # -- changes of state -----------------------------------------------------------------------

@@ -150,7 +150,7 @@ def _spread(error: Array) -> Array:
 
 
 def _excess(covariance: Array, error: Array) -> float:
-    """Return the factor with which a covariance's ellipsoid contains 95 % of the errors."""
+    """Return by which factor a covariance must grow to contain 95 % of the errors."""
     return float(np.quantile(ellipsoids(covariance, error), CONTAINED_SHARE))
 
 

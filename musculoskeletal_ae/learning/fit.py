@@ -106,8 +106,8 @@ def _reopened(
 ) -> MusclePrior:
     """Return the prior of muscle `m` after a possible change of the muscle.
 
-    If it was changed, its earlier parameters are fitted and set in `body`, and the result is a wide
-    prior around them. Otherwise the result is `prior`.
+    If the muscle was changed, its parameters before the change are fitted and set in `body`. The
+    result is then a wide prior around them, otherwise it is `prior`.
     """
     # Exclude tensions of 0 N, which mean that the muscle was isolated.
     before = ~observed.known[:, m] & (observed.tension[:, m] != 0.0)

@@ -160,7 +160,7 @@ class CheckpointKeeper:
         return True
 
     def numbered(self, mae: Mae) -> Mae:
-        """Return the network with a version above its own and that of the network in use."""
+        """Return the network with a higher version than before and than the network in use."""
         before = 0 if self.mae is None else self.mae.version
         return replace(mae, version=1 + max(mae.version, before))
 
@@ -204,7 +204,7 @@ class CheckpointKeeper:
             self._state.keep(self._samples, self.publication.checkpoint, changed)
 
     def save(self) -> Path:
-        """Save samples and network at once, and the network also as a checkpoint file.
+        """Save samples and network now, and the network also as a checkpoint file.
 
         Returns:
             The state directory.

@@ -10,9 +10,9 @@
 Isolated muscles are not learned: samples do not describe them, and the published network lists
 them.
 
-The caller supplies the time: the ROS clock, recorded time or simulated time. All rules on what is
-learned and when use this time. Therefore a recording is learned exactly as on a robot, except that
-training takes no time.
+The caller supplies the time: the ROS clock, recorded time or simulated time. All rules for
+collecting samples and starting updates use this time. A recording is therefore learned in the same
+way as the messages of a robot, except that training takes no time.
 """
 
 import math
@@ -52,7 +52,7 @@ class Learner:
         robot: The nominal body.
         collector: Turns messages into samples.
         scheduler: Decides when an update begins.
-        trainer: Makes updates.
+        trainer: Computes updates.
         keeper: Validates, stores and publishes networks.
         enabled: Whether the learner learns, see `enable`.
     """
@@ -230,9 +230,11 @@ class Learner:
         return self.body.isolated
 
     def use_body(self, body: BodyState) -> None:
-        """Use another body state from now on; the present samples are kept.
+        """Use another body state from now on.
 
         Isolated muscles are not learned. While the length offsets are unknown, learning pauses.
+        Samples that were taken under wrong length offsets are dropped or corrected
+        (`offset_history`); all others are kept.
         """
         isolated_before = self.isolated
         self._use_body(body)
@@ -310,10 +312,13 @@ class Learner:
     # -- samples → checkpoints ------------------------------------------------------------------
 
     def poll(self, now: float) -> bytes | None:
-        """Start an update if due, take over a finished one, and return a checkpoint if due.
+        """Start the next update if it is due, and take over an update that has finished.
 
         Args:
-            now: Time of a steady clock [s].
+            now: The present time on the clock of the messages [s].
+
+        Returns:
+            A checkpoint if one is due for publication, else None.
         """
         self._polled_at = now
         if self.collector.used_at != self._used_at:
@@ -396,7 +401,7 @@ class Learner:
         self.keeper.restore(mae)
 
     def save(self) -> Path:
-        """Save samples and network at once; return the state directory.
+        """Save samples and network now; return the state directory.
 
         Raises:
             StateError: If there is no directory, or it cannot be written.

@@ -30,8 +30,8 @@ class NetworkTrainer:
 
     The published network is a weight average over about the last tenth of all steps. The step size
     decreases with the number of steps: the network first follows a body that is still being
-    learned, and settles when it is known. At a constant step size even the averaged network's error
-    varies by ±10 % over hours.
+    learned, and settles when the body is known. At a constant step size, even the averaged
+    network's error varies by ±10 % over hours.
     """
 
     def __init__(self, network: Network, seed: int = 0, steps: int = 0) -> None:
@@ -44,7 +44,7 @@ class NetworkTrainer:
         self.steps = steps  # number of steps so far, including those before a restart
 
     def train(self, data: TrainingData, steps: int) -> float:
-        """Train for `steps` steps on random batches; return the mean loss of the second half."""
+        """Train for `steps` steps on random batches; return the mean loss in the second half."""
         entered, true = (torch.as_tensor(part, dtype=torch.float32) for part in data)
         mask = torch.arange(3).repeat_interleave(BATCH)
         losses = []

@@ -4,8 +4,10 @@
     e = |l − o − ①(θ, T_end)|,   median over COUNT messages, for each muscle
 
 θ is measured, or else estimated by ②. New offsets o are accepted if e is at most LARGEST_RATIO
-times the error with the previous offsets and the same network, or at most LEARNED_ERROR. If there
-are no messages with the previous offsets, the limit of e is LEARNED_ERROR or UNLEARNED_ERROR.
+times the error with the previous offsets and the same network, or at most LEARNED_ERROR. With
+fewer than COUNT messages under the previous offsets, the limit of e is LEARNED_ERROR for a network
+that has learned an arm, and UNLEARNED_ERROR for any other.
+
 Offsets within CALIBRATION_SPREAD of the accepted ones are accepted without a comparison, unless the
 offsets were unknown in between. Learning pauses while the published offsets disagree with the
 messages, whichever node published them.

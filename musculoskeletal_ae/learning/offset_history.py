@@ -34,15 +34,15 @@ class OffsetHistory:
     """Drops or corrects the samples of one store when its length offsets change.
 
     Attributes:
-        dropped: Number of samples dropped with revoked offsets.
+        dropped: Number of samples dropped because their offsets were revoked.
         corrected: Number of samples corrected.
     """
 
     def __init__(self, samples: SampleStore, offset: Array) -> None:
         """Start with the present offsets [m], (M,).
 
-        The store may hold back samples since before a restart of the learner. They are judged by
-        the offsets under which they were taken.
+        Some samples may have been held back since before a restart of the learner. They are judged
+        by the offsets under which they were taken.
         """
         self._samples = samples
         self._offset = samples.held_offset if samples.held else offset

@@ -294,7 +294,7 @@ class GroupFit:
         return RightSides(of_postures, np.concatenate([right, of_zero, of_springs]))
 
     def _springs(self, unknowns: Unknowns) -> Array:
-        """Return α, then β of the joints of the group with springs, (2S,)."""
+        """Return α and then β of those joints of the group that have springs, (2S,)."""
         return unknowns.springs[:, self.model.sprung].ravel()
 
     def moved(self, point: Point, step: Step) -> Point:

@@ -85,8 +85,8 @@ class OpenRest:
         since: Time at which the rest was detected [s].
         span: Duration of the averaged readings [s].
         readings: The averaged readings.
-        gravity: Directions of gravity from the readings before and after which the arm was still
-            for a whole window.
+        gravity: Directions of gravity from those readings before and after which the arm was
+            still for a whole window.
     """
 
     since: float

@@ -50,7 +50,7 @@ def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
 
 
 def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) -> Array:
-    """Return the derivative of K θ − b by first all α, then all β of `joints`, (N, D, 2 · joints).
+    """Return the derivatives of K θ − b by all α and then by all β of `joints`, (N, D, 2 · joints).
 
     Args:
         nominal: The springs that muscles.yaml states.

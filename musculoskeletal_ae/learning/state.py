@@ -172,7 +172,7 @@ class StateStore:
             self._next_attempt = now + RETRY_INTERVAL
 
     def save(self, samples: SampleStore, network: bytes | None) -> None:
-        """Save the state at once, and the network as a checkpoint file of its own.
+        """Save the state now, and the network also as a separate checkpoint file.
 
         Raises:
             StateError: If the state or the network cannot be saved.

@@ -19,7 +19,7 @@ MARGIN = 0.02
 
 
 class TrainingData(NamedTuple):
-    """N samples in scaled units, shape (N, D+2M) each."""
+    """N samples in scaled units; each array has the shape (N, D+2M)."""
 
     entered: Array  # network input, with noisy lengths
     true: Array  # target of the network's output

@@ -155,7 +155,7 @@ class TrainerProcess(Trainer):
         self._jobs.put(job)
 
     def poll(self) -> Update | None:
-        """Return the update if it has arrived, else None; restart a lost process when due."""
+        """Return the update if it has arrived, else None; restart a lost process after a pause."""
         now = time.monotonic()
         if now >= self._restart_at:
             self._start()

@@ -157,7 +157,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return the tension above T_bias [N] (M,) that each module needs in order to turn.
+        """Return the tension above T_bias [N] (M,) that makes each module pay out at `speed`.
 
         Args:
             lag: λ, time by which the modules lag behind [s].
@@ -287,7 +287,7 @@ class StiffnessControl(Actuation):
         return TENSION, wanted
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the command that demands T [N] at l [m], (M,)."""
+        """Return the command that demands T [N], or T_bias where T is lower, at l [m], (M,)."""
         return self.length_for(length, tension, np.maximum(tension, self._bias))
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
@@ -325,7 +325,10 @@ class StiffnessControl(Actuation):
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,  # noqa: ARG002
         is_fresh: bool,
     ) -> Array:  # fmt: skip
-        """Return the measured lengths [m] (M,), at which only T_bias is demanded."""
+        """Return the measured lengths [m] (M,), at which only T_bias is demanded.
+
+        If they are out of date, return `longest` where it is longer.
+        """
         # If the length is out of date, the muscle is paid out to its largest possible length.
         end = length if is_fresh else np.maximum(length, longest)
         # The length sensor of an isolated muscle may be faulty, so its reading is limited.
@@ -397,7 +400,7 @@ class PositionControl(Actuation):
         """Return SHARE (L_e(T_limit) − L_e(T + AHEAD dT/dt)) [m], (M,), but not less than 0.
 
         If T exceeds the limit, return the negative L_e(T_limit) − L_e(T). If T is not known, return
-        `release`, the stretch from T_bias to T_limit.
+        `release`.
         """
         elongation = self._robot.elongation
         depth = elongation(limit) - elongation(tension)
@@ -414,7 +417,7 @@ class PositionControl(Actuation):
         return 0.0
 
     def recovered(self, shortest: Array, dt: float) -> Array:
-        """Return `shortest` reduced at the speed RECOVERY.
+        """Return `shortest` − RECOVERY · `dt` [m], (M,).
 
         Paying out reverses the friction of the tendon, so the tension falls by far more than the
         elastic elements explain. If the module wound in again at full speed, the tension would
@@ -426,7 +429,11 @@ class PositionControl(Actuation):
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,
         is_fresh: bool,
     ) -> Array:  # fmt: skip
-        """Return the lengths [m] (M,) at which T is T_bias; without T, `start` plus `release`."""
+        """Return the lengths [m] (M,) at which T falls to T_bias, at most `longest`.
+
+        Where T does not exceed T_bias, return `last`. If T is not known or out of date, return
+        `start` plus `release`.
+        """
         robot, bias = self._robot, self._whole.bias
         end = start + self.release
         if is_fresh:
@@ -444,7 +451,7 @@ class PositionControl(Actuation):
         return float(tension - self._whole.bias[muscle])
 
     def winding_depth(self, muscle: int) -> float:
-        """Return `release` [m], which stretches a tendon from T_bias to T_limit."""
+        """Return `release` [m]; by default, it raises the tension from T_bias to T_limit."""
         return float(self.release[muscle])
 
 

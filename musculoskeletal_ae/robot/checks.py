@@ -320,7 +320,10 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
-    """Yield a fault for each joint that lacks muscles on one side or both in too many postures."""
+    """Yield a fault for each joint that lacks necessary muscles in too many postures.
+
+    A joint needs muscles on both sides, or on one side if it has a spring of its own.
+    """
     lacks = {
         '+': np.max(moment_arms, axis=1) <= matters,
         '-': np.min(moment_arms, axis=1) >= -matters,
@@ -357,14 +360,14 @@ def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterat
 
 
 def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
-    """Return the joint on which each muscle acts most, and how often its sign there changes.
+    """Return the joint on which each muscle acts most, and how often its action is reversed there.
 
     Args:
         moment_arms: r [m] in N postures, (N, M, D).
 
     Returns:
-        Index of the joint, (M,), and the share of postures with the sign opposite to the median,
-        (M,).
+        Index of the joint, (M,), and the share of the postures in which r has the sign opposite to
+        that of its median, (M,).
     """
     median, muscles = np.median(moment_arms, axis=0), np.arange(moment_arms.shape[1])
     main = np.abs(median).argmax(axis=1)
@@ -412,7 +415,7 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
-    """Yield a warning for each muscle whose tendon slips over an object that it wraps around."""
+    """Yield a warning for each muscle whose length jumps where its tendon slips over an object."""
     for m, size, theta in jumping_muscles(robot):
         crossed = np.flatnonzero(robot.routes.crossed[m])
         place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in crossed)
@@ -434,7 +437,7 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
 
 
 def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
-    """Yield a fault for each joint that moves no mass."""
+    """Yield a fault for each joint that moves almost no mass."""
     kin = robot.kinematics
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
     for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):

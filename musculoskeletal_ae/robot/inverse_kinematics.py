@@ -6,8 +6,8 @@
 (paper, §II-A) within the joint limits, by damped least squares (Levenberg–Marquardt) with
 pinocchio's Jacobian. Near a singular posture the pose determines some joints poorly, and camera
 noise would move them arbitrarily. Every step is therefore damped, and the search ends when a step
-reduces the sum by less than the noise does. A robot without joint sensors learns online from the
-resulting θ.
+reduces the sum by less than `LEAST_GAIN`, a change that noise alone can cause. A robot without
+joint sensors learns online from the resulting θ.
 """
 
 from typing import NamedTuple

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tree of joints, and the poses of all joints for many postures at once.
+"""The tree of joints, and the poses of all joints for many postures in one call.
 
 The pose of a revolute joint in its parent is its fixed placement times (Rodrigues' formula)
 

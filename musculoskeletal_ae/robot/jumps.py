@@ -2,7 +2,7 @@
 """Find tendons whose length jumps while the arm moves smoothly.
 
 If muscles.yaml states on which `side` a tendon passes an object, the tendon can slip over the end
-of that object. As in MuJoCo, the tendon then changes sides at once, and its length jumps by
+of that object. As in MuJoCo, the tendon then changes sides suddenly, and its length jumps by
 centimetres. No network can represent such a jump.
 """
 
@@ -39,9 +39,10 @@ def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tupl
 def _second_differences(
     lengths: Callable[[Array], Array], lower: Array, upper: Array
 ) -> tuple[Array, Array]:
-    """Return absolute second differences [m] (N, M) of lengths along random lines, and their θ.
+    """Return absolute second differences of lengths along random lines in joint space.
 
-    θ [rad], (N, D), are the postures at the middle of each difference.
+    Returns:
+        The differences [m], (N, M), and the posture in the middle of each [rad], (N, D).
     """
     joints = len(lower)
     ends = np.random.default_rng(0).uniform(lower, upper, (2, LINES, 1, joints))

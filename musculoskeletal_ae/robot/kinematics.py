@@ -2,7 +2,7 @@
 """Rigid-body kinematics and dynamics of the arm, with θ in the order of muscles.yaml.
 
 Pinocchio reads the URDF and computes link poses, gravity, inertia and Jacobians of single postures.
-Training, learning and the view need the poses of thousands of postures at once; `joint_tree.py`
+Training, learning and the view need the poses of thousands of postures; `joint_tree.py`
 computes these from the same placements. A test compares the two.
 """
 

@@ -35,7 +35,10 @@ CHANGES = {
 
 
 def remedies(check: RobotCheck, fault: Finding) -> list[str]:
-    """Return texts on remedies for a 'not_held' or 'not_stiff' fault, with the resulting share."""
+    """Return texts on remedies for a 'not_held' or 'not_stiff' fault.
+
+    Each text states the share of postures that are held or stiff with the remedy.
+    """
     kind = fault.kind.removeprefix('not_')
 
     @cache

@@ -134,9 +134,9 @@ class Robot:
         return relative - self.series_elastic.elongation(absolute, tension)
 
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
-        """Return the highest load of each joint in N postures [N·m], (D,).
+        """Return an upper limit of the load of each joint in N postures [N·m], (D,).
 
-        The load of a joint is the size of the holding torque, plus the sum of the sizes of the
+        It is the largest size of the holding torque, plus the largest sum of the sizes of the
         torques that all muscles exert on the joint at T_bias.
 
         Args:

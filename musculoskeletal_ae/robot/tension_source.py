@@ -58,7 +58,7 @@ class TensionSource:
         return tension if self.is_known else np.full_like(tension, np.nan)
 
     def measured(self, rows: Array) -> Array:
-        """Return both `rows` (2, ...), l and T_read, or only the row l if T is unknown."""
+        """Return the rows l and T_read of `rows` (2, ...), or only the row l if T is unknown."""
         return rows if self.is_known else rows[:1]
 
     def to_message(self, tension: Array) -> Array:

@@ -17,7 +17,7 @@ Where the tendon lifts off, the arc has length zero and the tangents lie on the 
 Length and moment arm are therefore continuous there. A point within RIM · r of the surface counts
 as lying on the rim, that is, outside the object. In MuJoCo, rounding decides about such points.
 
-The functions are compiled by numba. The geometric model evaluates many segments at once, and the
+The functions are compiled by numba. The geometric model evaluates many segments in one call. The
 emulator evaluates one segment after another in each step.
 """
 

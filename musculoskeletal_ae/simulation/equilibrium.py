@@ -157,14 +157,14 @@ def combine(shares: Array, rows: Array, total: Array) -> None:
 def add_slopes(
     limbs: Limbs, theta: Array, tension: Array, jacobian: Array, curvature: Array
 ) -> None:
-    """Fill `jacobian` and add to `curvature` by the cubics of all limbs.
+    """Compute the derivatives of the lengths by θ from the cubics of all limbs (see `Slopes`).
 
     Args:
         limbs: The cubics.
         theta: θ [rad], (D, N).
         tension: T [N], (M, N).
-        jacobian: Filled with G [m/rad], (M, D, N).
-        curvature: Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to its lower half, (D, D, N).
+        jacobian: Output: G [m/rad], (M, D, N).
+        curvature: Output: Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to its lower half, (D, D, N).
     """
     arms = theta.shape[1]
     jacobian[:] = 0.0
@@ -383,7 +383,7 @@ def advance(
 
 
 class QuasiStatics:
-    """Simulates arms of one robot by the equations above, with the network that `use` has set."""
+    """Simulates arms of one robot by the module's equations, with the network set by `use`."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.slopes = robot, Slopes(robot)

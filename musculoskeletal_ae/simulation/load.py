@@ -10,7 +10,7 @@ Python takes as long as the rest of a step. With forces f_i at points c_i, a joi
 axis a_k needs only sums over the bodies that it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
-    ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k, and symmetric
+    ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k; symmetric
 
 The last axis of all arrays (…, N) is that of the arms, so that a core computes several at once.
 """
