@@ -80,7 +80,7 @@ class Markers:
 
 
 class Frames:
-    """Publishes link poses on /tf; needs tf2_msgs, which the ROS wheels do not contain."""
+    """Publishes link poses on /tf; needs tf2_msgs, which the ROS packages of PyPI lack."""
 
     def __init__(self, node: Shell) -> None:
         try:

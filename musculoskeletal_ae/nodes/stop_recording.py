@@ -86,9 +86,13 @@ class StopRecording:
                 self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
-        """Write the kept messages in the background; keep `most` recordings (0: none).
+        """Write the kept messages in the background, and delete the oldest recordings.
 
-        While an earlier recording is still being written, this does nothing.
+        Nothing happens while an earlier recording is still being written.
+
+        Args:
+            cause: Cause of the stop, as text.
+            most: Largest number of recordings to keep; if it is 0, nothing is written.
         """
         messages = list(self._recent)
         if not (messages and most) or (self._writing is not None and self._writing.is_alive()):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `view`: shows a running arm on a web page, and moves it on request.
 
-The node subscribes only while somebody views the page. It then takes only the newest message of
-each topic, once for each picture. An executor would instead handle every message, which would take
-a tenth of a core.
+The node subscribes only while somebody views the page. Once for each picture, it then takes the
+newest message of each topic, and all messages of /diagnostics. An executor would instead handle
+every message of every topic, which would take a tenth of a core.
 """
 
 import math

@@ -54,7 +54,10 @@ def check(args: Namespace) -> int:
 
 
 def _suggested(robot: Robot, args: Namespace) -> int:
-    """Search for a sound arm and write it; return the exit status of the check of that arm."""
+    """Search for a sound arm, write the best arm that was found, and return the exit status.
+
+    The status is that of the check of the written arm, or 1 if no arm was written.
+    """
     change, before, after = suggest(robot, args.reach, args.postures, args.seed)
     far, routes = 1e3 * np.linalg.norm(change, axis=1), robot.routes
     if not before:

@@ -31,9 +31,9 @@ class Page:
     """One page, for any number of visitors.
 
     Attributes:
-        looked_at: Set while the page has visitors.
+        looked_at: Event that is set while the page has visitors.
         scene: The arms and muscles.
-        controls: What visitors command; None on a page that is read only.
+        controls: Buttons, sliders and handles; None on a page that is read only.
     """
 
     def __init__(
