@@ -47,7 +47,7 @@ class Parameter:
 
     @property
     def legal_values(self) -> str:
-        """Legal words, or range and unit, as text; '' if every value is legal."""
+        """Legal words, or range and unit, as text; '' if the parameter has none of these."""
         if self.legal:
             return f'one of: {", ".join(self.legal)}'
         if self.within is None:

@@ -72,7 +72,7 @@ def identifiers(steps: Iterable[Step]) -> str:
 
 
 def parse(value: str) -> tuple[Step, ...]:
-    """Return the steps in a value `remedy steps`; unknown ones are left out."""
+    """Return the steps that a value `remedy steps` lists; unknown identifiers are left out."""
     return tuple(STEPS[name] for name in value.split(', ') if name in STEPS)
 
 

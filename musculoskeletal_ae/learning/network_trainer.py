@@ -66,7 +66,7 @@ class NetworkTrainer:
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
-        """Return to large steps and a short weight average, because the body has changed."""
+        """Return to a large step size and a short weight average, because the body has changed."""
         self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
 
     def _average(self) -> None:

@@ -3,7 +3,7 @@
 
 The arm is at rest while the means of the two halves of a short window differ by no more than the
 settings' rates allow. Sensor noise is taken into account, because θ from a camera is much noisier
-than θ from a joint sensor. A rest is averaged until it ends, or in parts of `LONGEST_PART`. For an
+than θ from a joint sensor. A long rest is averaged in parts of `LONGEST_PART`. For an
 arm without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
 measured.
 
@@ -140,7 +140,8 @@ class RestDetector:
         """Process a reading, `dt` [s] after the previous one, with NaN for unmeasured θ.
 
         Returns:
-            The mean of a rest that has ended or has lasted for `LONGEST_PART`, otherwise None.
+            The mean of a rest that has ended, or of a part that has reached `LONGEST_PART` or
+            `MOST_READINGS`; otherwise None.
         """
         self._time += dt
         self._window.append(self._time, reading)

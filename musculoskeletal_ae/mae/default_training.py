@@ -68,7 +68,7 @@ RISE = 0.05  # fraction of the training during which the step size rises
 
 
 def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
-    """Return a number of units or steps, scaled up for the largest of some groups.
+    """Return a number of units or steps, scaled up for the size of the largest group.
 
     Args:
         number: The number for the reference arm, D + M = REFERENCE.

@@ -80,7 +80,7 @@ class Robot:
         return Robot(description)
 
     def elongation(self, tension: Array) -> Array:
-        """Return L_e [m] (M,) for T [N] (M,); tendons have the lengths that they have at θ = 0."""
+        """Return L_e [m] (M,) for T [N] (M,), with the lengths of the tendons at θ = 0."""
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:

@@ -166,7 +166,8 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     """Reject links and joints that do not form a tree.
 
-    Pinocchio's parser would only report them on stderr, and would use the last joint of each link.
+    Pinocchio's parser would only report them on stderr. If several joints have the same child, it
+    would use the last one.
     """
     links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
     for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():

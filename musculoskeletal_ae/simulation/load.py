@@ -58,7 +58,7 @@ def vector(a: Array) -> Vector:
 
 @njit(cache=True)
 def of(arm: int, vectors: Array) -> Vector:
-    """Return the vector of one arm from (3, N), without memory allocation."""
+    """Return the vector of one arm from `vectors` (3, N), without memory allocation."""
     return vectors[0, arm], vectors[1, arm], vectors[2, arm]
 
 
