@@ -3,9 +3,8 @@
 
 The arm is at rest while the means of the two halves of a short window differ by no more than the
 settings' rates allow. Sensor noise is taken into account, because θ from a camera is much noisier
-than θ from a joint sensor. A long rest is averaged in parts of `LONGEST_PART`. For an
-arm without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
-measured.
+than θ from a joint sensor. A long rest is averaged in parts of `LONGEST_PART`. For an arm without
+joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was measured.
 
 The slow start and end of a motion cannot be distinguished from rest, but they disturb the direction
 of gravity that an accelerometer measures. Therefore gravity is used only if the arm was still in
