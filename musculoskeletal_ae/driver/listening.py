@@ -367,8 +367,8 @@ class Listening:
             tension: T [N], (N, M).
 
         Returns:
-            The sum over muscles of the misfit [m] that remains if columns are exchanged or signs of
-            l are reversed; ∞ if θ is beyond the joint limits.
+            The sum over muscles of the misfit [m] that remains after the best exchange of columns
+            or reversal of signs of l; ∞ if θ is beyond the joint limits.
         """
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)

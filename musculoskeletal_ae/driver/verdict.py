@@ -99,7 +99,7 @@ class Verdict:
 
     @property
     def wrong(self) -> set[str]:
-        """The CHECKS that found a fault."""
+        """Those of CHECKS that found a fault."""
         return {fault.check for fault in self.faults}
 
     def __str__(self) -> str:

@@ -149,7 +149,7 @@ def record(
     which a fixed list cannot contain. The step of `second` is therefore replaced by `first` with
     the least tension that holds the posture on the geometric model. While a muscle is switched off,
     all modules follow tensions: 0 N for this muscle, and those of muscle stiffness control for all
-    other muscles. A position-controlled module is paid out instead.
+    other muscles. If the modules are position-controlled, the switched-off one is paid out instead.
 
     Args:
         arm: The arm.

@@ -122,9 +122,10 @@ def _warn(warnings: list[str]) -> None:
 
 
 def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
-    """Return a warning about the first anomaly in a recording and the error before it, or ''.
+    """Return a warning about the first anomaly in a recording; '' if there is none.
 
-    The health monitor detects the anomaly with the learned network, as on a running arm.
+    The warning also states the error of the estimate before the anomaly. The health
+    monitor detects the anomaly with the learned network, as on a running arm.
     """
     stream, health = MuscleStream(robot), HealthMonitor(robot, preset)
     isolated: tuple[int, ...] | None = None

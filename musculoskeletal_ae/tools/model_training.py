@@ -101,7 +101,11 @@ def train_on_model(robot: Robot, args: Namespace) -> Trained:
 
 
 def table(errors: list[PairError], title: str) -> str:
-    """Return a table of the nine errors: mean norm of the vector, mean |error| of an element."""
+    """Return a table of the errors of θ, T and l with each of the three masks.
+
+    Each cell has the mean norm of the error vector and, in parentheses, the mean absolute error of
+    an element.
+    """
     heads = [f'{SYMBOLS[output]} [{unit}] norm (each)' for output, unit, _ in OUTPUTS]
     lines = ['', title, f'{"entered by":<12}' + ''.join(head.rjust(26) for head in heads)]
     for mask, name in ENTERED.items():
@@ -128,7 +132,7 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
 
 
 def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
-    """Return a figure of the loss, the nine errors, and the error of every joint and muscle."""
+    """Return a figure of the loss, the errors in `table`, and the errors by joint and muscle."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

@@ -180,7 +180,10 @@ def grid_cell(reach: float) -> float:
 
 
 def pieces(robot: Robot) -> Ints:
-    """Return the index of the muscle of each drawn straight piece, including pieces of arcs."""
+    """Return, for each straight piece that is drawn, the index of its muscle.
+
+    Arcs around objects are drawn as straight pieces as well.
+    """
     routes = robot.routes
     return np.sort(np.append(routes.muscle, np.repeat(routes.muscle[routes.wrapping], ARC)))
 
