@@ -58,8 +58,14 @@ stop() {{ # SCRIPT: ends the command in the background that runs this script
 }}
 trap 'for script in "${{!running[@]}}"; do stop "$script"; done' EXIT
 ask() {{ # COMMAND: fails if the command fails, does not end, or prints a refusal
-  eval "timeout {ANSWER_PATIENCE} $1" | tee answer.log
-  [ "${{PIPESTATUS[0]}}" = 0 ] &&
+  # As README says, a command is repeated while the daemon of `ros2` has not discovered the topic.
+  local status
+  for _ in 1 2 3; do
+    eval "timeout {ANSWER_PATIENCE} $1" | tee answer.log
+    status=${{PIPESTATUS[0]}}
+    grep -q 'does not appear to be published yet' answer.log || break
+  done
+  [ "$status" = 0 ] &&
     ! grep -qE 'success(ful)?=False|[Ss]etting parameter failed' answer.log
 }}
 background() {{ # SCRIPT COMMAND
