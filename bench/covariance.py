@@ -149,7 +149,8 @@ def main(argv: list[str]) -> None:
                 texts.append(row.text())
             print(f'{reality} {seed}: {"; ".join(texts)}', flush=True)
         texts = [summary(rows[reality, source]) for source in VIEWS]
-        print(f'{reality}, mean: {"; ".join(texts)} (goal: 0.93 to 0.97, NEES 1)', flush=True)
+        goal = 'goal: 0.93 to 0.97 inside, NEES 1'
+        print(f'{reality}, mean: {"; ".join(texts)} ({goal})', flush=True)
 
 
 def summary(rows: list[Honesty]) -> str:

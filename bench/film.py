@@ -131,7 +131,8 @@ def main(argv: list[str]) -> int:
                 if ' s  error ' in line:
                     break
             else:
-                raise MusculoskeletalError('bringup.sh ended before its first status line')
+                problem = 'bringup.sh ended before its first status line'
+                raise MusculoskeletalError(f'{problem}; its output above shows the cause')
             # Read on, because a full pipe would block the process.
             Thread(target=system.communicate, daemon=True).start()
             frames, kept = record(options, Path(folder))

@@ -43,7 +43,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
-LOAD, MINUTE = 3.6, 60.0  # mass of the payload [kg]; time until it is added or removed again [s]
+LOAD = 3.6  # mass of the payload [kg]
+MINUTE = 60.0  # [s]; the payload is added or removed after each minute
 
 MESSAGES = {
     'change of l in 10 ms [m]': SIGNAL_LIMITS.step + SIGNAL_LIMITS.speed * SAMPLE_TIME,

@@ -145,8 +145,8 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
             fitting = [store for store in possible if digest(store) == digests[0]]
             if not fitting:
                 lost.append(
-                    f'learner {life}: it loaded other samples than the earlier learners had '
-                    'accepted'
+                    f'learner {life}: it loaded samples that differ from those that the earlier '
+                    'learners had accepted'
                 )
                 break
             if versions[0] < newest:

@@ -190,10 +190,17 @@ class McapFile:
         newest = self._newest[topic.name] = max(self._newest.get(topic.name, 0), time)
         self.start, self.end = min(self.start, time), max(self.end, time)
         if newest - time > LONGEST_DISORDER:
-            problem = f'the log times of {topic.name} go back by {(newest - time) / 1e9:.3g} s'
+            problem = (
+                f'the log times of {topic.name} go back by {(newest - time) / 1e9:.3g} s; '
+                f'legal: at most {LONGEST_DISORDER / 1e9:g} s'
+            )
             raise BagError(self.path, problem, _JUMP)
         if self.end - time > LONGEST_PAUSE:
-            raise BagError(self.path, 'its messages are not in chronological order', CONVERT)
+            problem = (
+                f'a message is {(self.end - time) / 1e9:.3g} s older than one before it; '
+                f'legal: at most {LONGEST_PAUSE / 1e9:g} s'
+            )
+            raise BagError(self.path, problem, CONVERT)
 
 
 class _ExactStream:

@@ -21,7 +21,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from musculoskeletal_ae.bags.storage import CONVERT, BagTopic, reading
+from musculoskeletal_ae.bags.storage import CONVERT, NAME_A_BAG, BagTopic, reading
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_yaml
 
@@ -144,7 +144,7 @@ def read_metadata(directory: Path) -> Contents:
     """Return the storage files that metadata.yaml names, or all if metadata.yaml is unusable.
 
     Raises:
-        BagError: If there are no storage files, or they are compressed individually.
+        BagError: If there are no storage files, or rosbag2 compressed the files or messages.
     """
     try:
         metadata = convert(read_yaml(directory / FILE, _unusable), _Document)
@@ -153,12 +153,17 @@ def read_metadata(directory: Path) -> Contents:
             files = sorted(file for file in directory.iterdir() if file.suffix in SUFFIXES)
         if not files:
             problem = f'has neither a readable {FILE} nor mcap or sqlite3 files'
-            raise BagError(directory, problem, 'name a bag directory or an .mcap file') from error
+            raise BagError(directory, problem, NAME_A_BAG) from error
         problem = f'{FILE} cannot be used ({error}); reading all files of the directory'
         return Contents(files, None, problem)
     information = metadata.rosbag2_bagfile_information
-    if (information.compression_mode or 'none').lower() != 'none':
-        raise BagError(directory, 'its files or messages are compressed individually', CONVERT)
+    mode = information.compression_mode or 'none'
+    if mode.lower() != 'none':
+        problem = (
+            f'{FILE} states compression_mode {mode!r:.100}; legal: none '
+            '(compressed chunks within an mcap file are legal)'
+        )
+        raise BagError(directory, problem, f'{CONVERT}, without this compression')
     names = dict.fromkeys(Path(name).name for name in information.relative_file_paths)
     return Contents([directory / name for name in names], information.message_count, '')
 

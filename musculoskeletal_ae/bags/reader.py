@@ -18,6 +18,7 @@ from musculoskeletal_ae.bags.metadata import FILE, Contents, read_metadata
 from musculoskeletal_ae.bags.storage import (
     LATEST,
     LONGEST_PAUSE,
+    NAME_A_BAG,
     BagMessage,
     BagTopic,
     StorageFile,
@@ -117,9 +118,7 @@ def _open_file(path: Path) -> StorageFile:
         return sqlite3_file.Sqlite3File(path)
     if head.startswith(mcap_file.MAGIC):
         return mcap_file.McapFile(path)
-    raise BagError(
-        path, 'is neither an mcap nor a sqlite3 file', 'name a bag directory or an .mcap file'
-    )
+    raise BagError(path, 'is neither an mcap nor a sqlite3 file', NAME_A_BAG)
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:

@@ -29,6 +29,8 @@ LONGEST_PAUSE = 10_000_000_000  # [ns]
 LATEST = (1 << 63) - 1  # [ns]; the largest ROS time
 
 DAMAGED = 'use a copy or another recording'
+#: remedy if a path is not a recording
+NAME_A_BAG = 'name a bag directory, or one mcap or sqlite3 file'
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
@@ -108,7 +110,7 @@ def open_file(path: Path) -> BinaryIO:
     """
 
     def refuse(file: Path, problem: str) -> BagError:
-        return BagError(file, problem, 'name another bag directory or .mcap file')
+        return BagError(file, problem, 'name another bag directory, mcap or sqlite3 file')
 
     return open_regular(path, refuse)
 

@@ -18,9 +18,9 @@ from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 class Action(IntEnum):
     """Action of a stop; if several causes are present, the most severe action applies."""
 
-    #: keep the last command; release if the stop lasts longer than `hold_time`
+    #: keep the last command, because the cause may clear; after `hold_time`, the same as RELEASE
     HOLD = 1
-    #: keep the last command for `hold_time`, then pay out until every muscle is at T_bias
+    #: keep the last command for `hold_time` in any case, then pay out every muscle to T_bias
     RELEASE = 2
     #: pay out at once until every muscle is at T_bias
     RELEASE_AT_ONCE = 3

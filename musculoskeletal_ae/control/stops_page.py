@@ -27,12 +27,12 @@ of the controller in `/diagnostics` contain the same identifiers.
 
 ## Causes
 
-The action `hold` keeps the last command; if the stop lasts longer than `hold_time`, the arm is \
-released. The action `release` keeps the last command for `hold_time` and then pays out all \
-muscles until each exerts T_bias; `release at once` does not wait for `hold_time`. Modules that \
-follow positions are paid out until their measured tension is T_bias, or by `release` of \
-muscles.yaml where no tension is known. If several \
-causes begin together, the first one in this table is reported.
+The action `hold` keeps the last command, because the cause may clear; after `hold_time`, it does \
+the same as `release`. The action `release` keeps the last command for `hold_time` in any case, \
+and then pays out all muscles until each exerts T_bias. The action `release at once` does not wait \
+for `hold_time`. Modules that follow positions are paid out until their measured tension is \
+T_bias, or by `release` of muscles.yaml where no tension is known. If several causes begin \
+together, the first one in this table is reported.
 
 {table}
 

@@ -411,11 +411,17 @@ class Arm(ABC):
         return readings._replace(tension=self.robot.tension_source.known(readings.tension))
 
     def _read_currents(self, tension: Array) -> Array:
-        """Return T_read of the motor currents [N] for raw T [N] (M,), with drive friction."""
+        """Return T_read [N], (M,), converted from noisy motor currents.
+
+        The motors carry the drive friction in addition to the tension of their tendons.
+
+        Args:
+            tension: T before noise [N], (M,), as from `_raw_readings`.
+        """
         muscle = self._muscle
-        pull = np.where(muscle.ruptured > 0.0, 0.0, tension)
-        pull = pull + self._drive_friction * muscle.sliding
-        read = self._current_scale * pull + self._current_zero
+        load = np.where(muscle.ruptured > 0.0, 0.0, tension)
+        load = load + self._drive_friction * muscle.sliding
+        read = self._current_scale * load + self._current_zero
         return noisy(read, CURRENT_NOISE, CURRENT_RESOLUTION, self._rng)
 
     @property

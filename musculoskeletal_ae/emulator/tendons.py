@@ -37,7 +37,7 @@ SPOOL = 0.01  # radius of the spool [m]
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
 LATE = np.array([0.75, 0.25])  # shares of the delayed stretch with the last two time constants
 KNOTS = 200  # number of entries of the table of an elastic law
-GIVING = 0.1  # time constant with which a route point follows its load [s]
+GIVING = 0.1  # time constant with which a route point yields to its load [s]
 
 
 class Springs:

@@ -142,7 +142,9 @@ class CheckpointValidator:
             del self._used[1]  # the oldest network stays, because it is most likely to be proven
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
-        """Record whether an anomaly is detected, and roll back a network that is not proven.
+        """Record whether an anomaly is detected; when one begins, roll back unproven networks.
+
+        The newest proven network is then in use, or the oldest network if none is proven.
 
         Returns:
             The network that takes over again, or None if there is no rollback.

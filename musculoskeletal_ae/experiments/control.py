@@ -198,9 +198,9 @@ def control_all(_: Study, rows: Rows) -> Plot:
 
 
 def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
-    """Draw groups of bars by method, with the bound of each group.
+    """Draw a group of bars for each label: one bar for each method, and the QP bound of the group.
 
-    `trace` holds errors and tensions by method, (groups, approaches).
+    `trace` holds errors and tensions by method, (groups, approaches), and the bounds, (groups,).
     """
     figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']

@@ -5,9 +5,10 @@ Links, joints, limits and masses are those of the robot directory. Route points 
 computes them. Each tendon has an actuator that represents a motor and its series elastic element.
 The control u is the length of the tendon at which the element is slack:
 
-    pull = k (L − u),   0 ≤ pull ≤ T_max,   k = dT/dx at T_mid = (T_bias + T_limit) / 2
+    T = k (L − u),   0 ≤ T ≤ T_max,   k = dT/dx at T_mid = (T_bias + T_limit) / 2
 
-L is the length of the tendon in MuJoCo, and u = l + offset, where l is the length in this package.
+x is the elongation of the element, and L is the length of the tendon in MuJoCo. The control is
+u = l + offset, where l is the length in muscle_states.
 Tendon friction is approximated by a constant force μ T_mid, although it is a share of the tension.
 """
 

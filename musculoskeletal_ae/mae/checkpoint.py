@@ -223,11 +223,14 @@ def _metadata(data: bytes) -> Metadata:
     """Return the metadata of safetensors bytes."""
     if len(data) > MAX_BYTES:
         raise CheckpointError(f'it has {len(data)} bytes; legal: at most {MAX_BYTES}')
-    size = int.from_bytes(data[:8], 'little')
-    if not 2 <= size <= min(MAX_HEADER_BYTES, len(data) - 8):
+    if len(data) < 10:  # the size of the header in 8 bytes, and the shortest header
+        problem = f'not safetensors: it has {len(data)} bytes; legal: at least 10'
+        raise CheckpointError(problem)
+    size, most = int.from_bytes(data[:8], 'little'), min(MAX_HEADER_BYTES, len(data) - 8)
+    if not 2 <= size <= most:
         raise CheckpointError(
-            f'{len(data)} bytes with a header of {size} bytes are not safetensors '
-            f'(a header has 2 to {MAX_HEADER_BYTES} bytes and lies inside the file)'
+            f'not safetensors: the first 8 bytes state a header of {size} bytes; '
+            f'legal: 2 to {most} ({len(data)} bytes in total)'
         )
     try:
         entries = msgspec.json.decode(data[8 : 8 + size], type=_Header).metadata

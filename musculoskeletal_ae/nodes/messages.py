@@ -82,7 +82,7 @@ def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Return whether a publisher has a subscriber, so that building a message makes sense."""
+    """Return whether a publisher has a subscriber; without one, no message need be built."""
     return publisher.get_subscription_count() > 0
 
 

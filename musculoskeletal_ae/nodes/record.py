@@ -215,7 +215,8 @@ def parse(arguments: list[str]) -> Namespace:
     add('--topics', type=names, metavar='LIST', help='topics, separated by commas (default: all)')
     parser.add_motors()
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
-    add('--compression', choices=COMPRESSIONS, default='zstd', help='compression of the messages')
+    compression_help = 'compression of the chunks of the mcap file'
+    add('--compression', choices=COMPRESSIONS, default='zstd', help=compression_help)
     recover_help = (
         'copy all readable messages of a damaged bag, for example of a killed recorder, to a '
         'complete bag in DIR (default: BAG_recovered)'

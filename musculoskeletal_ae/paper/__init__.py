@@ -16,7 +16,10 @@ IEEE Robotics and Automation Letters, 2020. Section and equation numbers are the
     §IV-A           exploration.py        the three steps of random motion
 
 `constants.py` holds the numbers of the paper, and the values that this project chose where the
-paper gives none. doc/explanation/method.md lists the deliberate deviations. Preset `paper` runs
-the code of this folder. No folder except `presets/` imports from it. Parts that both presets share
-(the network's arithmetic, Adam, the geometric model) are imported from other folders.
+paper gives none. doc/explanation/method.md lists the deliberate deviations.
+
+Preset `paper` runs the code of this folder. Preset `default` uses two parts of it as well: the
+methods `geometric`, `first` and `second`, and the three steps of random motion. Within the package,
+only `presets/` imports from this folder. The network's arithmetic, Adam and the geometric model,
+which both presets also use, are in other folders.
 """

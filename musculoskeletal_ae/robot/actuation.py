@@ -84,7 +84,8 @@ class Actuation(ABC):
     def assumed_tension(self) -> Array:
         """Tension that models and plans assume where none is measured [N], (M,).
 
-        It is the tension at which `check_robot` judges an arm: DESIRED_SHARE of T_limit.
+        It is DESIRED_SHARE of T_limit, but at least T_bias. `check_robot` judges each posture at
+        the tensions nearest to the same share of T_limit that hold the arm.
         """
         return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
 

@@ -64,7 +64,10 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
 
 
 def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
-    """Return the joint-space inertia [kg·m² or kg] (J−1, J−1) of the tree's joints at q."""
+    """Return the joint-space inertia [kg·m² or kg] of the tree's joints at q.
+
+    Its shape is (J−1, J−1), because J counts the root link as joint 0 (`JointTree`).
+    """
     # Add the lower triangle, which pinocchio does not fill.
     upper = np.triu(pin.crba(model, data, q))
     return upper + np.triu(upper, 1).T

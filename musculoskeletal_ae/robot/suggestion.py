@@ -28,7 +28,7 @@ from musculoskeletal_ae.robot.robot import Robot
 FAILING_SHARE = 0.02
 PENALTY = 10.0  # weight of failed requirements in the cost; the first term of the cost is below 1
 START_SPREAD = 0.2  # initial standard deviation of x
-TRIES = 40  # number of evaluated candidates per coordinate of all via points
+TRIES = 40  # number of candidates evaluated for each of the 3P coordinates of the via points
 RESOLUTION = 1e-4  # step to which displacements of via points are rounded [m]
 THIN = 0.003  # width of a muscle in the picture [m]
 

@@ -169,7 +169,14 @@ class Heat:
         self._covariance[:, [0, 1], [0, 1]] = SPREAD[:2] ** 2
 
     def _update(self, square: Array, housing: Array, is_valid: Bools, dt: float) -> None:
-        """Predict over dt [s], and correct the muscles whose housing temperature is valid."""
+        """Predict the state after dt [s], and correct it where the housing temperature is valid.
+
+        Args:
+            square: Mean T² over dt [N²], (M,).
+            housing: Mean housing temperature over dt [°C], (M,).
+            is_valid: Whether each housing temperature is valid, (M,).
+            dt: Time since the last update, at most LONGEST [s].
+        """
         before, covariance = self._state, self._covariance
         after = flow(before, square, dt)
         moved = flow(before[:, None] + SLOPE * np.eye(6)[:, :, None], square, dt)
@@ -186,9 +193,12 @@ class Heat:
         first = (self._age > LEARNED) & (unsure < KNOWN**2) & np.isnan(self._reference[0])
         self._reference = np.where(first, logs, self._reference)
         factor = np.exp(logs - self._reference)
-        texts = 'heats up {:.2g} times as much', 'cools down {:.2g} times as slowly'
+        texts = (
+            'heats up at {:.2g} times its earlier rate under the same tension',
+            'has {:.2g} times its earlier time constant of cooling',
+        )
         self.changed = {
-            int(m): f'{texts[k].format(factor[k, m])} as before'
+            int(m): texts[k].format(factor[k, m])
             for k, m in np.argwhere(np.abs(np.log(factor)) > np.log(CHANGED))
         }
 

@@ -3,11 +3,15 @@
 
     load(θ) = g(θ) + K θ − b − Jᵀ F
 
-(paper, §III-F: the necessary torque from the geometric model), compiled by numba. K and b describe
-the springs of the joints (`JointElasticity`). Pinocchio computes the same torque of the weight, and
-a test compares both results. However, Pinocchio has no gradient with a wrench, and calling it from
-Python takes as long as the rest of a step. With forces f_i at points c_i, a joint k at o_k with
-axis a_k needs only sums over the bodies that it carries:
+(paper, §III-F: the necessary torque from the geometric model). K and b describe the springs of the
+joints (`JointElasticity`). Pinocchio computes the same torque of weight and wrench, and a test
+compares both results. Its gradient with external forces (`computeStaticTorqueDerivatives`) cannot
+be used, because it holds each force constant in the frame of a joint. The force of the wrench F is
+constant in the axes of the root link. In addition, the simulator calls `hold` from code that numba
+compiles, and such code cannot call Pinocchio.
+
+With forces f_i at points c_i, a joint k at o_k with axis a_k needs only sums over the bodies that
+it carries:
 
     τ_k       = a_k · Σ (c_i − o_k) × f_i
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k; symmetric

@@ -22,7 +22,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_seed('of data and weights')
     parser.add_plot('loss and errors')
     for flag, text in (
-        ('--from-bag', 'learn the real arm from recordings: bag directories or .mcap files'),
+        ('--from-bag', 'learn the arm from recordings: bag directories, mcap or sqlite3 files'),
         ('--hold-out', 'with --from-bag: recordings for measuring the error before and after'),
     ):
         parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)

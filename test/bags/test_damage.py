@@ -170,7 +170,7 @@ def test_a_recording_whose_times_run_backwards_is_refused_at_once(tmp_path):
     times = range(10**12, 0, -(10**7))
     back = [samples.Sample('/anomaly', FLOAT, time, time, ONE) for time in times]
     samples.write_mcap(tmp_path / 'a.mcap', back)
-    with pytest.raises(BagError, match=r'log times of /anomaly go back by 1\.0\d* s; record again'):
+    with pytest.raises(BagError, match=r'log times of /anomaly go back by 1\.0\d* s; legal'):
         Bag.open(tmp_path / 'a.mcap')
 
 

@@ -110,7 +110,7 @@ def test_counts_that_differ_from_the_files_are_reported(bag, content):
 @pytest.mark.parametrize('mode', ['FILE', 'message'])
 def test_a_bag_that_rosbag2_compressed_itself_is_refused_with_a_remedy(mode, bag):
     change(bag, compression_mode=mode, compression_format='zstd')
-    with pytest.raises(BagError, match=r'files or messages are compressed.*rosbags-convert'):
+    with pytest.raises(BagError, match=f"compression_mode '{mode}'; legal: none.*rosbags-convert"):
         Bag.open(bag)
 
 
@@ -161,7 +161,7 @@ def test_topics_one_after_the_other_are_refused_and_the_remedy_helps(tmp_path):
         samples.Sample(f'/{a}/anomaly', FLOAT, t * 10**9, 0, ONE) for a in 'lr' for t in range(30)
     ]
     samples.write_mcap(tmp_path / 'a.mcap', data)
-    with pytest.raises(BagError, match=r'not in chronological order; .*rosbags-convert'):
+    with pytest.raises(BagError, match=r'29 s older.*legal: at most 10 s; .*rosbags-convert'):
         Bag.open(tmp_path / 'a.mcap')
     convert = Path(sys.executable).with_name('rosbags-convert')
     arguments = ['--src', tmp_path / 'a.mcap', '--dst', tmp_path / 'b', '--dst-storage', 'mcap']

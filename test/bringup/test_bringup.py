@@ -55,7 +55,7 @@ def bringup(environment, trained_file):
     yield start
     for run in runs:
         run.end(signal.SIGINT)
-        for process in pids(run):  # if the shutdown failed, which the test has reported
+        for process in pids(run):  # processes that the bring-up failed to end
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
 

@@ -460,7 +460,8 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
     driver = settled()
     home = driver.arm.sense().length
 
-    def mirrored(rows):  # mirrored about the initial length, where the law still seems to hold
+    # A length mirrored about the initial length is correct at rest; winding in reveals its sign.
+    def mirrored(rows):
         return np.stack([2.0 * home - rows[0], *rows[1:]])
 
     driver.publish = mirrored

@@ -224,17 +224,18 @@ def test_whatever_a_header_holds_its_refusal_can_be_sent_in_a_message(key):
 
 
 @pytest.mark.parametrize(
-    'data',
+    ('data', 'problem'),
     [
-        b'',
-        b'\x80\x04N.',  # a file of pickle, which must never be executed
-        (2**63).to_bytes(8, 'little') + b'{}',
-        (2).to_bytes(8, 'little') + b'{}',
-        (200_000).to_bytes(8, 'little') + b'[' * 200_000,
+        (b'', 'it has 0 bytes; legal: at least 10'),
+        # a file of pickle, which must never be executed
+        (b'\x80\x04N.', 'it has 4 bytes; legal: at least 10'),
+        ((2**63).to_bytes(8, 'little') + b'{}', f'a header of {2**63} bytes; legal: 2 to 2'),
+        ((2).to_bytes(8, 'little') + b'{}', 'no metadata'),
+        ((200_000).to_bytes(8, 'little') + b'[' * 200_000, 'no metadata'),
     ],
 )
-def test_bytes_that_are_no_checkpoint_are_refused(data):
-    with pytest.raises(CheckpointError, match='train'):
+def test_bytes_that_are_no_checkpoint_are_refused(data, problem):
+    with pytest.raises(CheckpointError, match=f'{problem}.*train'):
         from_bytes(data)
 
 
