@@ -516,11 +516,14 @@ class Controller:
         """Return why the lengths are unreliable, or ''.
 
         Normally the estimator revokes the offsets. The controller does so only if the estimator
-        does not react to a jump, for example because the estimator was just restarting.
+        does not react to a jump, for example because the estimator was just restarting. During an
+        anomaly, the arm is stopped, and the estimator decides whether a jump is due to a repair.
         """
         stream = self.stream
         if stream.body.offsets.is_suspect:
             return 'the estimator has revoked the length offsets'
+        if self.watchdog.has_anomaly:
+            return ''
         displaced = self.stream.displaced
         has_jumped = displaced.muscles and not displaced.is_unseen
         if has_jumped and stream.body.offsets.known and now - self._jumped_at > REACTION_TIME:

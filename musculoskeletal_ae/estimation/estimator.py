@@ -15,6 +15,7 @@ need lengths report findings. `suspects.py` describes the sequence from a ruptur
 
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,8 +25,9 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
+from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
-from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Observation
+from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Kind, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.length_calibration import (
     LengthCalibration,
@@ -230,10 +232,14 @@ class Estimator:
     def reset(self) -> None:
         """Clear the anomaly, and consider the body healthy in its present state.
 
+        If the length of the suspect has jumped since the finding, its length offset is checked
+        first. A wrong one revokes the length offsets.
+
         Raises:
             MusculoskeletalError: If the length offsets have been revoked, and joint sensors do not
                 agree with the lengths.
         """
+        self._check_repair()
         if self.body.offsets.is_suspect:
             if not self.health.joints.agrees:
                 raise MusculoskeletalError(f'{self.cause}; {self.suspects.advice}')
@@ -394,14 +400,55 @@ class Estimator:
         elif self.mae is None and self.body.offsets.known and jumped:
             self._handle(finding_of(jumped), now)
 
+    def _check_repair(self) -> None:
+        """After a jump of the suspect's length, confirm or revoke the length offsets."""
+        suspected, offsets = self.suspects.finding, self.body.offsets
+        if suspected is None or not self.suspects.has_suspect_jumped or not offsets.known:
+            return
+        if suspected.muscle in self.body.isolated:
+            return
+        if evidence := self._wrong_zero(suspected.muscle):
+            finding = Finding(suspected.muscle, Kind.LENGTHS_DISAGREE, evidence)
+            self._handle(finding, self.stepped_at)
+        else:
+            # The new object is published, so that the other nodes trust the length again.
+            self._use_body(self.body.with_offsets(replace(offsets)))
+
+    def _wrong_zero(self, muscle: int) -> str:
+        """Return evidence that the length offset of a repaired muscle is wrong, or ''.
+
+        Its length is compared with the joint sensors or, without them, with the posture that the
+        other muscles indicate.
+        """
+        joints, sample, mae = self.health.joints, self.sample, self.state.complete_mae
+        if joints.gap is not None:
+            return '' if joints.agrees else 'since its repair, lengths disagree with joint sensors'
+        assert sample is not None
+        assert mae is not None
+        others = mae.without((*self.body.isolated, muscle))
+        theta = others.estimate(sample.bone_tension, sample.length).theta
+        pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
+        error = abs(float(sample.length[muscle] - mae.lengths(theta, pull)[muscle]))
+        limit = (GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG).single
+        if error <= limit:
+            return ''
+        return (
+            f'since its repair, its length differs from that which the other muscles indicate by '
+            f'{1e3 * error:.0f} mm (limit {1e3 * limit:.0f} mm)'
+        )
+
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Handle a finding, if there is one; return whether it has just been latched."""
         if finding is None:
             return False
         before = self.suspects.finding
+        is_repair = self.suspects.explains(finding)
         isolated = self.suspects.take(finding, self.body.isolated, now)
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
+        if is_repair:
+            self.health.reset()  # the evidence of before the repair is no longer valid
+            return False
         revokes = finding.kind in REVOKING and finding.muscle not in self.body.isolated
         if revokes and self.body.offsets.known:
             self._use_body(self.body.with_offsets(self.body.offsets.revoked()))

@@ -26,6 +26,10 @@ differ:
                             lengths. The same applies to a `length_jump` of a muscle that is not
                             isolated.
     joint_sensors_disagree  concerns no muscle, so none is isolated
+
+While a finding is latched whose remedy is the repair of a muscle, the repair may make the length of
+this muscle jump. Therefore a jump of this length alone neither replaces the finding nor revokes the
+length offsets. `Estimator.reset` then checks whether the length agrees with the rest of the arm.
 """
 
 from collections.abc import Iterable
@@ -39,7 +43,7 @@ from musculoskeletal_ae.estimation.verification import (
     Verdict,
     Verification,
 )
-from musculoskeletal_ae.remedy import sentence
+from musculoskeletal_ae.remedy import REPAIR, sentence
 from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
@@ -58,6 +62,8 @@ class SuspectHandling:
         last_verdict: Index of the last verified suspect, or of a muscle isolated without a
             verification, and its verdict; None before the first.
         faults: Verdicts on the isolated muscles that turned out to be faulty, by index.
+        has_suspect_jumped: Whether the length of the suspect has jumped since the finding, as after
+            a repair.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -67,6 +73,7 @@ class SuspectHandling:
         self.verification: Verification | None = None
         self.last_verdict: tuple[int, Verdict] | None = None
         self.faults: dict[int, Verdict] = {}
+        self.has_suspect_jumped = False
         self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
 
     @property
@@ -111,6 +118,9 @@ class SuspectHandling:
             self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
+        if self.explains(finding):
+            self.has_suspect_jumped = True
+            return isolated
         if self.finding is not None:
             if finding.kind in REVOKING and self.finding.kind not in REVOKING:
                 isolated = self.clear(isolated)  # the earlier finding is based on wrong lengths
@@ -122,6 +132,13 @@ class SuspectHandling:
             return isolated
         self.verification = Verification(muscle, self._law(muscle))
         return (*isolated, muscle)
+
+    def explains(self, finding: Finding) -> bool:
+        """Return whether a finding is a jump that the repair of the suspect explains."""
+        suspected = self.finding
+        if suspected is None or suspected.remedy != REPAIR:
+            return False
+        return finding.kind is Kind.LENGTH_JUMP and finding.muscle == suspected.muscle
 
     def _law(self, muscle: int) -> ModuleLaw:
         robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])
@@ -150,6 +167,7 @@ class SuspectHandling:
         """
         suspect = None if self.verification is None else self.verification.muscle
         self.finding = self.verification = None
+        self.has_suspect_jumped = False
         return tuple(muscle for muscle in isolated if muscle != suspect)
 
     def on_isolated(self, isolated: Iterable[int]) -> None:

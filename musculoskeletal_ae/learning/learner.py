@@ -440,7 +440,8 @@ class Learner:
     def trouble(self) -> str:
         """Why learning is not possible or results are not on disk, or ''."""
         jumped = ''
-        if self.collector.has_jumped and self.body.offsets.known:
+        has_jumped = self.collector.has_jumped and self.body.offsets.known
+        if has_jumped and not self.collector.is_anomaly:
             jumped = 'learning is paused because lengths have jumped; call estimator/zero'
         troubles = self.trainer.trouble, self.keeper.trouble, self.offset_check.problem, jumped
         return '; '.join(filter(None, troubles))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """No message makes the controller do harm: glitches, false or late data, heat, overload, clocks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values
@@ -8,9 +10,11 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from musculoskeletal_ae.control.controller import REACTION_TIME
 from musculoskeletal_ae.control.supervisor import RESUME
 from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, OWN_PAUSE, Overload
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import QUANTITIES
 
 TICK = 0.1 * DT  # largest change of a length command in one step under the rate limit [m]
@@ -311,3 +315,26 @@ def test_commands_follow_the_clock_of_the_messages_at_any_pace(pace):
 def test_the_age_limit_grows_with_a_slow_clock_and_never_shrinks(pace, gap, late):
     _, cause = run(pace, gap, at=200, count=201)
     assert ('older' in cause) is late
+
+
+def causes(bench):
+    return [condition.cause.identifier for condition in bench.core.conditions(bench.now)]
+
+
+@pytest.mark.parametrize('is_confirmed', [True, False])
+def test_during_an_anomaly_the_estimator_decides_whether_a_jump_is_due_to_a_repair(is_confirmed):
+    bench = DistortingBench()
+    bench.core.anomaly(True)
+    bench.lies(round((LIMITS.settled + REACTION_TIME + 0.5) / DT), length=with_a_jump)
+    bench.lie = lambda read: np.array([with_a_jump(read[0]), *read[1:]])
+    assert causes(bench) == ['anomaly_detected']
+    if is_confirmed:
+        body = bench.core.stream.body
+        bench.core.use_body(body.with_offsets(replace(body.offsets)))
+    bench.core.anomaly(False)
+    bench.step(50)
+    assert causes(bench) == ([] if is_confirmed else ['length_offsets_revoked'])
+
+
+def with_a_jump(length):
+    return length + 0.05 * (np.arange(len(length)) == 2)

@@ -155,6 +155,78 @@ def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arr
     assert arm.offsets.known
 
 
+@pytest.fixture(params=[True, False], ids=['joint sensors', 'no joint sensors'])
+def ruptured(request, robot, mae):
+    """An arm that has latched the rupture of muscle 2; its module has wound in the tendon."""
+    arm = MovingArm(robot, mae)
+    arm.has_sensors = request.param
+    arm.go(8.0)
+    arm.tense = 1.0 - np.eye(6)[2]
+    for wound in np.linspace(0.0, 0.2, 40):
+        arm.off = -wound * np.eye(6)[2]
+        arm.go(0.05)
+    arm.go(1.5)
+    assert arm.kind is Kind.SLACK_TENDON
+    assert arm.core.suspects.finding.muscle == 2
+    return arm
+
+
+def repair(arm, zero=0.0):
+    arm.off, arm.tense = zero * np.eye(6)[2], np.ones(6)
+    arm.go(2.5, sensors=arm.has_sensors)
+
+
+def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
+    before = ruptured.offsets
+    repair(ruptured)
+    assert ruptured.core.suspects.has_suspect_jumped
+    assert ruptured.kind is Kind.SLACK_TENDON
+    assert ruptured.core.suspects.advice == 'repair the muscle; call estimator/reset'
+    assert ruptured.offsets is before
+    ruptured.core.reset()
+    ruptured.go(3.0, sensors=ruptured.has_sensors)
+    assert ruptured.kind is None
+    assert ruptured.offsets.known
+    np.testing.assert_array_equal(ruptured.offsets.offset, before.offset)
+    assert ruptured.offsets is not before  # published again, so that all nodes trust the length
+    assert not ruptured.core.stream.displaced.muscles
+
+
+@pytest.mark.parametrize('jump', [SEVERAL, 0.1 * np.eye(6)[4]])
+def test_a_jump_of_another_muscle_during_a_repair_revokes_the_offsets(ruptured, jump):
+    repair(ruptured)
+    ruptured.off = jump
+    ruptured.go(2.0, sensors=ruptured.has_sensors)
+    assert ruptured.offsets.is_suspect
+    assert ruptured.core.suspects.advice == 'call estimator/zero'
+    with pytest.raises(MusculoskeletalError, match='estimator/zero'):
+        ruptured.core.reset()
+
+
+@pytest.mark.parametrize('zero', [-0.12, 0.12])
+def test_a_repair_with_another_zero_revokes_the_offsets_at_the_latest_on_reset(ruptured, zero):
+    repair(ruptured, zero)
+    with pytest.raises(MusculoskeletalError, match=r'since its repair.*estimator/zero'):
+        ruptured.core.reset()
+    assert ruptured.offsets.is_suspect
+    assert ruptured.kind is Kind.LENGTHS_DISAGREE
+    ruptured.core.calibrate_lengths()
+    assert ruptured.kind is None
+
+
+@pytest.mark.parametrize('ruptured', [True], indirect=True)
+def test_joint_sensors_find_a_wrong_zero_after_a_reset_right_after_the_repair(ruptured):
+    """The reset comes before joint sensors were read, and the error is too small without them."""
+    ruptured.off, ruptured.tense = 0.07 * np.eye(6)[2], np.ones(6)
+    while not ruptured.core.suspects.has_suspect_jumped:
+        ruptured.go(DT)
+    ruptured.core.reset()
+    assert ruptured.kind is None
+    ruptured.go(3.0)
+    assert ruptured.kind is Kind.LENGTHS_DISAGREE
+    assert ruptured.offsets.is_suspect
+
+
 def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(robot, mae):
     arm = MovingArm(robot, mae)
     arm.go(8.0)

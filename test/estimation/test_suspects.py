@@ -43,6 +43,26 @@ def test_the_first_finding_stays_latched(suspects, robot):
     assert suspects.cause == f'{robot.muscles[1]}: d = 9'
 
 
+@pytest.mark.parametrize('kind', [Kind.RESIDUAL_DISTANCE, Kind.SLACK_TENDON, Kind.SENSOR_FROZEN])
+@pytest.mark.parametrize(
+    'jump',
+    [
+        Finding(1, Kind.LENGTH_JUMP, ''),  # of the suspect
+        Finding(2, Kind.LENGTH_JUMP, ''),
+        Finding(1, Kind.LENGTHS_JUMPED, ''),
+    ],
+)
+def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, kind, jump):
+    suspects.settings = Detection(on_anomaly='stop')
+    finding = Finding(1, kind, '')
+    suspects.take(finding, (), 0.0)
+    is_repair = jump == Finding(1, Kind.LENGTH_JUMP, '')
+    assert suspects.explains(jump) == is_repair
+    suspects.take(jump, (), 1.0)
+    assert suspects.finding is (finding if is_repair else jump)
+    assert suspects.has_suspect_jumped == is_repair
+
+
 def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(suspects):
     isolated = suspects.take(DISTANCE, (), 0.0)
     isolated = suspects.conclude(Verdict(Outcome.RUPTURED), isolated, 1.0)
