@@ -138,7 +138,6 @@ class MotionTest(ABC):
         for fault in judgement.faults:
             verdict.failed(fault.kind, names=', '.join(robot.joints[j] for j in fault.joints))
         if judgement.faults:
-            verdict.withdraw('zero')  # lengths were compared with the model at wrong angles
             return
         unknown = [name for j, name in enumerate(robot.joints) if j not in judgement.right]
         if judgement.right:

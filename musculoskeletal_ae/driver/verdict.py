@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The checks of a driver, the faults that they can find, and the verdict."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -73,13 +74,6 @@ class Verdict:
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))
         self.faults.append(Fault(texts.check, muscles, observation, change, what))
 
-    def withdraw(self, what: str) -> None:
-        """Remove the faults of this name, because they have another cause."""
-        check = CHECKS.index(FAULTS[what].check)
-        for fault in [fault for fault in self.faults if fault.name == what]:
-            self.faults.remove(fault)
-            self._state[list(fault.muscles), check] = OPEN
-
     def add(self, other: 'Verdict') -> None:
         """Add the results of another verdict on the same driver."""
         wrong = other._state == WRONG
@@ -90,17 +84,41 @@ class Verdict:
 
     @property
     def allows_motion(self) -> bool:
-        """Whether the motion test is safe in spite of the faults that were found.
+        """Whether the motion test may begin: not after any fault.
 
-        Wrong length offsets do not endanger the arm. At an unexpected rate, motions are only slower
-        or coarser. All other faults forbid motion, among them long gaps between messages.
+        One fault can hide behind another one. For example, lengths of wrong sign can look like
+        lengths with wrong zeros.
         """
-        return all(fault.check == 'zero' or fault.name == 'rate' for fault in self.faults)
+        return not self.faults
 
     @property
     def wrong(self) -> set[str]:
         """Those of CHECKS that found a fault."""
         return {fault.check for fault in self.faults}
+
+    @property
+    def conclusion(self) -> str:
+        """The last line of the report.
+
+        Only if each check was possible for every muscle, it says that the driver keeps its
+        contract. Otherwise it names the checks that were not possible.
+        """
+        if self.faults:
+            return 'driver check FAILED: fix the faults above'
+        names: dict[str, list[str]] = {}  # checks by the muscles that they did not judge
+        for check, is_open in zip(CHECKS, (self._state == OPEN).T, strict=True):
+            if is_open.any():
+                names.setdefault(self._whose(np.flatnonzero(is_open).tolist()), []).append(check)
+        if not names:
+            return 'the driver keeps its contract'
+        parts = [f'{", ".join(checks)} of {whose}' for whose, checks in names.items()]
+        return f'no fault found; not judged: {"; ".join(parts)}'
+
+    def _whose(self, muscles: Sequence[int]) -> str:
+        """Return the names of muscles as a list for a text, or 'all muscles'."""
+        if len(muscles) == self.robot.muscle_count:
+            return 'all muscles'
+        return ', '.join(self.robot.muscles[m] for m in muscles)
 
     def __str__(self) -> str:
         names = self.robot.muscles
@@ -109,10 +127,8 @@ class Verdict:
         lines = [f'{name:<{width}}' + ''.join(f'{cell:>9}' for cell in row) for name, row in rows]
         lines.append(f'{OPEN}: not judged')
         for fault in self.faults:
-            whose = ', '.join(names[m] for m in fault.muscles)
-            whose = 'all muscles' if len(fault.muscles) == len(names) else whose
             lines += [
-                f'fault: {fault.check} of {whose}: {fault.observation}',
+                f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}',
                 f'    change: {fault.change}',
             ]
         return '\n'.join([*lines, *(f'note: {note}' for note in self.notes)])

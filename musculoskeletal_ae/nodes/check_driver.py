@@ -228,8 +228,7 @@ def _check(options: Namespace, arguments: list[str]) -> int:
             _say(verdict)
         else:
             _say('motion test skipped: fix the faults above first')
-    passed, failed = 'the driver keeps its contract', 'driver check FAILED: fix the faults above'
-    _say(failed if verdict.faults else passed)
+    _say(verdict.conclusion)
     return 1 if verdict.faults else 0
 
 

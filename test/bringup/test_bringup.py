@@ -301,7 +301,8 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_ctrl_c_ends_it
     status, output = second.ended()
     assert status == 2 and "'/own' is in use" in output and '--namespace' in output
     status, output = graph.ended(run, signal.SIGINT)
-    assert 'the driver keeps its contract' in transcript + output
+    # Listening alone cannot judge everything.
+    assert 'no fault found; not judged: ' in transcript + output
     assert status == 130 and 'Traceback' not in output and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
     assert kept.is_dir()  # what was learned of a real arm is kept for the next run

@@ -82,7 +82,12 @@ class Driver:
     def wind(
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
     ) -> Verdict:
-        """Return the verdict of `Winding` or `Positioning`, begun with the verdict `heard`."""
+        """Return the verdict of `Winding` or `Positioning`, begun with the verdict `heard`.
+
+        As with check_driver, nothing moves if `heard` does not allow it.
+        """
+        if heard and not heard.allows_motion:
+            return heard
         kind = self.robot.actuation.choose(Winding, Positioning)
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:

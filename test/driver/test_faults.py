@@ -16,7 +16,7 @@ import pytest
 from driver.scripted import Driver, array, joint_state
 from musculoskeletal_ae import validity
 from musculoskeletal_ae.driver.listening import Listening
-from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange, with_modules
@@ -238,6 +238,29 @@ def test_a_fault_is_found_by_listening(name):
     verdict = driver.listen(8.0 if how == 'moved' else 3.0, moved=how == 'moved')
     assert verdict.wrong == {check}, str(verdict)
     assert reported in str(verdict)
+    assert not verdict.allows_motion  # whatever the fault is
+    assert verdict.conclusion == 'driver check FAILED: fix the faults above'
+
+
+def test_only_a_complete_check_says_that_the_driver_keeps_its_contract():
+    driver = unclipped(with_tension(55.0, 60.0))
+    driver.in_tension = law(most=60.0)
+    verdict = driver.listen(3.0)
+    at_rest = 'no fault found; not judged: order, sign, law, clip, latency of all muscles'
+    assert verdict.conclusion == at_rest
+    verdict = driver.listen(8.0, moved=True)
+    # Two muscles of the moved arm hardly changed their lengths.
+    few = 'order, sign of brachialis, triceps_lateral'
+    part = f'no fault found; not judged: {few}; law, clip, latency of all muscles'
+    assert verdict.conclusion == part
+    driver.listen(3.0)
+    others = ', '.join(name for m, name in enumerate(ROBOT.muscles) if m != BICEPS)
+    assert f'; law, clip, latency of {others}' in driver.wind((BICEPS,), heard=verdict).conclusion
+    verdict = Verdict(ROBOT)
+    for check in CHECKS:
+        assert check in verdict.conclusion
+        verdict.passed(check)
+    assert verdict.conclusion == 'the driver keeps its contract'
 
 
 def test_unknown_length_offsets_are_no_fault_if_the_user_says_so():
@@ -255,7 +278,7 @@ def test_slow_repeated_and_frozen_messages_are_found():
     slow.period = 0.05
     verdict = slow.listen()
     assert verdict.wrong == {'rate'} and 'came at 20 Hz' in str(verdict)
-    assert verdict.allows_motion
+    assert not verdict.allows_motion
     repeating, rows = Driver(ROBOT), []
     repeating.publish = lambda now: rows.append(now) or rows[len(rows) // 2]
     assert 'repeat the previous message' in str(repeating.listen())
@@ -451,7 +474,7 @@ def test_a_joint_sensor_of_wrong_sign_is_named_by_winding_in(joint):
     driver, sign = settled(), np.ones(ROBOT.joint_count)
     sign[joint] = -1.0
     driver.angles = lambda theta: sign * theta
-    verdict = driver.wind(heard=driver.listen(2.0))
+    verdict = driver.wind()
     assert {fault.name for fault in verdict.faults} == {'joint sign'}, str(verdict)
     assert f'sign of the angle of {ROBOT.joints[joint]} is reversed' in str(verdict)
 
