@@ -4,8 +4,8 @@
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold of d = margin · (1 + n_few/samples) · max d
                                    threshold of A = margin · (1 + n_few/samples) · max A
 
-e are the residuals of a message, and A is their score in the paper (`mae.residuals`). μ and Σ are
-mean and covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
+e are the residuals of a message, and A is the size of e (`mae.residuals`). μ and Σ are mean and
+covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
 
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
