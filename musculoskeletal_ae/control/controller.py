@@ -462,11 +462,22 @@ class Controller:
         start, mae = self._ready()
         self._follow(self.planner.by_twist(mae, start, twist))
 
+    def explore_at_start(self) -> str:
+        """Start the exploration if this is possible; return the reason if it is refused, else ''.
+
+        A refused exploration is reported until it begins or a request replaces it.
+        """
+        reason = self.explore(True)
+        self.supervisor.awaits_exploration = reason != ''
+        return reason
+
     def explore(self, wanted: bool) -> str:
         """Start or end the exploration; return the reason if this is refused, else ''."""
         condition = self.supervisor.condition
         if wanted and condition is not None:
-            return f'stopped: {condition}'
+            if self.supervisor.is_latched:
+                return f'stopped: {condition}'
+            return f'paused: {condition}: try again when the pause has ended'
         if wanted and self.settings.method == 'float':
             return GUIDED
         if wanted and not (self.robot.tension_source.is_known or self.stream.body.offsets.known):

@@ -10,7 +10,7 @@ from musculoskeletal_ae.control import reach, stops
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.supervisor import Activity
-from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
+from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step, identifiers, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
 from musculoskeletal_ae.signals.body_state import KNOWN
@@ -48,7 +48,10 @@ def report(core: Controller, now: float) -> Report:
         # reset.
         causes = {condition.cause: condition} | {each.cause: each for each in present}
         text = '; also '.join(map(str, causes.values()))
-        steps = stops.remedy_of(causes, supervisor.explored)
+        # An anomaly that has ended needs no repair.
+        of_finding = REPAIR if core.watchdog.has_anomaly else ()
+        explored = supervisor.awaits_exploration
+        steps = stops.remedy_of(causes, explored, of_finding, core.watchdog.has_anomaly)
         values |= {
             'stop cause': condition.cause.identifier,
             stops.STOP_CAUSES: ', '.join(cause.identifier for cause in causes),
@@ -63,6 +66,10 @@ def report(core: Controller, now: float) -> Report:
         values['waits for'] = present[0].cause.identifier
         return Report('warn', f'waiting: {present[0]}', values)
     doing = DOING[supervisor.activity]
+    if supervisor.awaits_exploration:
+        step = Step.EXPLORE if core.stream.body.offsets.known else Step.EXPLORE_GENTLY
+        values |= {'remedy': step.text, REMEDY_STEPS: step.identifier}
+        warnings.insert(0, f'not exploring, mode {supervisor.mode} (to go on: {step.text})')
     if warnings:
         return Report('warn', '; '.join(warnings), {**values, 'doing': doing})
     return Report('ok', doing, values)

@@ -221,6 +221,9 @@ class StopCause(Enum):
 
 
 STOP_CAUSES = 'stop causes'  # key of a value in /diagnostics
+#: causes that follow from an anomaly: a faulty muscle makes estimates implausible, and implausible
+#: estimates are rejected
+CONSEQUENCES = frozenset({StopCause.IMPLAUSIBLE_ESTIMATE, StopCause.STALE_ESTIMATE})
 
 
 class Condition(NamedTuple):
@@ -234,7 +237,10 @@ class Condition(NamedTuple):
 
 
 def remedy_of(
-    causes: Iterable[StopCause], explored: bool, of_finding: Iterable[Step] = REPAIR
+    causes: Iterable[StopCause],
+    explored: bool,
+    of_finding: Iterable[Step] = REPAIR,
+    has_anomaly: bool = False,
 ) -> list[Step]:
     """Return the steps of the remedies of all causes, each step once.
 
@@ -244,9 +250,15 @@ def remedy_of(
         causes: The causes, in whose order the steps are returned.
         explored: Whether the arm explored when it stopped, so that it may explore again.
         of_finding: Remedy of the estimator's finding, which is part of the remedy of an anomaly.
+        has_anomaly: Whether an anomaly is present that explains `CONSEQUENCES`, so that these
+            causes need nothing but the reset.
     """
-    of_anomaly = *of_finding, Step.RESET_CONTROLLER
-    remedies = (of_anomaly if cause is StopCause.ANOMALY else cause.steps for cause in causes)
+    special: dict[StopCause, tuple[Step, ...]] = {
+        StopCause.ANOMALY: (*of_finding, Step.RESET_CONTROLLER)
+    }
+    if has_anomaly:
+        special |= dict.fromkeys(CONSEQUENCES, (Step.RESET_CONTROLLER,))
+    remedies = (special.get(cause, cause.steps) for cause in causes)
     steps = sorted(dict.fromkeys(chain.from_iterable(remedies)), key=lambda step: step in LAST)
     return [*steps, Step.EXPLORE] if explored and Step.EXPLORE_GENTLY not in steps else steps
 

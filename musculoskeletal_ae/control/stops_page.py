@@ -39,7 +39,9 @@ together, the first one in this table is reported.
 ## Steps of remedies
 
 The value `remedy` in `/diagnostics` is a sentence for people. The value \
-`remedy steps` lists the identifiers of its steps, in order.
+`remedy steps` lists the identifiers of its steps, in order. While an anomaly is present, \
+{consequences} need no steps of their own, because they usually follow from it. Their steps are \
+advised if these causes outlast the anomaly.
 
 {steps}
 """
@@ -54,6 +56,9 @@ def page() -> str:
         states=_listed(states),
         diagram=supervisor.diagram(),
         table=stops.table(),
+        consequences=' and '.join(
+            f'`{cause.identifier}`' for cause in stops.StopCause if cause in stops.CONSEQUENCES
+        ),
         steps=remedy.table(),
     )
 

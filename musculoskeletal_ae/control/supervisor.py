@@ -89,12 +89,15 @@ class Supervisor:
         activity: What the arm does, or will do after a stop.
         explored: Whether the arm explored when the latched stop began, and no request has replaced
             the exploration since.
+        awaits_exploration: Whether the arm does not explore although it should: a latched stop has
+            ended an exploration, or one could not begin, and no request has replaced it since.
         state: The stop state.
         condition: The reported stop cause; None while running.
     """
 
     def __init__(self) -> None:
         self.activity, self.explored = Activity.IDLE, False
+        self.awaits_exploration = False
         self.state = StopState.RUNNING
         self.condition: Condition | None = None
         self._causes: set[StopCause] = set()  # all latching causes since the stop began
@@ -143,6 +146,7 @@ class Supervisor:
         if self.is_latched:
             activity = AFTER_A_STOP.get(activity, activity)
         self.activity, self.explored = activity, False
+        self.awaits_exploration = False
 
     def on_offsets(self, known: bool) -> None:
         """Adapt the activity to new length offsets.
@@ -231,9 +235,10 @@ class Supervisor:
             self.condition, self.explored = None, False
             self._causes.clear()
             if resumed:
-                self.activity = Activity.EXPLORING
+                self.activity, self.awaits_exploration = Activity.EXPLORING, False
         elif self.is_latched and not was_latched:
             self.explored = self.explores
+            self.awaits_exploration = self.awaits_exploration or self.explores
             self.activity = AFTER_A_STOP.get(self.activity, self.activity)
             if self.condition is not None:  # an auto-recoverable cause has become latched
                 self._causes.add(self.condition.cause)

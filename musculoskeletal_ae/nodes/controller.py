@@ -118,8 +118,8 @@ class Controller(Shell):
         serve(self, Trigger, 'controller/reset', self._reset)
         # While no estimates arrive, this timer checks message ages and publishes commands.
         self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
-        if self.parameter('explore'):
-            self.core.explore(True)
+        if self.parameter('explore') and (reason := self.core.explore_at_start()):
+            self.get_logger().warning(f'not exploring: {reason}')
 
     def destroy_node(self) -> None:
         """Wait until a stop recording has been written, then destroy the node."""

@@ -111,6 +111,8 @@ class Situation:
         self.suspect = self.evidence = ''
         self._finding = ''  # kind of the estimator's finding; 'none', or '' if it is unknown
         self._clear_reports = 0  # successive reports of the estimator without a finding
+        self._has_returned = False  # whether an anomaly has ended and begun again during one stop
+        self._has_ended = False  # whether an anomaly has ended during the present stop
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
@@ -149,12 +151,19 @@ class Situation:
                 self._accepted.append(node.values.get(VERSION, ''))
             elif name == 'controller':
                 self.doing = node.message
+                if node.values.get('mode') not in (STOPPED, VERIFYING):
+                    self._has_ended = self._has_returned = False
             if name in FOLLOWERS:
                 self._compare_network(name, node.values.get(VERSION, ''))
 
     def _take_estimator(self, values: dict[str, str]) -> None:
+        was_detected = self.detected
         self._finding = values.get('finding', '')
         self.detected = self._finding not in ('', 'none')
+        if self.detected and self._has_ended:
+            self._has_returned = True
+        if self._finding == 'none' and was_detected:
+            self._has_ended = True
         self._clear_reports = self._clear_reports + 1 if self._finding == 'none' else 0
         self.suspect = values.get('suspect muscle', '')
         self.evidence = values.get('evidence', '')
@@ -196,13 +205,16 @@ class Situation:
             if _is_own(name) or node.level == DiagnosticStatus.OK:
                 continue
             if self._is_shown(name, node):
-                if silent := node.values.get(SILENT_TOPIC):
+                if (silent := node.values.get(SILENT_TOPIC)) and not self._explains(node):
                     errors.append(Trouble(f'{name}: {silent}'))
                 if refused := node.values.get('refused'):
                     warnings.append(Trouble(f'warning: {name}: refused {refused}'))
                 continue
             if node.level == DiagnosticStatus.WARN:
-                warnings.append(Trouble(f'warning: {name}: {node.message}'))
+                # A pause ends by itself, so its steps are not necessary yet.
+                is_paused = 'stop cause' in node.values
+                steps = () if is_paused else remedy.parse(node.values.get(REMEDY_STEPS, ''))
+                warnings.append(Trouble(f'warning: {name}: {node.message}', steps))
             else:
                 steps = remedy.parse(node.values.get(REMEDY_STEPS, ''))
                 errors.append(Trouble(f'{name}: {node.message}', steps))
@@ -211,6 +223,25 @@ class Situation:
     def _values(self, name: str) -> dict[str, str]:
         node = self._nodes.get(f'{self._here}/{name}')
         return {} if node is None else node.values
+
+    @property
+    def _has_consequences(self) -> bool:
+        """Whether a present anomaly explains `stops.CONSEQUENCES`, which then need no steps.
+
+        Once the anomaly has returned during the same stop, its remedy has not helped. The steps of
+        all causes are advised then, because the anomaly may itself be the consequence of another.
+        """
+        return (
+            self.detected
+            and not self._has_returned
+            and f'{self._here}/estimator' not in self.silent_nodes()
+        )
+
+    def _explains(self, node: Node) -> bool:
+        """Return whether the anomaly explains why a node receives no usable estimates."""
+        # The step for a silent topic is the last one (`NeededTopics`).
+        steps = remedy.parse(node.values.get(REMEDY_STEPS, ''))
+        return self._has_consequences and steps[-1:] == (Step.CHECK_ESTIMATOR,)
 
     def _is_shown(self, name: str, node: Node) -> bool:
         """Return whether `_stops` or `_body` already shows the report of a node."""
@@ -252,10 +283,10 @@ class Situation:
             troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
         if is_stopped and not (is_verifying and is_stopped_by_anomaly):
             text, steps = control.get('remedy', ''), remedy.parse(control.get(REMEDY_STEPS, ''))
-            if is_in_stop and self._finding:
+            if (is_in_stop and self._finding) or (causes and self.detected):
                 # The estimator knows the kind of the finding, and whether the anomaly has ended.
                 explored, known = Step.EXPLORE in steps, of_finding if self.detected else ()
-                steps = tuple(stops.remedy_of(causes, explored, known))
+                steps = tuple(stops.remedy_of(causes, explored, known, self._has_consequences))
                 text = remedy.sentence(steps)
             stop = control.get('stop', cause)
             troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
@@ -306,6 +337,9 @@ class Situation:
         if unknown := values.get(key) or self._values('controller').get(key):
             text = f'length offsets unknown: {unknown}'
             steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
+            of_finding = remedy.parse(values.get(REMEDY_STEPS, ''))
+            if self._has_consequences and Step.CALIBRATE_LENGTHS not in of_finding:
+                steps = ()  # the lengths are calibrated after the anomaly
             if values.get('state') == 'calibrating':
                 steps = CALIBRATION_STEPS if values.get('calibration problem') else ()
                 if not steps and values.get(CALIBRATION) == GENTLE_MOTION and self._stands_still:

@@ -338,6 +338,61 @@ def test_after_a_stop_of_the_exploration_the_remedy_ends_with_exploring_again(si
     assert 'explore' not in bench.report().values['remedy steps']
 
 
+@pytest.mark.parametrize('go_on', ['explore', 'end', 'target'])
+def test_an_arm_that_no_longer_explores_says_so_until_a_request(go_on):
+    bench = Bench(max_age=0.2, hold_time=0.5)
+    bench.core.explore(True)
+    bench.step(50)
+    bench.stop()
+    bench.step(50)
+    assert bench.core.reset(bench.now) is None
+    bench.blind = {'muscles'}
+    bench.step(30)
+    assert bench.core.supervisor.mode == 'paused'
+    reason = bench.core.explore(True)  # refused, but a second try will do
+    assert reason.startswith('paused: muscle_states are too old') and 'try again' in reason
+    bench.blind = set()
+    bench.step(50)
+    report = bench.report()
+    assert report.level == 'warn' and report.values['remedy steps'] == 'explore'
+    assert report.message.startswith('not exploring, mode idle (to go on: call controller/explore')
+    bench.stop()  # a second stop does not hide it
+    assert bench.report().values['remedy steps'].endswith('reset_controller, explore')
+    bench.step(50)
+    assert bench.core.reset(bench.now) is None
+    requests = {
+        'explore': lambda: bench.core.explore(True),
+        'end': lambda: bench.core.explore(False),
+        'target': lambda: bench.target(REST),
+    }
+    requests[go_on]()
+    bench.step(50)
+    assert 'not exploring' not in bench.report().message
+
+
+def test_an_exploration_that_cannot_begin_at_the_start_is_reported_after_the_stop():
+    bench = Bench()
+    bench.stop()
+    assert 'controller/stop' in bench.core.explore_at_start()
+    bench.step(50)
+    assert bench.report().values['remedy steps'] == 'reset_controller, explore'
+    assert bench.core.reset(bench.now) is None
+    assert bench.report().message.startswith('not exploring, mode idle')
+    assert bench.core.explore_at_start() == '' and bench.report().message == 'exploring'
+
+
+def test_an_anomaly_that_has_ended_needs_no_repair():
+    bench = Bench()
+    bench.target(REST)
+    bench.step(50)
+    bench.core.anomaly(True)
+    bench.step(50)
+    assert bench.report().values['remedy steps'].startswith('repair_muscle, reset_estimator')
+    bench.core.anomaly(False)
+    bench.step(50)
+    assert bench.report().values['remedy steps'] == 'reset_controller'
+
+
 def test_a_new_network_keeps_the_correction_of_rest_feedback():
     bench = Bench(first_duration=0.5)
     bench.target(REST)

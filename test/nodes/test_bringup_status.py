@@ -13,7 +13,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC, slow_cause
 from musculoskeletal_ae.nodes.situation import Situation, figures
-from musculoskeletal_ae.remedy import identifiers, sentence
+from musculoskeletal_ae.remedy import Step, identifiers, sentence
 
 
 def diagnostics(
@@ -205,6 +205,65 @@ def test_the_remedy_of_several_causes_repairs_nothing_if_only_lengths_are_off():
         'check_sensor', 'calibrate_lengths', 'reset_controller', 'explore_gently'
     ]  # fmt: skip
     assert 'repair' not in situation.trouble()
+
+
+CONSEQUENCES = StopCause.IMPLAUSIBLE_ESTIMATE, StopCause.STALE_ESTIMATE
+REPAIR_STEPS = ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore']
+
+
+def with_silent_estimates(report):
+    """Return a report of a controller that also receives no usable estimates."""
+    status = report.status[0]
+    steps = next(value for value in status.values if value.key == 'remedy steps')
+    steps.value += ', check_estimator'
+    status.values.append(KeyValue(key=SILENT_TOPIC, value='no usable estimated_joint_states'))
+    return report
+
+
+@pytest.mark.parametrize('first', [StopCause.ANOMALY, *CONSEQUENCES])
+def test_what_follows_from_an_anomaly_needs_no_steps_until_the_anomaly_has_returned(first):
+    situation = Situation('/left')
+    also = [cause for cause in (StopCause.ANOMALY, *CONSEQUENCES) if cause is not first]
+    stop = with_silent_estimates(stopped(first, also=also, explored=True))
+    lengths = {'unknown_length_offsets': 'triceps'}
+    situation.diagnosed(found(Kind.RESIDUAL_DISTANCE, **lengths))
+    situation.diagnosed(stop)
+    assert situation.steps() == REPAIR_STEPS
+    for consequence in ('checkpoint', 'estimator/zero', 'is running', 'no usable'):
+        assert consequence not in situation.trouble()
+    situation.diagnosed(found(None))  # what is still present after the anomaly is necessary
+    after = situation.steps()
+    assert 'repair_muscle' not in after
+    assert {'check_checkpoint', 'calibrate_lengths', 'check_estimator'} <= set(after)
+    situation.diagnosed(found(Kind.RESIDUAL_DISTANCE, **lengths))  # the repair has not helped
+    assert {*REPAIR_STEPS, 'check_checkpoint', 'calibrate_lengths'} <= set(situation.steps())
+    situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
+    situation.diagnosed(stop)
+    assert situation.steps() == REPAIR_STEPS
+
+
+def test_revoked_lengths_are_to_be_calibrated_also_during_an_anomaly():
+    situation = Situation('/left')
+    situation.diagnosed(found(Kind.RESIDUAL_DISTANCE))  # estimator/reset is refused until then
+    situation.diagnosed(stopped(StopCause.ANOMALY, also=[StopCause.LENGTH_OFFSETS_REVOKED]))
+    assert 'calibrate_lengths' in situation.steps()
+
+
+def test_an_arm_that_should_explore_but_does_not_is_shown_with_the_step():
+    situation = Situation('/left')
+    message = f'not exploring, mode idle (to go on: {Step.EXPLORE.text})'
+    values = {'mode': 'idle', 'remedy_steps': 'explore'}
+    situation.diagnosed(diagnostics('/left/controller', message, DiagnosticStatus.WARN, **values))
+    assert situation.trouble() == f'warning: /left/controller: {message}'
+    assert situation.steps() == ['explore']
+
+
+def test_a_pause_is_shown_without_steps_because_it_ends_by_itself():
+    situation = Situation('/left')
+    values = {'mode': 'paused', 'stop_cause': 'stale_estimate', 'remedy_steps': 'check_estimator'}
+    situation.diagnosed(diagnostics('/left/controller', 'paused', DiagnosticStatus.WARN, **values))
+    assert situation.trouble() == 'warning: /left/controller: paused'
+    assert situation.steps() == []
 
 
 def test_a_calibration_that_runs_is_not_to_be_started():
