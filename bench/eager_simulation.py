@@ -135,7 +135,10 @@ class EagerSimulation:
         return length.detach(), torch.autograd.grad(length, angles, tension)[0]
 
     def _hold(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the holding torque (N, D) and its derivative by θ (N, D, D), as in `load.hold`."""
+        """Return the holding torque (N, D) and its derivative with respect to θ (N, D, D).
+
+        `load.hold` computes the same.
+        """
         tree, (placement, first, second) = self.tree, self.poses
         poses = [placement.new_tensor(np.eye(4)).expand(len(theta), 4, 4)]
         for i in range(1, len(tree.parent)):

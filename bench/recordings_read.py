@@ -49,7 +49,8 @@ class Run:
 
     name: str
     load: float  # payload [kg]
-    length: Array  # l, paid-out tendon since the start [m], (N, M); ten times that for the stand
+    #: l, length of tendon paid out since the start [m], (N, M); `continuum_stand` scales it by 10
+    length: Array
     effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
     theta: Array  # θ, which an independent sensor measured [rad], (N, D)
     rests: Array  # first row of each rest, and the row after its last row, (R, 2)

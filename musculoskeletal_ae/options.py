@@ -132,7 +132,7 @@ class Parser(argparse.ArgumentParser):
     def add_seeds(
         self, default: tuple[int, ...] | None, text: str = 'seeds of the emulated individuals'
     ) -> None:
-        """Add `--seeds`, one for each emulated individual."""
+        """Add `--seeds`: one seed for each emulated individual."""
         self.add_argument('--seeds', type=seeds, default=default, metavar='N,…', help=text)
 
     def add_reality(self) -> None:

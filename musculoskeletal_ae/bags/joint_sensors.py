@@ -22,7 +22,7 @@ TEXTS = {
         'Publish θ with the sign that the axis in robot.urdf defines, and record again'
     ),
     ORDER: (
-        'the lengths fit only if these joint sensors are exchanged: {names}. '
+        'the lengths fit only if these joint sensors are swapped with each other: {names}. '
         'Publish each position under the name of its joint, and record again'
     ),
     DEGREES: (

@@ -105,7 +105,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _pay_out(self, m: int) -> None:
-        """Release muscle m, which has run away, or all muscles."""
+        """Release muscle m, which has run away; a subclass may release all muscles instead."""
 
     # -- common parts ---------------------------------------------------------------------------
 

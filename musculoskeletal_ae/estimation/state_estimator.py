@@ -45,7 +45,7 @@ class StateEstimator:
         self.complete_mae: Mae | None = None
 
     def use(self, mae: Mae, isolated: Iterable[int]) -> None:
-        """Use another network, in which these muscles (indices) are isolated."""
+        """Use another network, and isolate the muscles with the indices `isolated` in it."""
         self.complete_mae, self.mae = mae, mae.without(isolated)
 
     def step(self, bone_tension: Array, length: Array) -> Estimate:

@@ -220,7 +220,7 @@ def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[f
 
 
 def forces(_: Study, rows: Rows) -> Plot:
-    """Draw magnitudes and directions of all pushes."""
+    """Plot the estimated over the true magnitude of all pushes, and the error of the direction."""
     keys = 'true', 'estimated', 'free'
     parts = [[row.traces[key] for key in keys] for row in rows.values()]
     true, estimated, free = map(np.concatenate, zip(*parts))

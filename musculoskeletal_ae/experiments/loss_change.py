@@ -5,13 +5,13 @@ Paper (§IV-D). The elbow is bent to 90°, −50 N in z and 50 N in y act on the
 forced to 30°.
 
 Here. The elbow is flexed to 90°. A force of −50 N in z acts on the hand, then one of 50 N in y.
-Then the shoulder is forced to 30° and released. Each preset runs its own simulator on its networks
-before and after learning; preset `paper` minimises L_sim,2 while the shoulder is forced, and
+Then the shoulder is held at 30° and released. Each preset runs its own simulator on its networks
+before and after learning; preset `paper` minimises L_sim,2 while the shoulder is held, and
 L_sim,1 in all other phases. Each preset's `proposed` computes the command that holds the posture,
 with its learned network. The same forces act on an emulated arm with the same command. Its joints
-cannot be forced, so it is compared in the first three phases only. On robots without elbow_pitch
-and shoulder_pitch, joints named elbow and shoulder take their roles, or else the last and the first
-revolute joint.
+cannot be held at an angle, so it is compared in the first three phases only. On robots without
+elbow_pitch and shoulder_pitch, joints named elbow and shoulder take their roles, or else the last
+and the first revolute joint.
 """
 
 from collections.abc import Mapping
@@ -202,8 +202,9 @@ def loss_change(study: Study, rows: Rows) -> Plot:
             both[0].text(at, 1.02, name, transform=both[0].get_xaxis_transform(), **style)
     figure.suptitle(f'individual {seed}: the simulator after learning')
     return figure, (
-        'The simulator after learning while forces act on the hand and a joint is forced. '
-        'Dashed: the emulated arm under the same forces (its joints cannot be forced).'
+        'The simulator after learning: first, forces act on the hand; then a joint is held at a '
+        'given angle. Dashed: the emulated arm under the same forces (its joints cannot be held at '
+        'an angle).'
     )
 
 

@@ -43,7 +43,7 @@ from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS
 
 REALITIES = KIN, FOREIGN
-#: groups of effects of which the ablation removes one at a time
+#: groups of effects; the ablation removes each group in turn
 ABLATED = {
     'route points': ('attachment',),
     'kinks, slip-over': ('kinks', 'slip_over'),
@@ -57,7 +57,8 @@ ABLATED = {
     'joint sensors': ('joint_zero', 'joint_bend', 'backlash'),
     'delays': ('delay', 'jitter', 'dropouts'),
 }
-QUICK = ('friction',)  # groups of effects of which a shortened run removes one at a time
+#: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
+QUICK = ('friction',)
 ABLATION_INDIVIDUALS = 2  # number of individuals whose effects are removed
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'

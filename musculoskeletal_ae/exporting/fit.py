@@ -112,7 +112,10 @@ class _Muscle:
         return solution.x, NOISE * solution.fun[: len(states.length)]
 
     def _linearised(self, parameters: Array, states: _States) -> tuple[Array, Array]:
-        """Return the muscle's lengths [m], (N,), and their derivatives (N, K) by K parameters."""
+        """Return the muscle's lengths [m], (N,), and their derivatives, (N, K).
+
+        The derivatives are those with respect to the K parameters.
+        """
         point = self._routes.point + self.shift(parameters)
         whole, by_point = self._routes.moved(states.poses, point)
         absolute, by_shift = whole[:, 0], by_point.reshape(len(whole), -1)

@@ -85,7 +85,8 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                     if not route or isinstance(route[-1], Wrap):
                         source.note(
                             'dropped',
-                            f'muscle {name}: a {kind} via point, because no point is before it',
+                            f'{kind} via point in the route of {name}, because no fixed point '
+                            'directly precedes it',
                         )
                         continue
                     radius = float(numbers(via.get('radius'), 1, f'{where} radius')[0])
@@ -101,7 +102,10 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
                 route.append(RoutePoint(body, at))
         if route and isinstance(route[-1], Wrap):
             route.pop()
-            source.note('dropped', f'muscle {name}: a wrap, because no point is after it')
+            source.note(
+                'dropped',
+                f'last wrap of the route of {name}, because no fixed point follows it',
+            )
         source.routes[name] = tuple(route)
     if model == 'model.urdf':
         _measure(source)

@@ -196,7 +196,9 @@ def arm_verdict(comparison: Comparison) -> str:
 def check_verdict(check: RobotCheck) -> str:
     """Return a line with the verdict of `check_robot`."""
     held, stiff = (f'{100 * share.mean():.0f} %' for share in (check.held, check.stiff))
-    shares = f'{held} of postures are held, {stiff} are stiff'
+    shares = (
+        f'the muscles can hold the arm in {held} of postures, and it is stiff enough in {stiff}'
+    )
     kinds = Counter(fault.kind for fault in check.faults)
     faults = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
     return f'check_robot: {f"not sound: {faults}" if faults else "sound"}; {shares}'

@@ -86,8 +86,8 @@ class Source:
         self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:
-        """Return the notes about dropped muscles and tendons."""
-        return [note for note in self.notes if re.match(r'dropped: .*(muscle|tendon)', note)]
+        """Return the notes about dropped muscles, tendons and actuators."""
+        return [note for note in self.notes if re.match('dropped: (muscle|tendon|actuator) ', note)]
 
     def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
         """Return a legal, unused name, and add a note if it differs from the original."""

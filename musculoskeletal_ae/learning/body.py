@@ -130,7 +130,7 @@ class Poses(NamedTuple):
 
 
 class CalibratedBody:
-    """Computes muscle lengths of the calibrated body and their derivatives by its `parameters`."""
+    """Computes muscle lengths of the calibrated body, and derivatives for its `parameters`."""
 
     def __init__(
         self,

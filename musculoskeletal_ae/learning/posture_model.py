@@ -54,7 +54,8 @@ class Residuals(NamedTuple):
     load: Array
     angle: Array  # residuals of the angles [rad], (N, D); 0 where no angle was measured
     gravity: Array  # residuals of the directions of gravity, (N, 3J)
-    gravity_by_posture: Array  # derivative of the directions of gravity by θ, (N, 3J, D)
+    #: derivative of the directions of gravity with respect to θ, (N, 3J, D)
+    gravity_by_posture: Array
 
 
 class Bent(NamedTuple):

@@ -190,12 +190,14 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     """
     if added := [name for name in robot.muscles if name not in state.muscles]:
         raise StateError(
-            'only the saved samples are used, because the saved network lacks the muscles '
-            f'{", ".join(added)}'
+            f'the saved network lacks the muscles {", ".join(added)}, so only the saved samples '
+            'are used'
         )
     if state.network is None:
         return None
     try:
-        return checkpoint.from_bytes(state.network, robot, 'the saved network')
+        return checkpoint.restored(state.network, robot)
     except CheckpointError as error:
-        raise StateError(f'only the saved samples are used, because {error}') from error
+        raise StateError(
+            f'the saved network cannot be used, so only the saved samples are used; reason: {error}'
+        ) from error

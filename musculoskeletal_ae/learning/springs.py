@@ -50,7 +50,9 @@ def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
 
 
 def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) -> Array:
-    """Return the derivatives of K θ − b by all α and then by all β of `joints`, (N, D, 2 · joints).
+    """Return the derivatives of K θ − b with respect to α and β, (N, D, 2 · joints).
+
+    The derivatives with respect to α of all `joints` come first, then those with respect to β.
 
     Args:
         nominal: The springs that muscles.yaml states.

@@ -115,7 +115,7 @@ class StateStore:
         except OSError as error:
             raise StateError(
                 f'{self.directory}: an unusable state cannot be kept as a backup ({error}); '
-                'free disk space, or set another state_directory'
+                'free disk space or make the directory writable, or set another state_directory'
             ) from error
 
     def _load(self, samples: SampleStore) -> Mae | None:
@@ -147,7 +147,7 @@ class StateStore:
             return None
 
     def _note_backup(self, problem: object, backup: Path) -> None:
-        note = f'{problem} (kept as {backup})'
+        note = f'{problem}; the state is kept as {backup}'
         self.not_used = f'{self.not_used}; {note}' if self.not_used else note
 
     # -- writing --------------------------------------------------------------------------------
@@ -188,7 +188,8 @@ class StateStore:
         except OSError as error:
             raise StateError(
                 'the state is saved with samples and network, but the network could not also be '
-                f'written to {self.directory / NETWORK} ({error}); free disk space and try again'
+                f'written to {self.directory / NETWORK} ({error}); free disk space or make the '
+                'directory writable, and try again'
             ) from error
 
     def trouble(self, samples: SampleStore) -> str:
@@ -218,7 +219,7 @@ class StateStore:
         except OSError as error:
             raise StateError(
                 f'{self.directory}: no backup can be made ({error}); nothing was replaced. Free '
-                'disk space and try again'
+                'disk space or make the directory writable, and try again'
             ) from error
         if reason:
             self._note_backup(reason, backup)

@@ -200,12 +200,25 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
         CheckpointError: If the checkpoint is invalid or does not fit the robot.
     """
     try:
-        meta = _metadata(data)
-        mae = _mae(meta, _tensors(data, meta))
-        if robot is not None:
-            _check_fit(mae, robot)
+        return restored(data, robot)
     except CheckpointError as error:
         raise _refused(source, str(error)) from error.__cause__
+
+
+def restored(data: bytes, robot: Robot | None = None) -> Mae:
+    """Return the network like `from_bytes`, with errors that state only the problem.
+
+    Args:
+        data: The bytes.
+        robot: See `from_bytes`.
+
+    Raises:
+        CheckpointError: The problem, without the name of the checkpoint and without a remedy.
+    """
+    meta = _metadata(data)
+    mae = _mae(meta, _tensors(data, meta))
+    if robot is not None:
+        _check_fit(mae, robot)
     return mae
 
 
@@ -261,8 +274,12 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f'not valid safetensors ({error})') from error
     shapes = meta.tensor_shapes()
-    if odd := tensors.keys() ^ shapes.keys():
-        raise CheckpointError(f'tensors missing or unknown: {", ".join(sorted(odd))[:200]}')
+    for problem, names in (
+        ('missing tensors', shapes.keys() - tensors.keys()),
+        ('unknown tensors', tensors.keys() - shapes.keys()),
+    ):
+        if names:
+            raise CheckpointError(f'{problem}: {", ".join(sorted(names))[:200]}')
     for name, value in tensors.items():
         if value.dtype != np.float64:
             raise CheckpointError(f'tensor {name} has type {value.dtype}; legal: float64')

@@ -262,7 +262,7 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
 
 
 def _motor_value(name: str, value: Any) -> Any:
-    """Return the checked value of a motor parameter; ROS checks it only for nodes."""
+    """Check and return the value of a motor parameter, which ROS checks only for nodes."""
     parameter = MOTORS[name]
     is_list = isinstance(parameter.default, tuple)
     words = value if isinstance(value, list) else [value]

@@ -316,7 +316,7 @@ class Situation:
             since = f'no report for {max(silent.values()):.0f} s'
             advice = f'perhaps the computer is overloaded (load {load_text()})'
             return [
-                f'{names}: {since}; {advice}; if it lasts, see their logs and restart bringup.sh'
+                f'{names}: {since}; {advice}; if it persists, see their logs and restart bringup.sh'
             ]
         return [
             f'{name}: no report for {silence:.0f} s; see its log, then restart the node or '

@@ -448,7 +448,7 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
 def _holding_faults(
     robot: Robot, stiffness: Array, least: float, softest: Ints, missing: Array
 ) -> Iterator[Finding]:
-    """Yield a fault if too few postures are held, and one if too few are stiff.
+    """Yield a fault if the muscles hold the arm in too few postures, or it is stiff in too few.
 
     Args:
         robot: The robot.

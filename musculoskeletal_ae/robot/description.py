@@ -51,7 +51,7 @@ LEAST_EIGENVALUE = -1e-9
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
 STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
 SPEED_DEFAULT = 0.1  # speed of a position-controlled module [m/s]
-#: scale of a motor current in `with_modules` [N/A]: 0.03 N·m/A, a gear of 20 and a spool of 10 mm
+#: scale of a motor current in `with_modules` [N per A]: 0.03 N·m/A, gear of 20, spool of 10 mm
 NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (
     'the tension is unknown, so these are not available: contact estimation, tension control, the '
@@ -166,7 +166,7 @@ class RobotDescription:
         if not self.tension_source.is_known:
             lines.append(f'tension_source is none: {NO_TENSION}')
         if (scale := self.tension_source.newton_per_ampere) is not None:
-            lines.append(f'tension_source is current, {shown(scale)} N/A: {BY_CURRENT}')
+            lines.append(f'tension_source is current, {shown(scale)} N per A: {BY_CURRENT}')
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines

@@ -54,7 +54,7 @@ class DriveEntry(Strict, frozen=True):
 
     @property
     def newton_per_ampere(self) -> float:
-        """Tension per current without friction [N/A]."""
+        """Tension per current without friction [N per A]."""
         return self.torque_constant * self.gear / self.spool_radius
 
 

@@ -26,7 +26,7 @@ class TensionSource:
 
     Attributes:
         kind: SENSOR, CURRENT or NONE.
-        newton_per_ampere: k_t n / r of each muscle [N/A], (M,); None unless `kind` is CURRENT.
+        newton_per_ampere: k_t n / r of each muscle [N per A], (M,); None unless `kind` is CURRENT.
     """
 
     kind: str = SENSOR

@@ -116,7 +116,7 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
 
 @njit(cache=True)
 def _beyond_rim(distance: float, r: float) -> float:
-    """Return a distance from the centre; for a point on the rim, return the radius exactly."""
+    """Return `distance` from the centre [m], or exactly r if the two differ by at most RIM · r."""
     return r if abs(distance - r) <= RIM * r else distance
 
 

@@ -109,7 +109,7 @@ class PresumedRupture:
         self._slack = LIMITS.slack_share * robot.description.tension.bias
         #: for which muscles a rupture is presumed, (M,)
         self._presumed: Bools = np.zeros(robot.muscle_count, dtype=bool)
-        #: time since when each of these muscles pulls again [s], (M,); ∞ if it does not pull
+        #: time at which each of these muscles began to pull again [s], (M,); ∞ if it does not pull
         self._taut_since: Array = np.full(robot.muscle_count, math.inf)
 
     def explains(self, jump: Jump, tension: Array, used: Bools) -> bool:

@@ -157,7 +157,7 @@ def combine(shares: Array, rows: Array, total: Array) -> None:
 def add_slopes(
     limbs: Limbs, theta: Array, tension: Array, jacobian: Array, curvature: Array
 ) -> None:
-    """Compute the derivatives of the lengths by θ from the cubics of all limbs (see `Slopes`).
+    """Compute derivatives of the lengths with respect to θ from cubics of all limbs (see `Slopes`).
 
     Args:
         limbs: The cubics.

@@ -68,7 +68,7 @@ def of(arm: int, vectors: Array) -> Vector:
 
 @njit(cache=True)
 def polynomial(terms: Array, order: int, x: float) -> float:
-    """Return the polynomial Σ terms_k xᵏ (order 0), or its first or second derivative by x."""
+    """Return the polynomial Σ terms_k xᵏ (order 0), or its first or second derivative at x."""
     value = 0.0
     for k in range(len(terms) - 1, order - 1, -1):
         factor = 1.0

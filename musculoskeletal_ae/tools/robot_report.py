@@ -80,10 +80,12 @@ def _suggested(robot: Robot, args: Namespace) -> int:
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
-    """Return the part of the report that says how many postures are held and how many are stiff."""
+    """Return the part of the report on the shares of postures that are held and stiff enough."""
     count, held = len(result.setting.theta), result.held
     share = f'{100 * REQUIRED_SHARE:.0f} %'
-    need = f'{share} of the postures must be held, and {share} must be stiff'
+    need = (
+        f'the muscles must hold the arm in {share} of postures; it must be stiff enough in {share}'
+    )
     required = required_stiffness(robot, result.required)
     desired = DESIRED_SHARE * robot.tension.limit
     tension = f'T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N'

@@ -309,11 +309,16 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
     cardsflow.write_text(text.replace('</viaPoint></link></myo', f'</viaPoint>{wrap}</link></myo'))
     result = import_robot(cardsflow, tmp_path / 'out')
     assert (result.robot.muscles, result.comparison) == (('front', 'back'), ({}, {}, {}))
-    assert 'dropped: muscle front: a wrap, because no point is after it' in result.notes
     assert (
-        'dropped: muscle front: a SPHERICAL via point, because no point is before it'
+        'dropped: last wrap of the route of front, because no fixed point follows it'
         in result.notes
     )
+    assert (
+        'dropped: SPHERICAL via point in the route of front, because no fixed point directly '
+        'precedes it' in result.notes
+    )
+    with pytest.raises(SourceError, match=r'no muscle remains; dropped: muscle still: .*joint$'):
+        import_robot(cardsflow, tmp_path / 'none', without=('front', 'back'))
     cardsflow.write_text('<cardsflow/>')
     with pytest.raises(SourceError, match=r'has no muscle with a route$'):
         read_source(cardsflow)

@@ -220,7 +220,8 @@ def test_a_network_that_cannot_be_used_does_not_cost_the_samples(tmp_path, arm26
     loaded, mae, not_used = read(tmp_path, arm26)
     assert_same(loaded, store)
     assert mae is None
-    assert 'not safetensors' in not_used and BACKUP in not_used
+    assert 'reason: not safetensors' in not_used and BACKUP in not_used
+    assert 'make one with `train`' not in not_used
     again, _, not_used = read(tmp_path, arm26)
     assert_same(again, store)
     assert not_used == ''

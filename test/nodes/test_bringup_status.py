@@ -392,7 +392,7 @@ def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
     assert second('sim', 'learner') == ('ok', '')
     situation.diagnosed(diagnostics('/left/second', 'wrong', DiagnosticStatus.ERROR))
     assert second('sim', 'learner')[1] == '/left/second: wrong'
-    for _ in range(6):  # a node that is not part of the arm may end without becoming an error
+    for _ in range(6):  # a node that is not part of the arm may end without being reported
         second('sim', 'learner')
     assert second('sim', 'learner') == ('ok', '')
 

@@ -21,7 +21,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 from musculoskeletal_ae.validity import read_muscle_states
 
 DRIVE = {'torque_constant': 0.05, 'gear': 20.0, 'spool_radius': 0.01}
-PER_AMPERE = 100.0  # tension per motor current of DRIVE [N/A]
+PER_AMPERE = 100.0  # tension per motor current of DRIVE [N per A]
 BY_CURRENT = {'actuation': 'position', 'tension_source': 'current'}
 ROBOT = Robot(with_modules(Robot.load('arm26').description, **BY_CURRENT))
 COUNT = ROBOT.muscle_count
@@ -46,7 +46,7 @@ def test_torque_constant_gear_and_radius_convert_a_current_to_a_tension(tmp_path
     states = read_muscle_states(array(rows), count, source=robot.tension_source)
     np.testing.assert_allclose(states[1], 0.5 * scale)
     np.testing.assert_allclose(robot.tension_source.to_message(states[1]), 0.5)
-    assert any('100–200 N/A' in line for line in robot.description.joint_notes)
+    assert any('100–200 N per A' in line for line in robot.description.joint_notes)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ COOL = 60.0  # largest temperature of a cool winding [°C]
 
 
 class ThermalDrift(Detector):
-    """Reports modules that have changed and are hot."""
+    """Reports modules whose thermal constants have changed and whose windings are hot."""
 
     def __init__(self, heat: Heat) -> None:
         self._heat = heat
@@ -25,7 +25,7 @@ class ThermalDrift(Detector):
         self._heat.accept(*muscles)
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
-        """Report a module that has changed according to the thermal model and is hot."""
+        """Report a module whose thermal constants have changed and whose winding is hot."""
         for muscle, change in self._heat.changed.items():
             if self._heat.core[muscle] > COOL:
                 return Finding(muscle, Kind.THERMAL_DRIFT, f'its module {change}')

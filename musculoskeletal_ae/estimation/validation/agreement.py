@@ -95,7 +95,7 @@ class AgreementCheck:
         self._has_learned = in_use.covariance is not None
 
     def comparisons(self, mae: Mae) -> list[Comparison]:
-        """Return all comparisons of a candidate."""
+        """Compare a candidate with the joint sensors, or else with the network in use."""
         if not self._messages.are_enough:
             theta, tension = self._postures.theta, self._postures.tension
             length = self._in_use.lengths(theta, tension)
