@@ -185,6 +185,7 @@ class View(Node):
                 self.reported_at = now
                 state = 'viewed' if is_viewed else 'the page has no visitors'
                 self.diagnostics.tell(Report('ok', state, {}), self.reception.take_rates())
+            self.page.send_entries()
             while not self.requests.empty():  # also after the last visitor has left
                 what, *value = self.requests.get()
                 try:
@@ -369,6 +370,8 @@ class View(Node):
                 self._ask(service, parameters=[parameter])
             case 'reset':
                 self._reset()
+            case 'refused':
+                self.page.notify(value, False)
             case 'controller/explore':
                 self._ask(what, data=True)
             case 'end exploring':

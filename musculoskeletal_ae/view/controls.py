@@ -4,10 +4,12 @@
 Requests of visitors call `act` in viser's threads, with the name of the request and its value:
 
     targets {joint: rad} · hand xyz [m] · reset · push xyz [N] · rupture name · repair name
-    payload kg · position s · end exploring · or the name of a service without a value
+    payload kg · position s · end exploring · refused text
+    or the name of a service without a value
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -16,12 +18,14 @@ import viser
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view.body import Kind
+from musculoskeletal_ae.view.entries import Entries, Key
 from musculoskeletal_ae.view.scene import Scene
 
 EXPLORE, END_EXPLORING = 'Explore', 'End exploring'
 RESET, RESTORE = 'Reset after a stop', 'Restore isolated muscles'
 RUPTURE, REPAIR = 'Rupture', 'Repair'
 CALIBRATE = 'Find the length offsets'
+PAYLOAD, POSITION = 'payload [kg]', 'at [s]'  # labels of sliders
 #: phrases in remedies of stops, and the button for each; longer phrases first
 BUTTONS = {
     'call estimator/reset; call controller/reset': RESET,
@@ -34,6 +38,14 @@ BUTTONS = {
 PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
 MOST_PUSH = 60.0  # largest force of a push with the mouse [N]
 MOST_PAYLOAD = 5.0  # largest payload that a visitor can choose [kg]
+#: requests after which values that are still being entered are not sent
+COMMANDS = (
+    'controller/stop', 'controller/explore', 'end exploring', 'reset', 'hand', 'estimator/zero',
+    'estimator/restore',
+)  # fmt: skip
+#: change of the estimate, as a share of the joint's range, that a slider does not follow; otherwise
+#: the noise of an arm at rest would change a number while somebody begins to type
+REST_SHARE = 0.02
 
 
 def with_buttons(text: str) -> str:
@@ -48,6 +60,7 @@ class Controls:
 
     Attributes:
         sliders: Handle of each joint's slider.
+        payload: Handle of the payload's slider.
     """
 
     def __init__(
@@ -56,6 +69,10 @@ class Controls:
         """Build the controls; `act` is called with the requests of visitors."""
         self._gui, self._robot, self._scene, self._act = server.gui, robot, scene, act
         self._is_targeted = False  # whether the sliders show a visitor's target
+        self._entries = Entries()  # values that visitors are entering at sliders
+        self._sliders: dict[Key, Any] = {}  # handles of all sliders
+        self._settled: dict[Key, float] = {}  # last value that was followed or sent
+        self._entered: dict[Key, float] = {}  # last value that was followed or entered
         self._is_pushing = False
         #: controls of each node, which are shown while the node runs
         self._of_node: dict[str, Any] = {
@@ -70,23 +87,45 @@ class Controls:
     def _connect(self, register: Any, what: str, value: Any = None) -> None:
         def on_event(event: Any) -> None:
             if event.client is not None:  # without a client, `follow` has set the control
-                if what in ('targets', 'hand'):
-                    self._is_targeted = True
-                self._act(what, *[value(event)] if value else [])
+                self.request(what, *[value(event)] if value else [])
 
         register(on_event)
+
+    def request(self, what: str, *value: Any) -> None:
+        """Pass on the request of a visitor, other than that of a slider."""
+        if what in COMMANDS:
+            self._entries.discard()
+        if what == 'hand':
+            self._is_targeted = True
+        self._act(what, *value)
 
     def _button(self, label: str, what: str, value: Any = None, color: Any = None) -> Any:
         made = self._gui.add_button(label, color=color)
         self._connect(made.on_click, what, value)
         return made
 
-    def _slider(
-        self, label: str, low: float, high: float, step: float, what: str, value: Any
-    ) -> Any:
+    def _slider(self, label: str, low: float, high: float, step: float, what: str) -> Any:
         made = self._gui.add_slider(label, low, high, step, min(max(0.0, low), high))
-        self._connect(made.on_update, what, value)
+        key = what, label
+        self._sliders[key], self._settled[key], self._entered[key] = made, made.value, made.value
+
+        async def on_update(event: Any) -> None:  # viser calls coroutines in order
+            if event.client is None:  # `follow` or `send_entries` has set the slider
+                return
+            self._is_targeted = self._is_targeted or what == 'targets'
+            value, before = float(made.value), self._entered[key]
+            # When a visitor leaves the box, the browser replaces a number beyond a limit by the
+            # limit. Keep the number, so that it is refused: the arm must not go to the limit.
+            if value == min(max(before, made.min), made.max):
+                value = before
+            self._entered[key] = value
+            self._entries.change(key, value, monotonic())
+
+        made.on_update(on_update)
         return made
+
+    def _set(self, key: Key, value: float) -> None:
+        self._settled[key] = self._entered[key] = self._sliders[key].value = value
 
     def _build_arm(self) -> Any:
         robot, button = self._robot, self._button
@@ -108,8 +147,7 @@ class Controls:
             steps = np.array([float(f'1e-{n}') for n in places])
             limits = np.ceil(robot.lower / steps) * steps, np.floor(robot.upper / steps) * steps
             self.sliders = [
-                self._slider(joint, low, high, step, 'targets', lambda e, j=joint: {j: _chosen(e)})
-                for joint, low, high, step in zip(robot.joints, *limits, steps)
+                self._slider(*each, 'targets') for each in zip(robot.joints, *limits, steps)
             ]
         return folder
 
@@ -123,12 +161,12 @@ class Controls:
             self._muscle.on_update(lambda event: self._pick(_chosen(event)))
             button(RUPTURE, 'rupture', lambda _: self._muscle.value, 'orange')
             button(REPAIR, 'repair', lambda _: self._muscle.value, 'gray')
-            self._payload = self._slider('payload [kg]', 0.0, MOST_PAYLOAD, 0.1, 'payload', _chosen)
+            self.payload = self._slider(PAYLOAD, 0.0, MOST_PAYLOAD, 0.1, 'payload')
         return folder
 
     def _build_replay(self) -> Any:
         with self._gui.add_folder('Recording') as folder:
-            self._timeline = self._slider('at [s]', 0.0, 1.0, 0.1, 'position', _chosen)
+            self._timeline = self._slider(POSITION, 0.0, 1.0, 0.1, 'position')
             self._button('Pause', 'replay/pause')
             self._button('Play', 'replay/resume')
         return folder
@@ -156,33 +194,55 @@ class Controls:
             self._gizmo.visible = False
         self._restore.visible = bool((self._scene.kinds == Kind.ISOLATED).any())
         self._explore.visible, self._end_exploring.visible = not explores, explores
-        self._is_targeted = self._is_targeted and not explores
+        is_free = explores and not self._entries.are_recent('targets', monotonic())
+        self._is_targeted = self._is_targeted and not is_free
 
     def draw(self, theta: Array) -> None:
         """Draw the handle of the hand at the posture θ [rad] (D,), unless a visitor drags it."""
         if not self._is_pushing:
             self._ball.position = self._robot.kinematics.end_effector_pose(theta).translation
 
+    def send_entries(self) -> None:
+        """Request the values that visitors have finished entering at sliders."""
+        for key, value in self._entries.take(monotonic()).items():
+            (what, label), slider = key, self._sliders[key]
+            if slider.min <= value <= slider.max:
+                self._settled[key] = value
+                self._act(what, {label: value} if what == 'targets' else value)
+            else:
+                legal = f'{slider.min:g} to {slider.max:g}'
+                self._act('refused', f'{label}: expected {legal}, got {value:g}')
+                self._set(key, self._settled[key])
+
     def follow(self, theta: Array | None, payload: float, played: Sequence[float] | None) -> None:
         """Update the controls.
 
         Args:
-            theta: The estimated θ [rad] (D,), which the sliders show until a visitor sets a target.
+            theta: The estimated θ [rad] (D,), which the sliders show until a visitor changes one.
             payload: Payload of the emulated arm [kg].
             played: Position and length of the replay [s]; None without a replay.
         """
         if theta is not None and not self._is_targeted:
-            for angle, slider in zip(theta, self.sliders):
+            for joint, angle, slider in zip(self._robot.joints, theta, self.sliders):
+                span = slider.max - slider.min
+                if abs(angle - slider.value) <= max(REST_SHARE * span, slider.step):
+                    continue
                 near = round(np.clip(angle, slider.min, slider.max) / slider.step) * slider.step
-                slider.value = float(np.clip(near, slider.min, slider.max))
+                self._set(('targets', joint), float(np.clip(near, slider.min, slider.max)))
             self._gizmo.position = self._robot.kinematics.end_effector_pose(theta).translation
-        self._payload.value = round(min(max(payload, 0.0), MOST_PAYLOAD), 1)
-        if played is not None:
+        now = monotonic()
+        if not self._entries.are_recent('payload', now):
+            self._set(('payload', PAYLOAD), round(min(max(payload, 0.0), MOST_PAYLOAD), 1))
+        if played is not None and not self._entries.are_recent('position', now):
             self._timeline.max = round(max(played[1], 0.1), 1)
-            self._timeline.value = round(min(played), 1)
+            self._set(('position', POSITION), round(min(played), 1))
 
-    def end_push(self) -> None:
-        """End a push, because its visitor may have left; the next event of a drag resumes it."""
+    def end_visit(self) -> None:
+        """Forget values that are being entered, and end a push: their visitor may have left.
+
+        The next event of a drag resumes the push.
+        """
+        self._entries.discard()
         if self._is_pushing:
             self._is_pushing = self._force.visible = False
             self._act('push', np.zeros(3))

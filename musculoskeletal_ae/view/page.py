@@ -96,7 +96,7 @@ class Page:
     def _on_disconnect(self, client: viser.ClientHandle) -> None:
         self._readings.pop(client.client_id, None)
         if self.controls is not None:
-            self.controls.end_push()
+            self.controls.end_visit()
         if not self._readings:
             self.looked_at.clear()
 
@@ -185,3 +185,8 @@ class Page:
         """Update the controls; see `Controls.follow`."""
         if self.controls is not None:
             self.controls.follow(self.scene.posture.get('estimated'), payload, played)
+
+    def send_entries(self) -> None:
+        """Request the values that visitors have finished entering; see `Controls`."""
+        if self.controls is not None:
+            self.controls.send_entries()

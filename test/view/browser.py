@@ -152,6 +152,20 @@ class Browser:
         )
         return result[0], result[1]
 
+    def type_at(self, slider: str, text: str) -> None:
+        """Replace the number in the box of the slider with the label `slider`, key by key."""
+        find = (
+            '(() => { const label = [...document.querySelectorAll("label")].find('
+            f'each => each.innerText.trim() === {json.dumps(slider)}); if (!label) return false;'
+            'let row = label, box = null; while (row && !box) { row = row.parentElement;'
+            'box = row && row.querySelector("input.mantine-NumberInput-input"); }'
+            'if (!box) return false;'
+            'box.scrollIntoView({block: "center"}); box.focus(); box.select(); return true; })()'
+        )
+        self._wait(lambda: self.evaluate(find), f'the number box of {slider}')
+        for key in text:
+            self.call('Input.insertText', text=key)
+
     def close_notifications(self) -> None:
         """Close notifications that cover the arm, such as a warning of a missing graphics card."""
         button = '.mantine-Notification-closeButton'

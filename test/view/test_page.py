@@ -7,6 +7,7 @@ import socket
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from urllib.request import Request, urlopen
 
 import numpy as np
@@ -31,6 +32,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.view import controls
+from musculoskeletal_ae.view.entries import SETTLE_TIME
 from musculoskeletal_ae.view.page import Page
 from musculoskeletal_ae.view.readings import History, scale_top
 from view.browser import Browser, find_chromium
@@ -220,6 +223,8 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         assert not targets and not any(message.data for message in detected)
         page.click(*page.centre('End exploring'))
         graph.wait(lambda: modes[-1].data == 'idle', 'the end of the exploration')
+        page.type_at('elbow', '-1.2')
+        graph.wait(lambda: targets and list(targets[-1].position) == [-1.2], 'the target')
         page.click(*page.centre('Explore'))
         see('exploring')
         page.click(*page.centre('Rupture'))
@@ -317,10 +322,118 @@ def test_a_browser_can_change_only_the_values_of_controls(graph, arm26):
             for updates in {'update_cb': []}, 5, {'value': float(slider.max)}:
                 mine.send(msgspec.msgpack.encode({**control, 'updates': updates}))
             # A legal value must not only move the slider, but also request a target.
-            graph.wait(lambda: asked, 'what the visitor asked for')
+            graph.wait(lambda: page.send_entries() or asked, 'what the visitor asked for')
         assert asked == [('targets', {arm26.joints[0]: pytest.approx(slider.max)})]
     finally:
         page.close()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Return the clock [s] of the controls, which only the test advances."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(controls, 'monotonic', lambda: clock.now)
+    return clock
+
+
+@pytest.fixture
+def entering(arm26, graph, clock):
+    """Return a page, its visitor's requests, and a function that enters values at a slider."""
+    port, asked = free_port(), []
+    page = Page(arm26, '127.0.0.1', port, False, lambda *what: asked.append(what))
+    try:
+        with ThreadPoolExecutor(1) as aside, visit(port, f'http://localhost:{port}') as mine:
+            aside.submit(read, mine)
+            mine.send(msgspec.msgpack.encode({'type': 'ViewerCameraMessage', **CAMERA}))
+            graph.wait(page.looked_at.is_set, 'the visitor to be counted')
+
+            def enter(slider: Any, *values: float) -> None:
+                change = {'type': 'GuiUpdateMessage', 'uuid': slider._impl.uuid}
+                for value in map(float, values):
+                    updates = {'value': value}
+                    mine.send(msgspec.msgpack.encode({**change, 'updates': updates}))
+                graph.wait(lambda: slider.value == values[-1], 'the page to receive the values')
+
+            yield page, asked, enter
+    finally:
+        page.close()
+
+
+def follow(page: Page, elbow: float) -> None:
+    """Let the page follow an estimate."""
+    theta = np.array([0.0, elbow])
+    page.draw({'estimated': theta}, np.full(6, 30.0), np.zeros(6, dtype=int))
+    page.follow(0.0, None)
+
+
+def test_a_number_is_sent_when_it_is_complete_and_is_not_overwritten_before(arm26, entering, clock):
+    page, asked, enter = entering
+    slider, elbow = page.controls.sliders[-1], arm26.joints[-1]
+    follow(page, -0.5)
+    assert slider.value == pytest.approx(-0.5)
+    follow(page, -0.51)  # noise of the estimate must not change the box while somebody uses it
+    assert slider.value == pytest.approx(-0.5)
+    for number in -1.0, -1.2:
+        enter(slider, number)
+        clock.now += 0.9 * SETTLE_TIME
+        # The mode of the controller may be a second old: this must not revive the following.
+        page.offer(['controller'], explores=True)
+        follow(page, -0.7)
+        page.send_entries()
+        assert slider.value == number and asked == []
+    clock.now += 0.2 * SETTLE_TIME
+    for _ in range(2):
+        page.send_entries()
+        follow(page, -0.7)
+        assert slider.value == -1.2 and asked == [('targets', {elbow: -1.2})]
+
+
+@pytest.mark.parametrize('is_left', [False, True], ids=['in the box', 'left the box'])
+def test_a_number_beyond_the_limits_is_refused_and_taken_back(arm26, entering, clock, is_left):
+    page, asked, enter = entering
+    slider, elbow = page.controls.sliders[-1], arm26.joints[-1]
+    follow(page, -0.5)
+    # When the visitor leaves the box, the browser clamps the number to the limit.
+    enter(slider, -1.0, -12.0, *[slider.min] * is_left)
+    clock.now += SETTLE_TIME
+    page.send_entries()
+    legal = f'{slider.min:g} to {slider.max:g}'
+    assert asked == [('refused', f'{elbow}: expected {legal}, got -12')]
+    assert slider.value == pytest.approx(-0.5)
+
+
+def test_a_payload_is_sent_when_it_is_complete_and_is_not_overwritten_before(entering, clock):
+    page, asked, enter = entering
+    for mass in 2.0, 2.5:
+        enter(page.controls.payload, mass)
+        page.send_entries()
+        page.follow(0.0, None)
+        assert page.controls.payload.value == mass and asked == []
+    clock.now += SETTLE_TIME
+    page.send_entries()
+    page.follow(0.0, None)  # the emulator has not answered yet
+    assert page.controls.payload.value == 2.5
+    assert asked == [('payload', 2.5)]
+
+
+def test_a_dragged_slider_is_followed_at_once(entering, arm26):
+    page, asked, enter = entering
+    enter(page.controls.sliders[-1], *np.arange(-30, -20) / 25.0)
+    page.send_entries()
+    assert asked == [('targets', {arm26.joints[-1]: pytest.approx(-0.84)})]
+
+
+@pytest.mark.parametrize('is_stop', [True, False], ids=['stop', 'departure'])
+def test_a_stop_or_departure_discards_a_target_that_is_being_entered(entering, clock, is_stop):
+    page, asked, enter = entering
+    enter(page.controls.sliders[-1], -1.0)
+    if is_stop:
+        page.controls.request('controller/stop')
+    else:
+        page._on_disconnect(SimpleNamespace(client_id=-1))
+    clock.now += SETTLE_TIME
+    page.send_entries()
+    assert asked == [('controller/stop',)] * is_stop
 
 
 def test_a_push_ends_when_its_visitor_leaves(arm26):
