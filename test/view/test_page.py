@@ -337,7 +337,7 @@ def clock(monkeypatch):
 
 
 @pytest.fixture
-def entering(arm26, graph, clock):
+def entering(arm26, graph):
     """Return a page, its visitor's requests, and a function that enters values at a slider."""
     port, asked = free_port(), []
     page = Page(arm26, '127.0.0.1', port, False, lambda *what: asked.append(what))
@@ -416,6 +416,7 @@ def test_a_payload_is_sent_when_it_is_complete_and_is_not_overwritten_before(ent
     assert asked == [('payload', 2.5)]
 
 
+@pytest.mark.usefixtures('clock')
 def test_a_dragged_slider_is_followed_at_once(entering, arm26):
     page, asked, enter = entering
     enter(page.controls.sliders[-1], *np.arange(-30, -20) / 25.0)
