@@ -9,6 +9,7 @@ prints one line and ends with status 1.
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -21,6 +22,8 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.stop_signals import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
+#: exit status after the reader of the output has closed it, as of other tools: 128 + SIGPIPE
+CLOSED = 141
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
 T = TypeVar('T')
 
@@ -173,12 +176,20 @@ def exit_status(
 
     For MusculoskeletalError, OSError and the exceptions in `also`, print one line and return 1.
     After Ctrl-C, print one line and return INTERRUPTED. The line is the text of the
-    KeyboardInterrupt, or says whether `out`, the file or directory of results, was written.
+    KeyboardInterrupt, or says whether `out`, the file or directory of results, was written. If the
+    reader of the output has closed it, as `head` does, print nothing and return CLOSED.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     before = _versions(out)
     try:
-        return work() or 0
+        status = work() or 0
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError as error:
+        if _is_stdout_closed():
+            return CLOSED
+        print(f'error: {error}', file=sys.stderr)
+        return 1
     except refused as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
@@ -191,6 +202,16 @@ def exit_status(
             kept = f'; {out} was {"not " if _versions(out) == before else ""}written'
         print(f'interrupted{kept}', file=sys.stderr)
         return INTERRUPTED
+
+
+def _is_stdout_closed() -> bool:
+    """Return whether the reader of stdout has closed it; if so, discard the rest of the output."""
+    try:
+        print(flush=True)  # fails even if the text that could not be written was discarded
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def _versions(out: Path | None) -> dict[Path, int]:

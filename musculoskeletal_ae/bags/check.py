@@ -5,6 +5,7 @@ from array import array
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -14,6 +15,11 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
+from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.collector import SampleCollector
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.settings import DEFAULT
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -66,14 +72,46 @@ def check_bag(
         name: _fit(bag, name, namespace, motors)
         for name in ([robot] if robot else shipped_robots())
     }
-    fits = [name for name, (faults, _) in results.items() if not faults]
+    fits = [name for name, fit in results.items() if not fit.faults]
     if robot:
-        check.faults += results[robot][0]
+        check.faults += results[robot].faults
     if fits:
-        check.lines += results[fits[0]][1]
+        check.lines += results[fits[0]].notes
+        check.lines.append(results[fits[0]].motion)
     if fits or not robot:
         check.lines.append(f'fits: {", ".join(fits) or "none of the shipped robots (see --robot)"}')
     return check
+
+
+def motion_text(robot: Robot, recording: Pairs) -> str:
+    """Return how many resting postures `train --from-bag` can learn from, as a text for users."""
+    samples = _resting_postures(robot, recording)
+    least = preset_named('default').least_samples
+    text = f'different resting postures to learn from: {samples}'
+    if samples >= least:
+        return text
+    return (
+        f'{text}; too little motion for `train --from-bag`, which needs at least {least}. Record '
+        'an arm that moves from posture to posture and rests in each, as with controller/explore'
+    )
+
+
+def _resting_postures(robot: Robot, recording: Pairs) -> int:
+    radian = robot.kinematics.radian
+    samples = SampleStore(DEFAULT, radian=radian)
+    healthy = Reservoir(robot.muscle_count, 0, DEFAULT, radian=radian)
+    collector = SampleCollector(robot, samples, healthy, DEFAULT)
+    isolated: tuple[int, ...] = ()
+    for time, theta, length, tension, row in zip(*recording, strict=True):
+        newest = tuple(np.flatnonzero(row == 1).tolist())
+        if newest != isolated:
+            isolated = newest
+            collector.use_body(collector.body.with_isolated(isolated))
+        collector.joints(time, theta)
+        states = np.array([length, tension, np.full(len(length), np.nan)])
+        if (paired := collector.muscles(time, states)) is not None:
+            collector.collect(paired)
+    return samples.accepted
 
 
 def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
@@ -131,17 +169,21 @@ def _contents(bag: Bag) -> list[str]:
     return [*lines, '']
 
 
-def _fit(
-    bag: Bag, name: str, namespace: str | None, motors: MotorSettings
-) -> tuple[list[str], list[str]]:
-    """Return the reasons why a bag does not fit a robot, and notes on unused messages."""
+class _Fit(NamedTuple):
+    faults: list[str]  # reasons why the bag does not fit the robot
+    notes: list[str]  # on unused messages
+    motion: str = ''  # text on the motion that can be learned from
+
+
+def _fit(bag: Bag, name: str, namespace: str | None, motors: MotorSettings) -> _Fit:
+    """Return whether a bag fits a robot."""
     try:
         robot = Robot.load(name)
         streams = read_streams(bag, robot, namespace, motors)
     except BagError as error:
-        return [f'does not fit {name}: {error}'], []
+        return _Fit([f'does not fit {name}: {error}'], [])
     except MusculoskeletalError as error:
-        return [str(error)], []
+        return _Fit([str(error)], [])
     left_out = [f'rejected {n}: {why}' for why, n in streams.rejected.items()]
     left_out += streams.notes
     left_out += [
@@ -149,10 +191,11 @@ def _fit(
     ]
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
-        return [problem], left_out
+        return _Fit([problem], left_out)
     pairs = streams.pairs()
     misplaced = [
         f'muscles are not in the order of {name}: {muscle} behaves like {like}'
         for muscle, like in misplaced_muscles(pairs, robot)
     ]
-    return misplaced or wrong_joint_sensors(robot, pairs), left_out
+    faults = misplaced or wrong_joint_sensors(robot, pairs)
+    return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs))

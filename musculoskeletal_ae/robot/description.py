@@ -289,7 +289,8 @@ def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None
         if not -math.inf < lower < upper < math.inf:
             least, most = distinct(lower, upper)
             limits_text = f'joint {name!r} has limits [{least}, {most}] in robot.urdf'
-            raise fail(f'$.joints[{i}]: {limits_text}; expected finite lower < upper')
+            expected = 'expected finite lower < upper in its <limit>'
+            raise fail(f'$.joints[{i}]: {limits_text}; {expected}')
 
 
 def _joint_problem(name: str, model: pin.Model) -> str:

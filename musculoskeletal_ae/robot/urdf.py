@@ -200,9 +200,10 @@ def _check_joint(where: str, joint: ET.Element) -> None:
     if kind in ONE_AXIS and axis is not None and not any(map(float, axis.get('xyz', '1').split())):
         raise RobotDescriptionError(f'{where}: axis: expected a nonzero vector, got 0 0 0')
     present = set() if limit is None else set(limit.keys())
-    if kind in LIMITED and (missing := {'effort', 'velocity'} - present):
-        expected = f'{" and ".join(sorted(missing))}, which a {kind} joint needs'
-        raise RobotDescriptionError(f'{where}: limit: expected {expected}; got none')
+    if kind in LIMITED and {'effort', 'velocity'} - present:
+        missing = ', '.join(name for name in NUMBERS['limit'] if name not in present)
+        expected = f'effort, velocity, lower and upper, which a {kind} joint needs'
+        raise RobotDescriptionError(f'{where}: limit: expected {expected}; missing: {missing}')
 
 
 def _check(part: str, element: ET.Element) -> None:

@@ -2,6 +2,7 @@
 """`train --from-bag`: learns from recordings, as on a running arm, and reports the errors."""
 
 import sys
+import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +18,9 @@ from musculoskeletal_ae.bags.topics import NO_MOTORS
 from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import motor_settings
@@ -27,6 +29,7 @@ from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.stop_signals import STOP, Reaction
+from musculoskeletal_ae.tools import model_training
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 
 LEAST_OFFSET = 0.002  # smallest joint-sensor offset that is shown [rad]
@@ -57,13 +60,15 @@ def train(args: Namespace) -> None:
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
     try:
         for path, pairs in recordings.items():
-            if path not in args.hold_out:
-                total = round(pairs.time[-1] - pairs.time[0], 1)
-                with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
-                    if stop := learn(learner, pairs, bar.update):
-                        warnings.append(f'{path}: {stop}')
+            if path in args.hold_out:
+                continue
+            if stop := _learn_and_show(learner, path, pairs):
+                warnings.append(f'{path}: {stop}')
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_keep(learner, args)) from interrupt
+    if not learner.updates:
+        _warn(warnings)
+        raise MusculoskeletalError(f'{_nothing_learned(learner)}; {args.out} was not written')
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
     print(f'{len(learner.samples)} samples, {learner.updates} updates')
     zero = (
@@ -87,6 +92,43 @@ def train(args: Namespace) -> None:
     print(f'checkpoint: {args.out}')
     sys.stdout.flush()
     _warn(warnings)
+
+
+def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:
+    """Learn from a recording and show the progress; return the warning of `learn`."""
+    total = round(recording.time[-1] - recording.time[0], 1)
+    begun = reported = time.perf_counter()
+    passed = 0.0
+    with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
+        if bar.disable:
+            print(f'{path}: learning from {total:.0f} s', flush=True)
+
+        def progress(seconds: float) -> None:
+            nonlocal passed, reported
+            bar.update(seconds)
+            passed += seconds
+            now = time.perf_counter()
+            if now - reported < model_training.REPORT_INTERVAL:
+                return
+            reported = now
+            learned = f'{len(learner.samples)} samples, {learner.updates} updates'
+            if bar.disable:
+                share = 100.0 * passed / max(total, passed)
+                print(f'{path}: {share:.0f} %, {learned}, {now - begun:.0f} s elapsed', flush=True)
+            else:
+                bar.set_postfix_str(learned)
+
+        return learn(learner, recording, progress)
+
+
+def _nothing_learned(learner: Learner) -> str:
+    """Return why no update took place, and what to record instead."""
+    return (
+        'nothing was learned (0 updates). Different resting postures in the recordings: '
+        f'{len(learner.samples)}; learning begins with {learner.scheduler.least_samples}. '
+        'Record some minutes in which the healthy arm moves from posture to posture and rests in '
+        f'each for at least {DEFAULT.rest_time:g} s, as with controller/explore'
+    )
 
 
 def offset_text(robot: Robot, zero: Array) -> str:

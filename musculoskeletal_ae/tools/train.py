@@ -14,7 +14,8 @@ def main(argv: list[str] | None = None) -> int:
         'train',
         'Trains the Musculoskeletal AutoEncoder on the geometric model of a robot and writes a '
         'checkpoint. Prints the error of each of the nine (mask, output) pairs on held-out data. '
-        'Exit status 1: the robot or a file is unusable, 2: invalid options.',
+        'Exit status 1: the robot or a file is unusable, or nothing was learned from recordings; '
+        '2: invalid options.',
     )
     parser.add_robot(default=None)
     parser.add_out('FILE.safetensors', 'the checkpoint')

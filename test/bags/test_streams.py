@@ -5,9 +5,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from bags import bag_samples as samples
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
-from musculoskeletal_ae.bags.check import check_bag, misplaced_muscles
+from musculoskeletal_ae.bags.check import check_bag, misplaced_muscles, motion_text
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.streams import read_streams
+from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -180,6 +180,18 @@ def test_the_check_says_what_is_in_a_bag_and_what_it_fits(arm, tmp_path):
         line.split()[:4] == ['/muscle_states', '200', '100.00', '0.010'] for line in check.lines
     )
     assert 'fits: arm26' in text
+
+
+@pytest.mark.parametrize('postures', [1, 3])
+def test_the_check_counts_the_resting_postures_that_can_be_learned_from(robot, postures):
+    time = 0.02 * np.arange(200 * postures)
+    posture = 0.5 * (robot.lower + robot.upper)
+    theta = posture + 0.1 * (time // 4.0)[:, None]
+    tension = np.full((len(time), robot.muscle_count), 60.0)
+    length = robot.muscle_lengths(theta, tension)
+    text = motion_text(robot, Pairs(time, theta, length, tension, np.full(tension.shape, -1)))
+    assert f'resting postures to learn from: {postures}' in text
+    assert ('too little motion' in text) == (postures == 1)
 
 
 def test_the_check_of_a_bag_of_another_arm_fails(arm, tmp_path):

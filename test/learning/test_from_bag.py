@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning from the shipped recordings, and `train --from-bag`."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -108,7 +109,7 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     arm26, initial, monkeypatch, tmp_path, capsys
 ):
     time = 0.02 * np.arange(1000)
-    # The arm never rests, so there is no rest sample to learn from.
+    # After the first reading, the arm never rests.
     waves = np.sin(np.outer(time, [1.7, 2.3]))
     theta = 0.5 * (arm26.lower + arm26.upper) + 0.3 * (arm26.upper - arm26.lower) * waves
     tension = np.full((1000, arm26.muscle_count), 60.0)
@@ -125,10 +126,16 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     monkeypatch.setattr(model_training, 'initial_mae', trained)
     monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
     out = str(tmp_path / 'out.safetensors')
-    assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 0
+    assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 1
     printed = capsys.readouterr()
     assert 'training: 50 %, loss 0.5' in printed.out
-    warning = printed.err.splitlines()[-1]
+    assert 'BAG: learning from 20 s\n' in printed.out
+    assert re.search(r'BAG: \d+ %, [01] samples, 0 updates, \d+ s elapsed\n', printed.out)
+    *_, warning, failed = printed.err.splitlines()
+    assert failed.startswith('error: nothing was learned (0 updates). Different resting postures')
+    assert 'in the recordings: 1; learning begins with 2. Record' in failed
+    assert failed.endswith(f'{out} was not written')
+    assert not Path(out).exists()
     assert warning.startswith('warning: BAG: ')
     assert f'sign of these joint sensors is reversed: {arm26.joints[0]}. Publish θ' in warning
 
@@ -145,6 +152,7 @@ def test_estimated_joint_sensor_offsets_are_shown_and_the_error_without_them(
 
     def learned(learner, *_):
         learner.trainer.body.zero[:] = [0.03, 0.0]
+        learner.scheduler.updates = 1
 
     monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
     monkeypatch.setattr(bag_learning, 'learn', learned)

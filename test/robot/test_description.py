@@ -124,6 +124,11 @@ BAD_URDF = {
     'mass missing': ('<mass value="0.8"/>', '', ["'forearm'", 'mass: expected value']),
     'no number to all': ('<mass value="0.8"/>', '<mass value="0_8"/>', ["'forearm'", '0_8']),
     'effort missing': ('effort="', 'force="', ["joint 'shoulder'", 'limit: expected effort']),
+    'lower, upper and velocity missing': (
+        '<limit lower="-1.3963" upper="0.6981" effort="20" velocity="6"/>',
+        '<limit effort="20"/>',
+        ["joint 'shoulder'", 'missing: lower, upper, velocity'],
+    ),
     'joint type': ('type="revolute"', 'type="hinge"', ["joint 'shoulder'", 'prismatic', 'hinge']),
     'two joints above': ('child link="hand"', 'child link="forearm"', ["'forearm'", 'another']),
     'link twice': ('<link name="hand"', '<link name="torso"', ["link 'torso' comes 2 times"]),
