@@ -273,6 +273,7 @@ wait_for() {
   name=${name_of[$pid]}
   unset "name_of[$pid]"
   [ "$name" = "$1" ] || [ "$name $status" = 'replay 0' ] || died "$name" "$status"
+  [ "$name" != replay ] || say 'end of the recording'
   return "$status"
 }
 

@@ -68,6 +68,8 @@ class Driver(Node):
             follow = partial(self.command, by_tension=kind == 'tension')
             self.create_subscription(Float64MultiArray, f'muscle_{kind}_command', follow, 10)
         self.create_timer(1.0 / RATE, self.tick)
+        name = self.robot.description.directory.name
+        self.get_logger().info(f'publishing at {RATE:g} Hz for {name}')
 
     def command(self, message: Float64MultiArray, by_tension: bool) -> None:
         """Receive a command: lengths, or tensions if `by_tension`; ignore a malformed one."""

@@ -25,6 +25,7 @@ class Step(Enum):
         'call controller/explore to explore again, gently until the offsets are known',
     )
     REPAIR_MUSCLE = 'repair_muscle', 'repair the muscle'
+    RESTORE_MUSCLES = 'restore_muscles', 'call estimator/restore'
     FREE_ARM = 'free_arm', 'free the arm'
     CHECK_SENSOR = (
         'check_sensor',

@@ -6,9 +6,10 @@ import os
 from typing import Literal, NamedTuple
 
 MOST_DIGITS = 17  # significant digits that identify a double
-#: key in /diagnostics that tells what a component waits for, and the value of this key if the
-#: component waits for the end of an anomaly
-WAITS_FOR, ANOMALY = 'waits for', 'anomaly'
+#: key in /diagnostics that tells what a component waits for, and the values of this key if the
+#: component waits for the end of an anomaly, or for known length offsets
+WAITS_FOR, ANOMALY, LENGTH_OFFSETS = 'waits for', 'anomaly', 'length_offsets'
+END_OF_RECORDING = 'end_of_recording'  # value `state` of a replay that has ended
 Level = Literal['ok', 'warn', 'error']
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
 from musculoskeletal_ae.learning.job import Update
-from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, Report
+from musculoskeletal_ae.report import ANOMALY, LENGTH_OFFSETS, WAITS_FOR, Level, Report
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def learner_report(learner: Learner) -> Report:
         message = 'stopped by learner/enable; call it with true to resume'
     elif not learner.body.offsets.known:
         message = 'waiting for a length calibration; if none is in progress, call estimator/zero'
+        waits_for = {WAITS_FOR: LENGTH_OFFSETS}
     elif not learner.offset_check.is_believed:
         message = 'checking new length offsets against muscle_states'
     elif learner.collector.is_anomaly:

@@ -36,7 +36,7 @@ from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, 
 from musculoskeletal_ae.nodes.taught_motion import ACKNOWLEDGE_TIME, send_taught_motion
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.reception import Reception
-from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.report import END_OF_RECORDING, Report
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 #: depth of the QoS; a reader that is one second late still receives every message
@@ -123,7 +123,9 @@ class Replay(Node):
                 self._publisher[message.topic].publish(message.data)
 
     def acknowledge(self) -> None:
-        """Wait until reliable readers have acknowledged the last messages."""
+        """Report the end; wait until reliable readers have acknowledged the last messages."""
+        values = {'position': self._position(), 'state': END_OF_RECORDING}
+        self._diagnostics.tell(Report('ok', 'end of the recording', values), {})
         end = time.monotonic() + ACKNOWLEDGE_TIME
         for publisher in self._publisher.values():
             left = max(0.0, end - time.monotonic())

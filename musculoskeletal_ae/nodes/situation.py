@@ -25,7 +25,14 @@ from musculoskeletal_ae.estimation.status import CALIBRATION, GENTLE_MOTION, ISO
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
-from musculoskeletal_ae.report import ANOMALY, WAITS_FOR, Level, load_text
+from musculoskeletal_ae.report import (
+    ANOMALY,
+    END_OF_RECORDING,
+    LENGTH_OFFSETS,
+    WAITS_FOR,
+    Level,
+    load_text,
+)
 
 LARGEST_AGE = 1.0  # age above which a measured or estimated value is no longer shown [s]
 #: time without a report after which a node counts as silent [s]; nodes report once a second
@@ -201,8 +208,12 @@ class Situation:
     def _troubles(self) -> list[Trouble]:
         others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
         errors, warnings = list[Trouble](), list[Trouble]()
+        if has_ended := self._values('replay').get('state') == END_OF_RECORDING:
+            errors.append(Trouble('end of the recording'))
         for name, node in self._nodes.items():
             if _is_own(name) or node.level == DiagnosticStatus.OK:
+                continue
+            if has_ended and SILENT_TOPIC in node.values:
                 continue
             if self._is_shown(name, node):
                 if (silent := node.values.get(SILENT_TOPIC)) and not self._explains(node):
@@ -254,6 +265,8 @@ class Situation:
         if node.values.get(WAITS_FOR) == ANOMALY:
             # When the anomaly has just ended, the last report of the waiting node may be older.
             return self.detected or 0 < self._clear_reports <= REPORTS
+        if node.values.get(WAITS_FOR) == LENGTH_OFFSETS:
+            return bool(self._unknown_offsets)
         if name == f'{self._here}/controller':
             return node.values.get('mode') in (STOPPED, VERIFYING)
         if name == f'{self._here}/estimator':
@@ -266,7 +279,7 @@ class Situation:
         control, estimator = self._values('controller'), self._values('estimator')
         mode, cause = control.get('mode'), control.get('stop cause', '')
         # The estimator may report a verification before the controller does.
-        is_verifying = mode == VERIFYING or estimator.get('verification') == 'running'
+        is_verifying = mode == VERIFYING or self.is_verifying
         is_stopped = mode in (STOPPED, VERIFYING)
         is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
         causes = stops.parse(control.get(stops.STOP_CAUSES, cause))
@@ -331,10 +344,9 @@ class Situation:
         controller then treats them as unknown, although the estimator reports none as unknown.
         """
         values, troubles = self._values('estimator'), []
-        if isolated := values.get(ISOLATION) or values.get('isolated muscles'):
-            troubles.append(Trouble(f'isolated: {isolated}'))
-        key = 'unknown length offsets'
-        if unknown := values.get(key) or self._values('controller').get(key):
+        if isolated := self._isolated():
+            troubles.append(Trouble(isolated))
+        if unknown := self._unknown_offsets:
             text = f'length offsets unknown: {unknown}'
             steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
             of_finding = remedy.parse(values.get(REMEDY_STEPS, ''))
@@ -346,6 +358,34 @@ class Situation:
                     steps = (Step.EXPLORE_GENTLY,)
             troubles.append(_with_remedy(text, *steps) if steps else Trouble(text))
         return troubles
+
+    @property
+    def _unknown_offsets(self) -> str:
+        """Names of the muscles with unknown length offsets, or ''."""
+        key = 'unknown length offsets'
+        return self._values('estimator').get(key) or self._values('controller').get(key, '')
+
+    def _isolated(self) -> str:
+        """Return a text on the isolated muscles, or ''.
+
+        It states how to use them again. These steps are not part of `steps`, because the arm goes
+        on without the muscles. The text leaves out a suspect that is being verified.
+        """
+        values = self._values('estimator')
+        names = values.get('isolated muscles', '')
+        each = (values.get(ISOLATION) or names).split(', ')
+        if self.is_verifying:
+            each = [muscle for muscle in each if muscle != self.suspect]
+        if not any(each):
+            return ''
+        has_faults = values.get(ISOLATION, names) != names
+        steps = (Step.REPAIR_MUSCLE,) * has_faults + (Step.RESTORE_MUSCLES,)
+        return f'isolated: {", ".join(each)} (to use it again: {remedy.sentence(steps)})'
+
+    @property
+    def is_verifying(self) -> bool:
+        """Whether a suspect is isolated only to be verified."""
+        return self._values('estimator').get('verification') == 'running'
 
     @property
     def _stands_still(self) -> bool:

@@ -256,7 +256,8 @@ class View(Node):
         ]
         trouble = self.page.with_buttons(situation.trouble())
         isolated = f'isolated: {self.robot.names(self._isolated())}'
-        if len(self._isolated()) and isolated not in trouble:
+        is_shown = 'isolated: ' in trouble or situation.is_verifying
+        if len(self._isolated()) and not is_shown:
             lines.append(isolated)
         shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
         values = error, anomaly, situation.distance, situation.limit

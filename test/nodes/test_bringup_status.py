@@ -159,7 +159,11 @@ def test_after_an_isolation_the_fault_is_named_and_the_learner_advises_nothing_f
     situation.diagnosed(diagnostics('/left/learner', *paused, waits_for='anomaly'))
     for _ in range(3):
         situation.diagnosed(isolated)
-        assert situation.trouble() == 'isolated: biceps (ruptured)'
+        assert situation.trouble() == (
+            'isolated: biceps (ruptured) '
+            '(to use it again: repair the muscle; call estimator/restore)'
+        )
+        assert situation.steps() == []  # the arm goes on without the muscle
     situation.diagnosed(isolated)  # the learner still waits for an anomaly that has ended
     assert situation.trouble().endswith('warning: /left/learner: paused by an anomaly')
 
@@ -264,6 +268,40 @@ def test_a_pause_is_shown_without_steps_because_it_ends_by_itself():
     situation.diagnosed(diagnostics('/left/controller', 'paused', DiagnosticStatus.WARN, **values))
     assert situation.trouble() == 'warning: /left/controller: paused'
     assert situation.steps() == []
+
+
+def test_a_suspect_counts_as_isolated_only_after_its_verification():
+    situation = Situation('/left')
+    body = {'isolated_muscles': 'triceps, biceps'}
+    body['isolated_muscles_with_faults'] = 'triceps (ruptured), biceps'
+    situation.diagnosed(found(Kind.SLACK_TENDON, verification='running', **body))
+    assert 'isolated: triceps (ruptured) (to use' in situation.trouble()
+    alone = {'isolated_muscles': 'biceps', 'isolated_muscles_with_faults': 'biceps'}
+    situation.diagnosed(found(Kind.SLACK_TENDON, verification='running', **alone))
+    assert situation.trouble() == 'ANOMALY: biceps is being verified'
+
+
+def test_a_learner_that_waits_for_a_calibration_is_not_shown_beside_the_calibration():
+    situation = Situation('/left')
+    waiting = diagnostics(
+        '/left/learner', 'waiting', DiagnosticStatus.WARN, waits_for='length_offsets'
+    )
+    lengths = {'state': 'calibrating', 'unknown_length_offsets': 'biceps'}
+    situation.diagnosed(diagnostics('/left/estimator', finding='none', **lengths))
+    situation.diagnosed(waiting)
+    assert situation.trouble() == 'length offsets unknown: biceps'
+    situation.diagnosed(diagnostics('/left/estimator', finding='none'))
+    assert situation.trouble() == 'warning: /left/learner: waiting'
+
+
+def test_silence_after_a_recording_is_put_down_to_its_end():
+    situation = Situation('/left')
+    silent = {'silent_topic': 'no usable muscle_states', 'finding': 'none'}
+    situation.diagnosed(diagnostics('/left/replay', 'end', state='end_of_recording'))
+    situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
+    assert situation.trouble() == 'end of the recording'
+    situation.diagnosed(diagnostics('/left/replay', 'playing'))
+    assert situation.trouble() == '/left/estimator: old'
 
 
 def test_a_calibration_that_runs_is_not_to_be_started():
@@ -404,7 +442,8 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
     body = {'state': 'isolated', 'isolated_muscles': 'biceps', 'unknown_length_offsets': 'triceps'}
     situation.diagnosed(diagnostics('/estimator', 'estimating', DiagnosticStatus.WARN, **body))
     assert situation.trouble() == (
-        'isolated: biceps, length offsets unknown: triceps (to go on: call estimator/zero), '
+        'isolated: biceps (to use it again: call estimator/restore), '
+        'length offsets unknown: triceps (to go on: call estimator/zero), '
         'warning: /sim: slow'
     )
     situation.diagnosed(diagnostics('/estimator', finding='none', state='estimating'))
