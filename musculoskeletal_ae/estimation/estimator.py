@@ -15,7 +15,6 @@ need lengths report findings. `suspects.py` describes the sequence from a ruptur
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -411,8 +410,10 @@ class Estimator:
             finding = Finding(suspected.muscle, Kind.LENGTHS_DISAGREE, evidence)
             self._handle(finding, self.stepped_at)
         else:
-            # The new object is published, so that the other nodes trust the length again.
-            self._use_body(self.body.with_offsets(replace(offsets)))
+            # The other nodes trust the length again because its offset is published with a larger
+            # standard deviation (`follow_offsets`).
+            confirmed = offsets.confirmed(suspected.muscle)
+            self._use_body(self.body.with_offsets(confirmed))
 
     def _wrong_zero(self, muscle: int) -> str:
         """Return evidence that the length offset of a repaired muscle is wrong, or ''.

@@ -494,7 +494,8 @@ class Shell(Node):
 
         If the estimator publishes known offsets and then other known offsets, it has restarted and
         has lost the result of its last calibration. The offsets in `body` then count as unknown
-        until the estimator has calibrated again.
+        until the estimator has calibrated again. The same offsets count as a change only if a
+        standard deviation has grown, because the estimator has then checked them after a repair.
         """
         previous = LengthOffsets.unknown(self.robot.muscle_count)
 
@@ -507,10 +508,12 @@ class Shell(Node):
             offsets, before = LengthOffsets(*rows), previous
             previous = offsets
             if before.known and offsets.known:
-                if (offsets.offset == before.offset).all():
+                is_same = bool((offsets.offset == before.offset).all())
+                if is_same and not (offsets.deviation > before.deviation).any():
                     return
-                unknown = LengthOffsets.unknown(len(offsets.offset))
-                offsets = replace(unknown, offset=offsets.offset)
+                if not is_same:
+                    unknown = LengthOffsets.unknown(len(offsets.offset))
+                    offsets = replace(unknown, offset=offsets.offset)
             self.body = self.body.with_offsets(offsets)
             changed()
 

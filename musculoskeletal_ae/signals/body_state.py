@@ -20,6 +20,9 @@ UNKNOWN = 1.0  # standard deviation of an unknown length offset [m]
 SUSPECT = 2.0  # standard deviation of a length offset that a fault has revoked [m]
 KNOWN = 0.05  # standard deviation below which a length offset counts as known [m]
 
+#: standard deviation that a length offset gains when it is confirmed after a repair [m]
+CONFIRMED = 0.01
+
 
 @dataclass(frozen=True)
 class LengthOffsets:
@@ -47,6 +50,12 @@ class LengthOffsets:
     def is_suspect(self) -> bool:
         """Whether a fault has revoked known offsets."""
         return bool((self.deviation >= SUSPECT).any())
+
+    def confirmed(self, muscle: int) -> LengthOffsets:
+        """Return the same offsets after a check of one muscle, whose offset is less certain now."""
+        deviation = self.deviation.copy()
+        deviation[muscle] = min(np.hypot(deviation[muscle], CONFIRMED), 0.9 * KNOWN)
+        return LengthOffsets(self.offset, deviation)
 
     def revoked(self) -> LengthOffsets:
         """Return the same offsets, marked as suspect until the next length calibration."""
