@@ -81,6 +81,11 @@ def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them
     graph.wait(lambda: controller.body.offsets.offset.all(), 'the uncertain length offsets')
     reported(0.05, 0.001)
     known(True)
+    # After the repair of a muscle, the estimator confirms the offsets with a larger deviation.
+    before = controller.core.stream.body.offsets
+    reported(0.05, 0.01)
+    graph.wait(lambda: controller.core.stream.body.offsets is not before, 'the confirmed offsets')
+    known(True)
 
 
 def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, trained_file):
