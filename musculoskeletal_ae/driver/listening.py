@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.pace import Pace
-from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.driver.verdict import FAULTS, ZERO_TOLERANCE, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
@@ -50,10 +50,9 @@ TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of
 #: value if their temperature is published in °F
 HOTTEST_AT_REST = 55.0
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
-# musashi_left_arm (notes/removed_benches.md), the offset is at most 42 mm, and lengths change by
-# 0.31 to 1.55 times the model's changes. If another muscle fits a column 2.5 times better than its
-# own muscle, the misfit to its own muscle is below 8.5 mm.
-ZERO_TOLERANCE = 0.045  # largest length offset of a healthy arm [m]
+# musashi_left_arm (notes/removed_benches.md), the offset is at most 42 mm (hence ZERO_TOLERANCE),
+# and lengths change by 0.31 to 1.55 times the model's changes. If another muscle fits a column 2.5
+# times better than its own muscle, the misfit to its own muscle is below 8.5 mm.
 SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
 MISPLACED = 0.012  # misfit of a column to its own muscle above which it can be misplaced [m]
 BETTER = 2.5  # a column is misplaced only if another muscle fits it better by this factor
@@ -292,7 +291,8 @@ class Listening:
         """
         lengths_verdict = Verdict(self._robot)
         misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
-        if sum(len(fault.muscles) for fault in lengths_verdict.faults) > 1:
+        is_suspect = sum(len(fault.muscles) for fault in lengths_verdict.faults) > 1
+        if is_suspect:
             best, explanation = JOINTS_BETTER * misfit, None
             for what, names, meant in self._angles(theta):
                 other = Verdict(self._robot)
@@ -305,7 +305,7 @@ class Listening:
                 what, names = explanation
                 verdict.failed(what, names=', '.join(names))
                 return
-        if lengths_verdict.faults:
+        if is_suspect:  # an angle changes the lengths of several muscles
             lengths_verdict.notes += self._suspected_signs(theta, length, tension)
         verdict.add(lengths_verdict)
 
@@ -355,6 +355,19 @@ class Listening:
             exchanged[:, [j, k]] = theta[:, [k, j]]
             yield 'joint order', [robot.joints[j], robot.joints[k]], exchanged
 
+    def _are_turned(self, length: Array, model: Array, moved: Bools) -> bool:
+        """Return whether l (N, M) of all muscles fit the model, (N, M), with the opposite sign.
+
+        On a moved arm, l of those that `moved` must change in the opposite direction. On an arm at
+        rest, all l must fit with the opposite sign, and several must not fit as they are.
+        """
+        if moved.any():
+            slopes = [np.polyfit(model[:, m], length[:, m], 1)[0] for m in np.flatnonzero(moved)]
+            return len(slopes) > 1 and all(SLOPES[0] < -slope < SLOPES[1] for slope in slopes)
+        turned, literal = (np.abs(np.median(length + sign * model, axis=0)) for sign in (1, -1))
+        misfits = int((literal > ZERO_TOLERANCE).sum())
+        return self._zeroed and bool((turned <= ZERO_TOLERANCE).all()) and misfits > 1
+
     def _judge_lengths(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> float:
@@ -390,17 +403,24 @@ class Listening:
             return spread
 
         fit = np.array([misfit(column[:, None] - model) for column in length.T])
+        own, doubt = fit.diagonal().copy(), ''
         if not moved.any():
             better = robot.actuation.choose('moving the arm by hand', '`check_driver --move`')
-            verdict.notes.append(
-                f'sign and order were checked at rest only; {better} checks them more reliably'
+            doubt = (
+                f'; judged at rest, which is not reliable: {better} checks sign and order better'
             )
             fit = np.maximum(fit, fit.T)  # at rest, only pairwise exchanges can be recognised
         rows, best = linear_sum_assignment(fit)
         inverse = misfit(length + model)
         # Antagonists mirror each other. If all signs are wrong, exchanged antagonists fit as well,
         # but are less likely.
-        all_turned = inverse[moved].sum() < fit[rows, best][moved].sum()
+        compared = moved if moved.any() else np.full(len(own), self._zeroed)
+        all_turned = inverse[compared].sum() < fit[rows, best][compared].sum()
+        if all_turned and self._are_turned(length, model, moved):
+            verdict.failed('all signs', *range(len(own)), doubt=doubt)
+            return float(np.minimum(fit[rows, best], inverse).sum())
+        if doubt:
+            verdict.notes.append('sign and order were checked at rest only' + doubt)
         for m, other in enumerate(best.tolist()):
             off = float(np.median((length - model)[:, m]))
             turned = all_turned or inverse[m] < fit[m, other]
@@ -408,9 +428,10 @@ class Listening:
             if moved.any():
                 follows |= not moved[m] or fit[m, m] <= MISPLACED
             else:
-                follows |= not self._zeroed or fit[m, m] <= ZERO_TOLERANCE
+                # Two muscles that are exchanged both misfit; if one misfits, its zero is wrong.
+                follows |= not self._zeroed or min(own[m], own[other]) <= ZERO_TOLERANCE
             if not follows:
-                verdict.failed('place', m, other=robot.muscles[other])
+                verdict.failed('place', m, other=robot.muscles[other], doubt=doubt)
                 continue
             if moved[m]:
                 slope = np.cov(length[:, m], model[:, m])[0, 1] / model[:, m].var(ddof=1)
@@ -428,7 +449,7 @@ class Listening:
             elif not moved.any() and inverse[m] < 0.3 * abs(off):
                 measured = f'l is {np.median(length[:, m]):+.3f} m'
                 predicted = f'the route predicts {model[0, m]:+.3f} m'
-                verdict.failed('sign', m, detail=f'{measured}, {predicted}')
+                verdict.failed('sign', m, detail=f'{measured}, {predicted}{doubt}')
             else:
                 verdict.failed('zero', m, off=1e3 * off)
         return float(np.minimum(fit[rows, best], inverse).sum())

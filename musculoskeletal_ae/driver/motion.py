@@ -45,6 +45,8 @@ class RunAwayError(Exception):
 class MotionTest(ABC):
     """Moves one muscle at a time, with one command per message, and checks the responses."""
 
+    _highest: Array  #: highest test tension [N] (M,)
+
     def __init__(self, verdict: Verdict, muscles: Sequence[int]) -> None:
         """Prepare to test muscles, by default all. The verdict receives the results."""
         self.verdict, robot = verdict, verdict.robot
@@ -52,6 +54,8 @@ class MotionTest(ABC):
         #: index of the muscle that is being tested; None while the arm is held
         self._tested: int | None = None
         self.done = False
+        #: whether each muscle has been tested in this run, and no fault was found, (M,)
+        self._is_verified: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
         self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
@@ -82,9 +86,13 @@ class MotionTest(ABC):
         while now - self._recent[0][0] > MEAN:
             self._recent.popleft()
         self.done = self.done or next(self._run, self) is self
-        return None if self.done or np.isnan(self._target).any() else self._target.copy()
+        return None if self.done or np.isnan(self._target).any() else self._command(states[0])
 
     # -- differences between the kinds of modules -----------------------------------------------
+
+    @abstractmethod
+    def _command(self, length: Array) -> Array:
+        """Return the command [m] (M,) for the present targets at l [m], both (M,)."""
 
     @abstractmethod
     def _hold(self) -> Wait:
@@ -104,8 +112,8 @@ class MotionTest(ABC):
         """
 
     @abstractmethod
-    def _pay_out(self, m: int) -> None:
-        """Release muscle m, which has run away; a subclass may release all muscles instead."""
+    def _release(self, m: int) -> Wait:
+        """Pay out muscle m, which has run away, for RELEASE or less; or all muscles instead."""
 
     # -- common parts ---------------------------------------------------------------------------
 
@@ -116,14 +124,12 @@ class MotionTest(ABC):
             for m in self._muscles:
                 self._tested = m
                 yield from self._try(m)
+                self._is_verified[m] = all(m not in fault.muscles for fault in self.verdict.faults)
             self._judge_joints()
         except RunAwayError as error:
             self.verdict.failed(error.fault, error.muscle, **error.values)
-            self._pay_out(error.muscle)
-            # After this wait, no more commands follow, so that the modules go to their safe state.
-            end = self._now + RELEASE
-            while self._now < end:
-                yield
+            # After the release no more commands follow, so that the modules go to their safe state.
+            yield from self._release(error.muscle)
 
     def _judge_joints(self) -> None:
         """Compare the joint sensors with the lengths, unless the lengths are wrong."""
@@ -144,9 +150,12 @@ class MotionTest(ABC):
             names = ', '.join(robot.joints[j] for j in judgement.right)
             verdict.notes.append(f'these joint sensors have the right sign: {names}')
         if unknown:
+            highest = float(self._highest.max())
+            higher = min(1.5 * highest, float(robot.tension.limit.min()))
+            again = f'Repeat the test with --tension {higher:.0f}, or move'
             verdict.notes.append(
                 f'the sign of these joint sensors is not known, because the joints moved too '
-                f'little: {", ".join(unknown)}. Repeat the test with a higher --tension, or move '
+                f'little: {", ".join(unknown)}. {again if higher > highest + 1.0 else "Move"} '
                 'the arm by hand while check_driver listens'
             )
 

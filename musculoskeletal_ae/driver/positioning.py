@@ -37,6 +37,9 @@ FURTHEST = 0.015  # largest distance by which the target moves inwards [m]
 OUTWARDS = 0.005  # distance by which the target moves outwards [m]
 FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
 SHARES = 0.7, 1.4  # legal range of the motion of l, divided by that of l_target
+#: rise of T that is permitted while the arm is held, even where T exceeds the highest test tension
+#: at rest [N]
+RISE = 20.0
 RUN_AWAY = 0.03  # distance of l from l_target that ends a test [m]
 
 
@@ -69,12 +72,19 @@ class Positioning(MotionTest):
                     f'{limit} N; choose a lower value'
                 )
             self._highest = np.full(self._robot.muscle_count, highest)
+        #: tension at which a muscle is released while the arm is held [N] (M,)
+        self._most: Array = np.full(self._robot.muscle_count, np.inf)
 
     # -- commands -------------------------------------------------------------------------------
 
+    def _command(self, length: Array) -> Array:  # noqa: ARG002
+        return self._target.copy()
+
     def _hold(self) -> Wait:
         yield from self._wait(RELEASE)
-        self._target[:] = self._mean()[0]
+        length, tension, _ = self._mean()
+        self._most = np.maximum(self._highest, tension + RISE)
+        self._target[:] = length
         yield from self._wait(SETTLE)
         held = self._mean()
         for m in np.flatnonzero(np.abs(held[0] - self._target) > FOLLOWS).tolist():
@@ -85,6 +95,8 @@ class Positioning(MotionTest):
         length, tension, _ = states
         far = np.abs(length - self._target) > RUN_AWAY
         m = self._lasting((tension > self._highest + RUN_AWAY_TENSION) | far)
+        if self._tested is None and (tension > self._most).any():
+            m = int((tension > self._most).argmax())
         if m is None:
             return None
         detail = f'T rose to {tension[m]:.0f} N'
@@ -92,8 +104,11 @@ class Positioning(MotionTest):
             detail = f'l deviates by {1e3 * (length - self._target)[m]:+.0f} mm from l_target'
         return RunAwayError(m, 'position ran away', detail=detail)
 
-    def _pay_out(self, m: int) -> None:
+    def _release(self, m: int) -> Wait:
         self._target[m] += self._robot.actuation.release[m]
+        end = self._now + RELEASE
+        while self._now < end:
+            yield
 
     def _mean(self) -> Array:
         """Return the mean of the last readings: l [m], T [N] and temperature [°C], (3, M)."""

@@ -14,6 +14,8 @@ from musculoskeletal_ae.schema import Strict
 #: of l, the MSC law, its clip at tension.max, and latency
 Check = Literal['rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency']
 CHECKS: tuple[Check, ...] = get_args(Check)
+#: largest length offset [m] of a healthy arm (`listening`)
+ZERO_TOLERANCE = 0.045
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
 POSITION_LAW = 'l → l_target, for as long as T is below T_max'
 LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g} N/m'
@@ -126,6 +128,9 @@ class Verdict:
         rows = zip(('', *names), (CHECKS, *self._state))
         lines = [f'{name:<{width}}' + ''.join(f'{cell:>9}' for cell in row) for name, row in rows]
         lines.append(f'{OPEN}: not judged')
+        if (self._state[:, CHECKS.index('zero')] == OK).any():
+            tolerance = f'{1e3 * ZERO_TOLERANCE:.0f} mm'
+            lines.append(f'zero ok: within {tolerance} of the route; smaller errors are not found')
         for fault in self.faults:
             lines += [
                 f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}',

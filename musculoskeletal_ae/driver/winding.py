@@ -9,6 +9,12 @@ steps inwards until the MSC law
 demands a low tension at the measured l. The target then returns, and moves beyond l, where T must
 stay at T_bias.
 
+Signs and order of commands are unknown before the test. Until a muscle has passed it, the muscle
+never gets a target for which the law would demand more than the highest test tension at the
+measured l. While the arm is held, before the first muscle is tested, the law demands only a part of
+this tension (HELD), and all muscles are released as soon as one measures more than a larger part
+(ALARM).
+
 The law multiplies an error of l (LENGTH_ERROR) by K. If K exceeds 50 kN/m, the resulting error of T
 exceeds TENSION_TOLERANCE. This error then replaces the tolerance, and the detection thresholds and
 the default of the demanded tensions grow in proportion to it.
@@ -51,6 +57,14 @@ CLIP = 20.0, 0.05  # demand beyond tension.max [N], and tolerance relative to te
 #: If a muscle becomes taut at an l_target within this distance of −l [m], the sign of l or of the
 #: command is wrong.
 MIRROR_TOLERANCE = 0.008
+#: highest demand, and tension at which all muscles are released, while the arm is held before the
+#: first test; relative to the range from T_bias to the highest test tension. Healthy emulated arms
+#: that still swing reach 0.81. If K is large, T is noisy, and ALARM is raised by the excess.
+HELD, ALARM = 0.5, 0.9
+OSCILLATES = 6  # T oscillates if it crosses its mean more often than this within MEAN
+#: distance of l_target beyond l at the start of a release [m], and its growth [m/s]; small at
+#: first, because commands of wrong sign wind in
+PAY_OUT = 0.003, 0.3
 MOST_BEYOND = 0.3  # highest demand beyond tension.max, relative to tension.max
 
 
@@ -112,6 +126,14 @@ class Winding(MotionTest):
                     f'muscle {robot.muscles[m]!r}: the check needs at least {needed} N, '
                     f'but it may command {limit} N at most; pass a higher --tension'
                 )
+        #: tension [N] (M,) above which all muscles are released while the arm is held
+        self._alarm: Array = self._bias + ALARM * (self._highest - self._bias)
+        self._alarm += 2.0 * (self._tolerance - TENSION_TOLERANCE)
+        #: highest tension [N] (M,) that is demanded in the present test
+        self._most: Array = self._highest.copy()
+        self._sent: Array = self._target.copy()  # the last command [m] (M,)
+        #: whether each muscle is searched for its response, which may be anywhere (M,)
+        self._is_searched: Bools = np.zeros(robot.muscle_count, dtype=bool)
         #: standard deviation of T while the arm is held [N] (M,)
         self._swing: Array = np.zeros(robot.muscle_count)
 
@@ -132,9 +154,21 @@ class Winding(MotionTest):
         """Return the error of a muscle that exceeds its demand or shortens too far."""
         length, tension, _ = states
         tensions = self._robot.tension
-        most = np.minimum(np.maximum(tensions.limit, self._highest), tensions.max)
-        asked = np.minimum(self._demanded(length), most)
-        m = self._lasting(tension > asked + self._run_away_tension)
+        verified = np.minimum(np.maximum(tensions.limit, self._most), tensions.max)
+        asked = np.minimum(
+            self._demanded(length), np.where(self._is_verified, verified, self._ceiling())
+        )
+        excess = tension - asked - self._run_away_tension
+        m = self._lasting(excess > 0.0)
+        unverified = np.where(self._is_verified, -np.inf, excess)
+        if self._tested is None and not np.isnan(self._sent).any():
+            unverified = tension - self._alarm
+        if (unverified > 0.0).any():
+            m = int(np.nanargmax(unverified))
+            recent = self._readings()[:, 1, m]
+            crossings = np.count_nonzero(np.diff(recent > recent.mean()))
+            if self._tested is None and crossings > OSCILLATES:
+                return RunAwayError(m, 'hums', swing=np.std(recent))
         if m is not None:
             detail = f'T rose to {tension[m]:.0f} N, but the demand was {asked[m]:.0f} N'
             rose = float(length[m] - start[0][m])
@@ -146,12 +180,38 @@ class Winding(MotionTest):
             return RunAwayError(int(fell.argmax()), 'ran away', detail=detail)
         return None
 
-    def _pay_out(self, m: int) -> None:  # noqa: ARG002 (all muscles: the arm may be falling)
-        self._target += 2.0 * RUN_AWAY
+    def _release(self, m: int) -> Wait:  # noqa: ARG002 (all muscles: the arm may be falling)
+        """Pay out all muscles.
+
+        Every target moves away from the newest l, because l may change in the wrong direction. If
+        a tension still rises, the sign of the commands is wrong, so that no more are sent.
+        """
+        start, before = self._now, self._recent[-1][1][1]
+        while (passed := self._now - start) < RELEASE:
+            length, tension, _ = self._recent[-1][1]
+            if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
+                break
+            self._target = length + min(PAY_OUT[0] + PAY_OUT[1] * passed, 2.0 * RUN_AWAY)
+            yield
+
+    def _ceiling(self) -> Array:
+        """Return the highest tension [N] (M,) that may be demanded of a muscle not yet tested."""
+        highest = self._most
+        if self._tested is None:
+            highest = self._bias + HELD * (self._highest - self._bias)
+        # Noise of l must not reach the limit, which would change the mean tension.
+        return highest + 2.0 * LENGTH_ERROR * self._robot.stiffness
+
+    def _command(self, length: Array) -> Array:
+        """Return the targets, but none that demands too much of a muscle not yet tested."""
+        nearest = length - (self._ceiling() - self._bias) / self._robot.stiffness
+        most_inwards = np.where(self._is_verified | self._is_searched, -np.inf, nearest)
+        self._sent = np.maximum(self._target, most_inwards)
+        return self._sent.copy()
 
     def _demanded(self, length: Array) -> Array:
         """Return the tensions [N] (..., M) that the present commands demand at l [m] (..., M)."""
-        demand = self._robot.actuation.demanded(length, self._target)
+        demand = self._robot.actuation.demanded(length, self._sent)
         assert demand is not None  # None only for modules that follow positions (`Positioning`)
         return demand
 
@@ -214,6 +274,8 @@ class Winding(MotionTest):
         half, whole = list[float](), list[float]()  # times to the response [s]
         # The demand at home may exceed T_bias, because the muscle carries the arm's weight.
         rise = (self._highest - self._bias)[m]
+        self._most = self._highest.copy()
+        self._most[m] = home.demand[m] + rise
         yield from self._wind(m, home.demand[m] + 0.5 * rise, home.length[m], half)
         last = yield from self._wind(m, home.demand[m] + rise, home.length[m], whole)
         pulled, wound = last.tension - home.tension, home.length - last.length
@@ -231,6 +293,7 @@ class Winding(MotionTest):
         if clip <= self._highest[m]:
             beyond = max((CLIP[0] * self._scale)[m], 2.0 * CLIP[1] * clip)
             beyond = min(beyond, MOST_BEYOND * clip)
+            self._most[m] = clip + beyond
             past = yield from self._wind(m, clip + beyond, home.length[m], [])
             if past.tension[m] > (1.0 + CLIP[1]) * clip:
                 verdict.failed('clip', m, got=past.tension[m], most=clip)
@@ -316,7 +379,9 @@ class Winding(MotionTest):
         if answered:
             self.verdict.failed('outwards', m)
             return
+        self._is_searched[m] = True
         onset = yield from self._find_onset(m, home)
+        self._is_searched[m] = False
         self._target[m] = home.length[m]  # at once, not at RELEASE_SPEED
         yield from self._wait(RELEASE)
         if onset is None:

@@ -258,11 +258,14 @@ def _parse(arguments: list[str]) -> Namespace:
     add(
         '--move',
         action='store_true',
-        help='after listening, wind in each muscle slightly, one at a time',
+        help='after listening, if no fault was found: hold the arm where it is with all muscles, '
+        'at no more than the test tension (--tension), then wind in each muscle slightly, one at '
+        'a time. If a muscle pulls more than demanded, it is released, and the test ends',
     )
-    add('--muscles', type=names, metavar='NAME,…', help='with --move: wind only these muscles in')
+    text = 'with --move: wind only these muscles in; all muscles hold the arm before'
+    add('--muscles', type=names, metavar='NAME,…', help=text)
     text = (
-        'with --move: tension up to which muscles are wound in [N] (default: T_bias + 40 N, or '
+        'with --move: test tension, to which muscles are wound in [N] (default: T_bias + 40 N, or '
         'T_bias + 0.8 mm times K for modules with a stiffness K above 50 kN/m; at most '
         'tension.max, or tension.limit for actuation: position)'
     )

@@ -35,6 +35,7 @@ class Driver:
         self.motors: MotorInterface | None = None
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
+        self.pulled: dict[str, float] = {}  # highest T [N] of any muscle in each phase of `wind`
         self._commands: deque = deque()
         # Computes T [N] from l_target and the measured rows; if None, the arm's own law does.
         self.in_tension: Callable | None = None
@@ -92,6 +93,8 @@ class Driver:
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
             for theta, rows in self.step():
+                tension = max(self.pulled.get(winding.trying, 0.0), self.arm.sense().tension.max())
+                self.pulled[winding.trying] = tension
                 if (target := winding.step(rows, self.now, self.angles(theta))) is not None:
                     self.command(target)
         return winding.verdict

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +16,7 @@ import pytest
 from driver.scripted import Driver, array, joint_state
 from musculoskeletal_ae import validity
 from musculoskeletal_ae.driver.listening import Listening
+from musculoskeletal_ae.driver.motion import ABOVE_BIAS, RUN_AWAY_TENSION
 from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -143,6 +144,50 @@ ANGLES = {
     'sign of all': (lambda theta: -theta, 'sign', 'shoulder, elbow'),
     'exchanged': (lambda theta: theta[::-1], 'order', 'shoulder, elbow are exchanged'),
 }
+
+
+@pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])
+def test_one_wrong_zero_is_not_taken_for_a_wrong_order(name):
+    robot = Robot.load(name)
+    for m in range(robot.muscle_count):
+        driver = Driver(robot)
+        driver.publish = partial(offset, m)
+        verdict = driver.listen(0.5)
+        assert [fault.muscles for fault in verdict.faults if fault.check == 'zero'] == [(m,)]
+        assert verdict.wrong == {'zero'}, str(verdict)
+        assert 'wrong sign or order looks like a wrong zero' in str(verdict)
+        assert 'joint sensors first' not in str(verdict)
+
+
+def offset(m, rows):
+    rows = rows.copy()
+    rows[0, m] += 0.1
+    return rows
+
+
+def test_the_reversed_sign_of_every_length_is_one_fault_of_a_moved_arm():
+    driver = Driver(ROBOT)
+    driver.publish = flipped
+    verdict = driver.listen(8.0, moved=True)
+    assert len(verdict.faults) == 1 and 'reverse the sign of every l' in str(verdict), str(verdict)
+
+
+@pytest.mark.parametrize('robot', ['arm26', 'musashi_left_arm'])
+def test_the_reversed_sign_of_every_length_is_one_fault_of_an_arm_at_rest(robot):
+    robot = Robot.load(robot)
+    theta = robot.lower + 0.9 * (robot.upper - robot.lower)
+    length = -robot.muscle_lengths(theta, robot.tension.bias)
+    listening, noise = Listening(robot, 100.0, theta), np.random.default_rng(0)
+    for k in range(50):
+        rows = np.stack([length, robot.tension.bias, np.full(len(length), 30.0)])
+        listening.muscles(array(rows + 1e-4 * noise.normal(size=rows.shape)), 0.01 * k)
+    verdict = listening.verdict(0.5)
+    assert len(verdict.faults) == 1 and 'reverse the sign of every l' in str(verdict), str(verdict)
+    assert 'judged at rest, which is not reliable' in verdict.faults[0].observation
+
+
+def test_the_tolerance_of_zeros_is_stated():
+    assert 'zero ok: within 45 mm of the route' in str(Driver(ROBOT).listen(0.5))
 
 
 @pytest.mark.parametrize('name', ANGLES)
@@ -477,6 +522,65 @@ def test_a_joint_sensor_of_wrong_sign_is_named_by_winding_in(joint):
     verdict = driver.wind()
     assert {fault.name for fault in verdict.faults} == {'joint sign'}, str(verdict)
     assert f'sign of the angle of {ROBOT.joints[joint]} is reversed' in str(verdict)
+
+
+def test_a_test_that_moved_a_joint_too_little_names_the_tension_to_repeat_it_with():
+    for highest, advice in (None, 'Repeat the test with --tension 105'), (300.0, '. Move the arm'):
+        robot = ROBOT if highest is None else with_tension(300.0, 500.0)
+        verdict = Verdict(robot)
+        winding = Winding(verdict, (0,), highest)
+        still, driver = np.zeros(robot.joint_count), settled()
+        while not winding.done:
+            for _, rows in driver.step():
+                if (target := winding.step(rows, driver.now, still)) is not None:
+                    driver.command(target)
+        assert advice in str(verdict)
+
+
+def inverted_law(driver, order):
+    """Let the modules evaluate the law with inverted lengths, in another order of muscles."""
+    home, back = driver.arm.sense().length, np.argsort(order)
+    # The lengths are mirrored about the initial ones, so that listening finds no fault.
+    driver.publish = lambda rows: np.stack([2.0 * home - rows[0], *rows[1:]])[:, order]
+    follow = law()
+    driver.in_tension = lambda target, rows: follow(target[back], [2.0 * home - rows[0]])
+
+
+HARMFUL = {
+    'inverted': lambda driver: inverted_law(driver, list(range(M))),
+    'inverted and exchanged': lambda driver: inverted_law(driver, [2, 0, 1, 4, 3, 5]),
+    'commands exchanged': lambda driver: setattr(driver, 'take', exchanged),
+}
+
+
+@pytest.mark.parametrize('name', HARMFUL)
+@pytest.mark.parametrize('highest', [None, 60.0])
+def test_no_wrong_driver_pulls_above_the_test_tension_while_the_arm_is_held(name, highest):
+    driver = settled()
+    HARMFUL[name](driver)
+    verdict = driver.wind((BICEPS,), highest)
+    assert verdict.faults or name == 'commands exchanged', str(verdict)
+    assert driver.pulled['hold'] < (highest or BIAS + ABOVE_BIAS)
+    assert max(driver.pulled.values()) < (highest or BIAS + ABOVE_BIAS) + RUN_AWAY_TENSION
+
+
+# No choice of the first command is safe with each of these drivers.
+JUMPING = {
+    'sign of the command': lambda home, target: 2.0 * (home - 0.03) - target,
+    'another zero': lambda _, target: target - 0.02,
+    'another order': lambda home, target: target + (home[::-1] - home) - 0.01,
+}
+
+
+@pytest.mark.parametrize('name', JUMPING)
+def test_a_driver_that_pulls_from_the_first_command_on_is_released_and_bounded_by_max(name):
+    driver = Driver(with_tension(55.0, 60.0))
+    driver.listen(2.0)
+    driver.take = partial(JUMPING[name], driver.arm.sense().length)
+    verdict = driver.wind((BICEPS,))
+    assert 'released for safety' in str(verdict)
+    assert driver.pulled.keys() == {'hold'}
+    assert driver.pulled['hold'] < 1.1 * 60.0
 
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
