@@ -154,7 +154,7 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
 
     # Option --network keeps the discovery range of the environment.
     recording = tmp_path / 'run'
-    options = ['--reality', str(model), '--network', '--duration', '5', '--record', str(recording)]
+    options = ['--reality', str(model), '--network', '--duration', '8', '--record', str(recording)]
     run = bringup(*chosen, *options, ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET')
     reported = f"-- reality {model}: joint 'elbow' moves from -1.5 to 0.2 there"
     assert 'training the initial network' in read_until(run, reported)
