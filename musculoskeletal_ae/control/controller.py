@@ -371,9 +371,9 @@ class Controller:
             self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
-        """Restart the comparison of the clocks and the stream of muscle states.
+        """Note that the messages' clock has jumped back.
 
-        This is needed after the messages' clock has jumped back.
+        The comparison of the clocks and the stream of muscle states begin again.
         """
         self.watchdog.age.clock_jumped_back()
         self.stream.reset()

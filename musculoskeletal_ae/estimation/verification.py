@@ -138,7 +138,7 @@ class ModuleLaw:
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return the length difference l' − l [m].
+        """Return by how much l', which the other muscles indicate, exceeds the measured l [m].
 
         Only the verdict on position-controlled modules uses the result, and for these,
         `PositionLaw` overrides this method.

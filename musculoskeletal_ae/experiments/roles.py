@@ -32,7 +32,7 @@ def elbows(robot: Robot) -> Bools:
 
 
 def shoulder(robot: Robot) -> int:
-    """Return the joint to sweep, in the role of shoulder_pitch.
+    """Return the index of the joint that plays the role of shoulder_pitch in the experiments.
 
     This is the first revolute joint with "shoulder_pitch" in its name, or else with "shoulder", or
     else the first revolute joint. Without revolute joints, it is the first joint.

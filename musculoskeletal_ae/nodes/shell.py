@@ -447,9 +447,10 @@ class Shell(Node):
 
     @property
     def intruders(self) -> str:
-        """Other nodes that publish topics of this arm's nodes or have this node's name, as text.
+        """A text on nodes that must not be there, or '' if there are none.
 
-        The text is empty if there are no such nodes.
+        These are other publishers of topics that belong to this arm's nodes, and other nodes with
+        the name of this node.
         """
         problems = [self.sources.intruders]
         if not self.twins.is_alone(time.monotonic()):

@@ -118,7 +118,6 @@ class Situation:
         self.suspect = self.evidence = ''
         self._finding = ''  # kind of the estimator's finding; 'none', or '' if it is unknown
         self._clear_reports = 0  # successive reports of the estimator without a finding
-        self._has_returned = False  # whether an anomaly has ended and begun again during one stop
         self._has_ended = False  # whether an anomaly has ended during the present stop
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
@@ -159,7 +158,7 @@ class Situation:
             elif name == 'controller':
                 self.doing = node.message
                 if node.values.get('mode') not in (STOPPED, VERIFYING):
-                    self._has_ended = self._has_returned = False
+                    self._has_ended = False
             if name in FOLLOWERS:
                 self._compare_network(name, node.values.get(VERSION, ''))
 
@@ -167,8 +166,6 @@ class Situation:
         was_detected = self.detected
         self._finding = values.get('finding', '')
         self.detected = self._finding not in ('', 'none')
-        if self.detected and self._has_ended:
-            self._has_returned = True
         if self._finding == 'none' and was_detected:
             self._has_ended = True
         self._clear_reports = self._clear_reports + 1 if self._finding == 'none' else 0
@@ -239,12 +236,13 @@ class Situation:
     def _has_consequences(self) -> bool:
         """Whether a present anomaly explains `stops.CONSEQUENCES`, which then need no steps.
 
-        Once the anomaly has returned during the same stop, its remedy has not helped. The steps of
-        all causes are advised then, because the anomaly may itself be the consequence of another.
+        If an anomaly has already ended during this stop, the present one shows that its remedy has
+        not helped. The steps of all causes are advised then, because the anomaly may itself be the
+        consequence of another cause.
         """
         return (
             self.detected
-            and not self._has_returned
+            and not self._has_ended
             and f'{self._here}/estimator' not in self.silent_nodes()
         )
 
