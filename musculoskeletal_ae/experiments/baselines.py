@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Earlier estimators of joint angles, evaluated on the same data as the autoencoder.
 
-The polynomial filter and the table search learn from the rest samples of the autoencoder. Since
-these postures are too few for a table search, both estimators are also evaluated after learning
-from the whole stream at 10 Hz.
+The polynomial filter and the table search learn from the same rest samples as the autoencoder.
+Rest samples cover too few postures for a table search. Both estimators are therefore evaluated a
+second time, after learning from all messages of the exploration, thinned to 10 Hz.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ def baseline_errors(
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error [rad] on the held-out motion, before and after learning.
 
-    All start from the geometric model. The unweighted least squares estimate does not learn, so its
+    Each estimator's name is mapped to the keys `before_rad` and `after_rad`. Before learning, all
+    estimators use the geometric model. The unweighted least squares estimate does not learn, so its
     two errors are equal.
     """
     part = stream.part(np.s_[::STREAM_STRIDE])
@@ -50,10 +51,11 @@ def _error(baseline: PolynomialFilter | TableSearch, held_out: Recording) -> flo
 
 
 def without_elongation(robot: Robot, tension: Array, length: Array) -> Array:
-    """Return the length if the series elastic element were not stretched, l + L_e(l_abs, T) [m].
+    """Return the lengths [m] that would be measured if no series elastic element were stretched.
 
-    The stretch shortens the measured l, so L_e is added. L_e is evaluated at the measured length
-    first. It is then evaluated again at the length corrected by this first L_e.
+    The stretch L_e shortens the measured length l, so the result is l + L_e(l_abs, T). L_e depends
+    on the absolute length l_abs without stretch, which is not measured. L_e is therefore evaluated
+    twice: first at the measured length, and then at the length corrected by this first L_e.
     """
     absolute = robot.routes.length_at_zero + length
     elongation = robot.series_elastic.elongation(absolute, tension)
@@ -61,13 +63,15 @@ def without_elongation(robot: Robot, tension: Array, length: Array) -> Array:
 
 
 class PolynomialFilter:
-    """Joint-muscle mapping by polynomials, and an extended Kalman filter on it (Ookubo 2015).
+    """Extended Kalman filter that measures lengths through a polynomial mapping (Ookubo 2015).
 
         l_m + L_e,m(T_m) = Σ_k c_mk x^k + a_m T_m,   x = θ scaled to [−1, 1],  total degree ≤ 3
 
-    The mapping starts as a fit to the geometric model. Learning refits it to the samples with the
-    previous coefficients as the prior, which determines everything that the samples leave open. The
-    filter models θ as a random walk and the mapping as its measurement, H = ∂l/∂θ.
+    The left side is the length of muscle m without the stretch of its series elastic element. The
+    terms x^k are the monomials of x. At first, the coefficients c_mk are a fit to the geometric
+    model, and a_m is 0. `learn` refits all coefficients to samples, with their previous values as
+    the prior. Coefficients that the samples do not determine therefore stay as they were. The
+    filter models θ as a random walk, and its measurement is the left side, with H = ∂l/∂θ.
     """
 
     name = 'polynomial mapping, EKF'
@@ -103,7 +107,7 @@ class PolynomialFilter:
         return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Fit the mapping to samples θ (N, D), T (N, M) and l (N, M); see the class."""
+        """Refit the mapping to samples θ [rad] (N, D), T [N] (N, M) and l [m] (N, M)."""
         design = self._monomials(theta)
         target = without_elongation(self._robot, tension, length)
         for m in range(self._robot.muscle_count):
@@ -115,7 +119,11 @@ class PolynomialFilter:
             self._noise[m] = (target[:, m] - rows @ self._coefficients[:, m]).std()
 
     def _measurement(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return the mapping's l + L_e [m] (M,) and H [m/rad] (M, D) at one (θ, T)."""
+        """Return the lengths that the mapping predicts at one (θ, T), and their derivatives.
+
+        The lengths l + L_e [m] have the shape (M,). Their derivatives H = ∂l/∂θ [m/rad] have the
+        shape (M, D).
+        """
         monomials = self._monomials(theta[None])[0]
         coefficients, elastic = self._coefficients[:-1], self._coefficients[-1]
         predicted = monomials @ coefficients + elastic * self.TENSION_SCALE * tension
@@ -150,8 +158,9 @@ class TableSearch:
 
         θ_est = θ_k,   k = argmin_k ‖l_k − (l + L_e(l_abs, T))‖₂
 
-    Before learning the table holds random postures of the geometric model. Learning replaces it
-    with the samples, with the elongation removed from every row.
+    Row k of the table holds the joint angles θ_k, and the lengths l_k without the stretch L_e of
+    the series elastic elements. Before learning, the rows are random postures of the geometric
+    model. `learn` replaces all rows with samples.
     """
 
     name = 'table search'
@@ -164,7 +173,7 @@ class TableSearch:
         self._lengths = cKDTree(robot.routes.relative_lengths(self._theta))
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Replace the table with samples θ (N, D), T (N, M) and l (N, M)."""
+        """Replace the table with samples θ [rad] (N, D), T [N] (N, M) and l [m] (N, M)."""
         self._theta = theta
         self._lengths = cKDTree(without_elongation(self._robot, tension, length))
 

@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """What learning changes in the body.
 
-Paper (§IV-A). The figure shows l against S-p from −120° to 30° at T = 0, and against T from 0 to
-500 N at θ = 0. Changes reach 40 mm and are largest in #2, #3 and #7. Some tension curves change
-from linear to strongly curved, which the paper attributes to wear of #2’s elastic unit and to high
-friction in #6.
+Paper (§IV-A). The figure shows the muscle length l against the shoulder pitch S-p from −120° to 30°
+at T = 0, and against the tension T from 0 to 500 N at θ = 0. Learning changes the lengths by up to
+40 mm, most of all those of muscles #2, #3 and #7. Some tension curves change from linear to
+strongly curved. The paper attributes this to wear of #2’s elastic unit and to high friction in #6.
 
 Here. The figures show l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0.
-They compare ① of both presets' networks, before and after learning, with the true body. All other
-joints are at θ = 0, even where this lies outside a joint’s limits (by 5° at the elbow). The
-shoulder's lower limit is −70°, so the networks extrapolate from there to −120°.
+They compare the lengths that the networks of both presets predict, before and after learning, with
+those of the true body. All other joints are at θ = 0, even where this lies outside a joint’s limits
+(by 5° at the elbow). The shoulder's lower limit is −70°, so the networks extrapolate from there to
+−120°.
 
-- change: largest difference of a muscle's curve before and after learning
-- relative change: the same for l − l(0), because the curves of the paper pass the origin
+- change: largest difference between a muscle's curves before and after learning
+- relative change: the same for l − l(0), because the curves of the paper pass through the origin
 - true change: difference between the true body and its model, which a perfect learner would find
-- model error: error of the initial network on its own model
-- excursion: range of a muscle's length over the joint's limits
-- nonlinearity: largest distance of l(T) from its chord, relative to its span
+- model error: error of the initial network on the geometric model from which it was trained
+- excursion: range of a muscle's length within the joint's limits
+- nonlinearity: largest distance of l(T) from the straight line between its ends, relative to its
+  range
 - shape: error of a curve after subtracting its mean difference from the true curve
-- worn: the first individual with a worn series elastic element at #2 and high tendon friction at
-  #6, which explores and learns again
+- worn: another arm that explores and learns. It is the first individual, but with a worn series
+  elastic element in #2 and high tendon friction in #6.
 """
 
 from collections.abc import Mapping
@@ -52,7 +54,7 @@ SMALL = 1e-9  # avoids a division by zero [m]
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Measure how learning changes the length curves of one individual."""
     robot, true = study.robot, study.arm(seed).individual
     joint, sampled = shoulder(robot), study.rests(seed).tension
     tension = np.linspace(0.0, robot.tension.max.max(), POINTS)
@@ -110,13 +112,19 @@ def measure(study: Study, seed: int) -> Measured:
 def _changes(
     robot: Robot, name: str, origin: int, trained: Bools, curves: Mapping[str, Array]
 ) -> dict[str, Any]:
-    """Return the numbers of one sweep, whose name is 'angle' or 'tension'.
+    """Return measures of how learning changes the length curves of one sweep.
 
-    `curves` are the lengths 'before' and 'after' learning and those of the 'true' body [m],
-    (points, M) each. The change of a muscle is the largest difference between the curves before and
-    after learning. A key with "relative" stands for the change of l − l(origin), because the curves
-    in the paper pass the origin. A key with "all" stands for the range of the paper's figure, every
-    other key for the range of the training.
+    The change of a muscle is the largest difference [mm] between its curves before and after
+    learning. Keys with "relative" hold the change of l − l(origin), because the curves in the paper
+    pass through the origin. Changes whose keys contain "all" cover the whole sweep, as in the
+    paper's figure. Changes whose keys do not contain it cover the points in `trained` only.
+
+    Args:
+        robot: The robot.
+        name: The swept quantity, 'angle' or 'tension', with which the keys begin.
+        origin: Index of the point at which this quantity is 0.
+        trained: Mask (points,) of the points within the range of the training.
+        curves: Lengths [m] (points, M) 'before' and 'after' learning, and of the 'true' body.
     """
     change = curves['after'] - curves['before']
     relative = change - change[origin]
@@ -146,9 +154,10 @@ def _by_muscle(robot: Robot, change: Array) -> dict[str, float]:
 
 
 def nonlinearity(curve: Array) -> Array:
-    """Return the largest distance of each curve (points, M) from its chord, relative to its range.
+    """Return how much each of M curves deviates from a straight line, (M,).
 
-    The result is 0 for a straight line.
+    The deviation is the largest distance of the curve (points, M) from the straight line between
+    its ends, relative to the range of the curve.
     """
     share = np.linspace(0.0, 1.0, len(curve))[:, None]
     chord = curve[0] + share * (curve[-1] - curve[0])
@@ -157,7 +166,10 @@ def nonlinearity(curve: Array) -> Array:
 
 
 def worn_arm(robot: Robot, seed: int) -> EmulatedArm:
-    """Return an individual with a worn element in muscle 2 and high friction in muscle 6."""
+    """Return an arm with a worn series elastic element in muscle 2, and high friction in muscle 6.
+
+    Apart from this, the arm is the individual of `seed`.
+    """
     individual = Individual(robot, seed)
     worn, with_friction = np.minimum((1, 5), robot.muscle_count - 1)
     individual.elastic.rate[worn] *= WORN
@@ -166,7 +178,7 @@ def worn_arm(robot: Robot, seed: int) -> EmulatedArm:
 
 
 def length_against_angle(study: Study, rows: Rows) -> Plot:
-    """Draw l over the shoulder's angle, one panel for each muscle."""
+    """Draw the muscle length over the shoulder's angle, one panel for each muscle."""
     joint = first_individual(rows)[1].numbers['joint']
     title = 'muscle length at T = 0, all other joints at 0'
     return _panels(study, rows, 'angle', f'θ of {joint} [deg]', title), (
@@ -176,7 +188,7 @@ def length_against_angle(study: Study, rows: Rows) -> Plot:
 
 
 def length_against_tension(study: Study, rows: Rows) -> Plot:
-    """Draw l over tension, one panel for each muscle."""
+    """Draw the muscle length over the tension, one panel for each muscle."""
     return _panels(study, rows, 'tension', 'T [N]', 'muscle length at θ = 0'), (
         'Muscle length against tension at θ = 0. Dotted: tensions outside the range of the '
         'exploration’s samples.'
@@ -184,7 +196,7 @@ def length_against_tension(study: Study, rows: Rows) -> Plot:
 
 
 def worn_muscles(study: Study, rows: Rows) -> Plot | None:
-    """Draw l over the tension of the individual with worn muscles, if it was measured."""
+    """Draw the muscle length over the tension for the worn arm; return None if it is missing."""
     title = 'muscle length at θ = 0, #2 worn, #6 with high friction'
     figure = _panels(study, rows, 'worn', 'T [N]', title)
     if figure is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contact, a part of the experiment `motion`: estimated external forces, and hand guiding."""
+"""Measure contact estimation and hand guiding, as a part of the experiment `motion`."""
 
 from dataclasses import replace
 from typing import Any
@@ -54,7 +54,7 @@ class ContactLoop(ClosedLoop):
         self._contact.use(mae)
 
     def contact(self, exploring: bool = False) -> Contact:
-        """Advance by one message, and return the estimated contact at this message."""
+        """Advance by one message, and return the contact estimate of this message."""
         _ = self.explore() if exploring else self.step()
         length, transmission = self._read.length, self.mae.transmission
         end = self._friction.end_tension(transmission, self._read.tension, length)
@@ -65,14 +65,14 @@ class ContactLoop(ClosedLoop):
         return [self.contact(exploring) for _ in range(round(duration / SAMPLE_TIME))]
 
     def rest(self, theta: Array) -> None:
-        """Reset the controller, which a push may have stopped, and move to θ [rad] (D,)."""
+        """End the push, reset the controller, which may have stopped, and move to θ [rad] (D,)."""
         self.push(np.zeros(3))
         self.core.reset(self._now)
         self.target(theta)
         self.contacts_during(MOVE)
 
     def push(self, force: Array) -> None:
-        """Apply a force [N] (3,) to the hand."""
+        """Apply a force [N] (3,) to the hand until the next call."""
         self.arm.set_wrench(np.concatenate([force, np.zeros(3)]))
 
 
@@ -118,9 +118,9 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _errors(true: Array, estimated: Array) -> tuple[Array, Array]:
-    """Return relative errors of the sizes of N forces, and errors of their directions [deg], (N,).
+    """Return the relative errors of N estimated magnitudes, and the direction errors [deg].
 
-    `true` and `estimated` are the forces [N], (N, 3).
+    Both results have the shape (N,). `true` and `estimated` are the forces [N], (N, 3).
     """
     sizes, estimated_sizes = np.linalg.norm(true, axis=1), np.linalg.norm(estimated, axis=1)
     cosine = (true * estimated).sum(axis=1) / np.maximum(sizes * estimated_sizes, 1e-9)
@@ -129,9 +129,10 @@ def _errors(true: Array, estimated: Array) -> tuple[Array, Array]:
 
 
 def _force(robot: Robot, rng: np.random.Generator, least: float, most: float) -> Array:
-    """Return a random force [N] (3,) along axes of the root link that produce joint torques.
+    """Return a random force (3,) with a magnitude from `least` to `most` [N].
 
-    On a planar arm, the force therefore lies in the plane of the arm.
+    The force has no component along those axes of the root link along which no force produces
+    joint torques. On a planar arm, the force therefore lies in the plane of the arm.
     """
     postures = robot.random_postures(20, rng)
     jacobians = [robot.kinematics.end_effector_jacobian(theta)[:3] for theta in postures]
@@ -151,7 +152,8 @@ def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
     """Push the hand of the resting arm.
 
     Returns:
-        The force and its estimate [N], each (3,), and whether all joints stayed off their stops.
+        The force [N] (3,), its estimate [N] (3,) averaged over the end of the push, and whether
+        all joints stayed within their limits.
     """
     robot, estimates, free = loop.arm.robot, list[Array](), True
     loop.push(force)
@@ -166,10 +168,11 @@ def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
 
 
 def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Array:
-    """Push the moving arm up to `count` times; return the forces and the delays of detection.
+    """Push the moving arm up to `count` times, and measure how soon each push is detected.
 
-    The rows of the result (2, N) are the sizes of the forces [N] and the delays [s]. A delay of
-    MOVED means that the collision was not detected.
+    Returns:
+        An array (2, N) of the magnitudes of the N forces [N] and their detection delays [s]. A push
+        that is not detected has a delay of MOVED, the duration of the push.
     """
     robot, collisions = loop.arm.robot, list[tuple[float, float]]()
     for _ in range(TRIES_PER_COLLISION * count):
@@ -188,7 +191,10 @@ def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Arra
 
 
 def _healthy(loop: ContactLoop, seconds: float) -> int:
-    """Return the number of contacts that begin during healthy exploration, after its first 5 s."""
+    """Return how many contacts are wrongly detected while an arm explores without any contact.
+
+    The exploration takes `seconds` [s] and another 5 s, which precede and are not counted.
+    """
     contacts, before = 0, False
     for n in range(round((seconds + 5.0) / SAMPLE_TIME)):
         now = loop.contact(exploring=True).is_contact and n * SAMPLE_TIME > 5.0
@@ -197,10 +203,10 @@ def _healthy(loop: ContactLoop, seconds: float) -> int:
 
 
 def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, float]:
-    """Measure gravity compensation.
+    """Measure the drift of the arm under gravity compensation, and push its hand afterwards.
 
     Returns:
-        The largest drift of a joint [rad], and the distance [m] by which a force moves the hand.
+        The largest drift of a joint [rad], and the distance [m] by which the push moves the hand.
     """
     settings, arm = Settings(first_duration=2.0), study.arm(seed)
     loop = ContactLoop(arm, study.network(seed), settings, seed)
@@ -220,7 +226,7 @@ def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[f
 
 
 def forces(_: Study, rows: Rows) -> Plot:
-    """Plot the estimated over the true magnitude of all pushes, and the error of the direction."""
+    """Plot the magnitudes and direction errors of estimated forces over the true magnitudes."""
     keys = 'true', 'estimated', 'free'
     parts = [[row.traces[key] for key in keys] for row in rows.values()]
     true, estimated, free = map(np.concatenate, zip(*parts))

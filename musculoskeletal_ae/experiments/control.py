@@ -1,23 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control.
 
-Paper (§IV-C). Each of five random θ_eval is approached from five random postures by the geometric
-model, and by `first`, `second` and `proposed` after learning. All learned methods are far better
-than `geometric`. `proposed` is as accurate as `second`, with less tension than `first` and
-`second`.
+Paper (§IV-C). The arm approaches each of five random targets θ_eval from five random postures. It
+uses the geometric model, and after learning the control methods `first`, `second` and `proposed`.
+All learned methods are far better than `geometric`. `proposed` is as accurate as `second`, with
+less tension than `first` and `second`.
 
 Here. The protocol is the same, in closed loop with the estimator and the controller of the nodes.
 Targets are postures that the true body can hold within [T_bias, T_limit]. `proposed` on the learned
 network moves the arm to each start. `geometric` uses the geometric model, and the other methods use
-the learned network. Methods with the suffix of a preset use the network of preset `paper`. Results
-are read 8 s after the command. If the controller stops, the arm’s position at that time counts, and
-so does the stop.
+the learned network. Methods whose name ends in `_paper` use the network of preset `paper`. Results
+are read 8 s after the command, even if the controller has stopped by then. These stops are counted.
 
 - model error and hysteresis: the mean offset over all starts of a target is the error of the model;
   the scatter about this mean is hysteresis
 - QP bound: the least ‖T‖ with which the true body holds θ_eval
 - bound reached: the least ‖T‖ with which the true body holds the posture in which the arm came to
-  rest. An arm that sags needs less than θ_eval does.
+  rest. An arm that sags below θ_eval may need less tension there than at θ_eval.
 """
 
 from collections.abc import Mapping
@@ -62,7 +61,7 @@ STARTING = 5.0  # duration of the motion to a start [s]
 
 
 class Approaches(NamedTuple):
-    """Final states of an arm after approaching P targets from S starts each, by method."""
+    """Results of approaching P targets from S starts each, with every control method."""
 
     target: Array  # θ_eval [rad], (P, D)
     bound: Array  # least ‖T‖ with which the true body holds each target [N], (P,)
@@ -75,9 +74,9 @@ class Approaches(NamedTuple):
 
 
 def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
-    """Approach `count` random targets from as many random starts each, by every method.
+    """Approach `count` random targets from `count` random starts each, with every control method.
 
-    `seed` determines targets and starts. `networks` maps presets to their networks.
+    `seed` determines targets and starts. `networks` maps the names of presets to their networks.
     """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
     postures = robot.random_postures(TRIES, rng)
@@ -115,7 +114,7 @@ def _bound(arm: Arm) -> float:
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Measure the errors and tensions of every control method on one individual."""
     networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
     ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
@@ -146,12 +145,15 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
-    """Return how far `proposed` exceeds the least tension, split by cause.
+    """Return measures that separate the causes why `proposed` needs more than the least tension.
 
-    For this, `proposed` plans the tensions, and then moves the same body without friction. The
-    ratio of the planned ‖T‖ to the bound shows the error of the learned body. The frictionless arm
-    needs more than planned because tensions are commanded as lengths. The arm with friction needs
-    still more because of the friction.
+    `proposed` first plans the tensions at each target, and then moves the same body without tendon
+    friction there. The mean ratios to the least ‖T‖ with which the true body holds the target are
+    - planned_to_bound, of the planned ‖T‖: it shows the error of the learned body, and
+    - frictionless_to_bound, of ‖T‖ after the motion: it is larger because tensions are commanded
+      as lengths.
+    The arm with friction exceeds even this ratio because of its friction. frictionless_rad is the
+    mean distance [rad] of the frictionless arm from the target.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:
@@ -185,7 +187,7 @@ def control(_: Study, rows: Rows) -> Plot:
 
 
 def control_all(_: Study, rows: Rows) -> Plot:
-    """Draw all individuals, with a group of bars for each; individuals have different θ_eval."""
+    """Draw errors and tensions of all individuals, with a group of bars for each individual."""
     traces = [row.traces for row in rows.values()]
     together: dict[str, Any] = {
         key: {name: np.array([trace[key][name].ravel() for trace in traces]) for name in METHODS}
@@ -198,9 +200,11 @@ def control_all(_: Study, rows: Rows) -> Plot:
 
 
 def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
-    """Draw a group of bars for each label: one bar for each method, and the QP bound of the group.
+    """Draw errors and tensions as groups of bars, with one bar for each control method.
 
-    `trace` holds errors and tensions by method, (groups, approaches), and the bounds, (groups,).
+    A dashed line shows the QP bound of each group. `labels` are the names of the groups. In
+    `trace`, 'errors' [rad] and 'tensions' [N] are arrays (groups, approaches) by method, and
+    'bound' [N] is an array (groups,).
     """
     figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']

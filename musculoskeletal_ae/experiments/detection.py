@@ -37,11 +37,14 @@ LONGEST_WAIT = 5.0
 
 
 class GraspAndRupture:
-    """Script of the experiment (paper, §IV-B): grasp midway, then rupture one muscle after another.
+    """Script of a recording (paper, §IV-B): grasp a payload, then rupture muscles one by one.
 
-    A muscle ruptures as soon as it carries tension after a random wait. If it carries none until
-    LATEST_RUPTURE, it ruptures then, and `carried` is False. With `switched_off`, the tendons stay
-    intact, and the modules are commanded zero tension instead.
+    The arm grasps the payload in the middle of the motion and holds it from then on. After the
+    motion, each muscle has a period of SLOT [s]. In this period, it ruptures as soon as it carries
+    tension after a random wait, but no later than LATEST_RUPTURE [s]. `carried` states whether it
+    carried tension when it ruptured. After another RUPTURE_TIME [s], it is repaired. With
+    `switched_off`, the tendons stay intact, and the muscle modules are commanded zero tension for
+    RUPTURE_TIME instead.
 
     Attributes:
         order: The muscles that rupture, in the order of their ruptures.
@@ -55,7 +58,7 @@ class GraspAndRupture:
         switched_off: bool = False,
         most: int | None = None,
     ) -> None:
-        """Plan a motion, and the ruptures that follow it.
+        """Plan a motion, and the ruptures after it.
 
         Args:
             robot: The robot.
@@ -101,7 +104,12 @@ class GraspAndRupture:
         return disturbed
 
     def __call__(self, arm: Arm, time: float) -> Bools | None:
-        """Grasp, rupture or mend at the planned time; see `recording.Script`."""
+        """Grasp the payload, and rupture or repair a muscle, when this is due at `time` [s].
+
+        Returns:
+            A mask (M,) of the muscles that are switched off, or None if none is; see
+            `recording.Script`.
+        """
         if abs(time - self.grasp) < 0.5 * SAMPLE_TIME:
             arm.set_payload(PAYLOAD)
         now = time + 1e-9
@@ -124,7 +132,7 @@ class GraspAndRupture:
 
 
 def grasp_and_release(arm: Arm, time: float) -> None:
-    """Grasp and release a payload every minute; see `recording.Script`."""
+    """Grasp and release a payload in turn, one a minute; see `recording.Script`."""
     turn, since = divmod(round(time / SAMPLE_TIME), round(GRASPING / SAMPLE_TIME))
     if since == 0:
         arm.set_payload(PAYLOAD if turn % 2 else 0.0)
@@ -143,7 +151,7 @@ class DetectorOutput(NamedTuple):
 def run_detector(robot: Robot, mae: Mae, recording: Recording) -> DetectorOutput:
     """Return what estimator and detector report for each message of a recording.
 
-    They run as in the node, but continue after an anomaly.
+    Both run as in the estimator node, but they continue after an alarm.
     """
     health, rows = HealthMonitor(robot, mae.preset), []
     health.use(mae)
@@ -170,7 +178,7 @@ def detection(
 ) -> dict[str, Any]:
     """Return the detection delays, the share of correctly named muscles, and the false alarms.
 
-    A rupture that was not detected counts with its whole duration.
+    The delay of a rupture that was not detected is its whole duration, RUPTURE_TIME [s].
 
     Args:
         robot: The robot.
@@ -223,12 +231,18 @@ def anomaly_levels(
     healthy_outputs: Mapping[str, DetectorOutput],
     fault: str,
 ) -> dict[str, Any]:
-    """Return measures of A and d without and with ruptures, before and after learning.
+    """Return measures of the anomaly A and the distance d for healthy and for ruptured muscles.
 
-    The measures are the largest and the median value of healthy messages, the level of each
-    rupture, the smallest level of a muscle in `plan.counted`, and the AUROC. The level of a rupture
-    is the median over the messages of `GraspAndRupture.while_ruptured`. The levels have the order
-    of `plan.muscles`. `fault` is the name of the fault in the keys.
+    All measures exist before and after learning. They are the largest and the median value of
+    healthy messages, the level of each rupture, the smallest level of the muscles in
+    `plan.counted`, and the AUROC. The level of a rupture is the median of A or d over the messages
+    of `GraspAndRupture.while_ruptured`. The levels have the order of `plan.muscles`.
+
+    Args:
+        plan: The script that ruptured the muscles.
+        faulty_outputs: Outputs for its recording, by the networks 'before' and 'after' learning.
+        healthy_outputs: Outputs for a healthy recording, by the same networks.
+        fault: Name of the fault in the keys of the result.
     """
     numbers: dict[str, Any] = {}
     for when, prefix in (('before', '_before'), ('after', '')):
@@ -256,7 +270,10 @@ def alarm_starts(alarm: Bools) -> Bools:
 
 
 def auroc(healthy: Array, faulty: Array) -> float:
-    """Return the probability that a faulty message scores above a healthy one (ties count half)."""
+    """Return the probability that a faulty message scores above a healthy one.
+
+    Equal scores count half. The result is 0.5 if either array is empty.
+    """
     from scipy.stats import mannwhitneyu  # the import takes 0.7 s
 
     pairs = len(healthy) * len(faulty)

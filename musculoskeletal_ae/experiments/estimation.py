@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """State estimation and anomaly detection.
 
-Paper (§IV-B). The same motions are estimated before and after learning: 0.414 → 0.186 rad. The
-error hardly rose when a 3.6 kg dumbbell was grasped. When muscle #2 was deactivated, A rose after
-learning but hardly before.
+Paper (§IV-B). The joint angles of the same motions are estimated before and after learning. The
+error falls from 0.414 to 0.186 rad. It hardly rises when the arm grasps a 3.6 kg dumbbell. When
+muscle #2 is deactivated, the anomaly A rises after learning, but hardly before.
 
 Here. The networks of both presets, before and after learning, process the same recordings. Messages
 pass one by one through the detector of the estimator node. The first recording is the held-out
 motion, with 3.6 kg in the hand from its middle on. Then every muscle in turn ruptures for 3 s and
 is repaired, still with the payload. After a random wait of up to 5 s, a muscle ruptures as soon as
-it carries more than 10 N above T_bias. A muscle that has not done so after 14 s ruptures then;
-plots show it in grey, and it is not counted. In the second recording, every muscle in turn is
+it carries more than 10 N above T_bias. A muscle that carries less until 14 s have passed ruptures
+then; plots show it in grey, and it is not counted. In the second recording, every muscle in turn is
 switched off for 3 s instead, as in the paper: its module is commanded zero tension, and its tendon
 stays intact. Healthy messages are those of the held-out motion, and of one hour of motion (shared
-by the individuals) in which the payload is grasped and released every minute. Preset `paper`
-decides by A instead of d. The node's detectors of frozen sensors and of thermal drift find nothing
-in these recordings.
+by the individuals) in which the payload is grasped or released every minute. The default preset
+detects faults by the distance d, and preset `paper` by the anomaly A. The node's detectors of
+frozen sensors and of thermal drift find nothing in these recordings.
 
 - detected: an alarm starts during the fault; if none does, the delay counts as 3 s
 - named: the muscle is the most suspect one in the message that completes the detection
@@ -78,7 +78,7 @@ OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for s
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Measure the estimates of one individual, and the detection of its ruptured muscles."""
     robot = study.robot
     most = QUICK_RUPTURES if study.quick else None
     plan = GraspAndRupture(robot, study.held_out_time, seed, most=most)
@@ -143,9 +143,12 @@ class Recordings(NamedTuple):
 def _preset(
     study: Study, seed: int, preset: str, recordings: Recordings
 ) -> tuple[dict[str, Any], dict[str, DetectorOutput], dict[str, DetectorOutput]]:
-    """Return a preset's numbers, and its outputs for the ruptures and for the switched-off muscles.
+    """Evaluate the networks of a preset before and after learning.
 
-    The keys of the outputs are 'before' and 'after', which refer to learning.
+    Returns:
+        The numbers of the preset, the detector's outputs for the recording with ruptures, and
+        those for the recording with switched-off muscles. The outputs have the keys 'before' and
+        'after', which name the network.
     """
     robot, networks = study.robot, study.networks(seed, preset)
     plan, faulty, healthy, plan_off, switched_off = recordings
@@ -175,7 +178,10 @@ def _preset(
 
 
 def _plot_range(trace: Mapping[str, Any]) -> tuple[slice, Any]:
-    """Return the messages from before the grasp to after the first rupture, and times [s]."""
+    """Return the slice of messages that plots show, and the times of these messages [s].
+
+    The messages extend from PLOT_START before the grasp to PLOT_TAIL after the first repair.
+    """
     start = max(0.0, trace['grasp'] - PLOT_START)
     rows = rows_between(start, trace['rupture'] + RUPTURE_TIME + PLOT_TAIL)
     return rows, start + times(len(trace['theta'][rows]))
@@ -188,7 +194,10 @@ def _mark(axes: Any, trace: Mapping[str, Any]) -> None:
 
 
 def grasp_and_cut(_: Study, rows: Rows) -> Plot:
-    """Draw the error, A and d from before the grasp to after the first rupture."""
+    """Draw the estimation error, A and d before and after the grasp and the first rupture.
+
+    A is the anomaly, and d the distance by which the default preset detects faults.
+    """
     seed, (numbers, trace) = first_individual(rows)
     shown, time = _plot_range(trace)
     figure, panels = plots.new_figure(12.0, 8.0, 3, sharex=True)
@@ -220,7 +229,7 @@ def grasp_and_cut(_: Study, rows: Rows) -> Plot:
 
 
 def deactivated(_: Study, rows: Rows) -> Plot:
-    """Draw the error and A while the second muscle is switched off, a column for each preset."""
+    """Draw the error and the anomaly A while a muscle is switched off, a column for each preset."""
     seed, row = first_individual(rows)
     off = row.traces['off']
     theta, by_preset = off['theta'], off['outputs']
@@ -256,7 +265,7 @@ def deactivated(_: Study, rows: Rows) -> Plot:
 
 
 def appearance(study: Study, rows: Rows) -> Plot:
-    """Draw arm and estimates at several moments of the experiment."""
+    """Draw the true and the estimated postures at several moments of the experiment."""
     seed, (_, trace) = first_individual(rows)
     moments = {name: step for step, name in enumerate(trace['moments'])}
     title = f'individual {seed}, estimated from lengths and tensions'
@@ -267,7 +276,7 @@ def appearance(study: Study, rows: Rows) -> Plot:
 
 
 def tracking(study: Study, rows: Rows) -> Plot:
-    """Draw the joint angles from before the grasp to after the first rupture."""
+    """Draw the true and estimated joint angles during the grasp and the first rupture."""
     (seed, (_, trace)), robot = first_individual(rows), study.robot
     shown, time = _plot_range(trace)
     count = robot.joint_count
@@ -292,7 +301,7 @@ def tracking(study: Study, rows: Rows) -> Plot:
 
 
 def cuts(_: Study, rows: Rows) -> Plot:
-    """Draw the level and the detection delay of every rupture."""
+    """Draw the anomaly A, the distance d and the detection delay of every rupture."""
     numbers = [row.numbers for row in rows.values()]
     ruptured = list(numbers[0]['cuts'])
     figure, panels = plots.new_figure(12.0, 0.42 * len(ruptured) + 1.9, 1, 3, sharey=True)

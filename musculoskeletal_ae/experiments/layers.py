@@ -56,7 +56,10 @@ ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is 
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results of the first individual; nothing for the others."""
+    """Measure networks with other hidden layers on the first individual.
+
+    The result of every other individual is empty.
+    """
     if seed != study.seeds[0]:
         return Measured({}, {})
     layouts = list(HIDDEN)[:QUICK_LAYOUTS] if study.quick else list(HIDDEN)
@@ -70,9 +73,11 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the mean of each number over trainings, and the ranges of the numbers in ERRORS.
+    """Return the mean of each number over the trainings, and the range of the errors.
 
-    `learned` is the number of trainings whose network was accepted, so that it learned online.
+    Each row holds the numbers of one training. Means, minima and maxima are None if every training
+    lacks the number. `learned` counts the trainings in which checkpoint validation accepted the
+    initial network; only these networks learned online.
     """
     learned = [row for row in rows if row['after_rad'] is not None]
     summary: dict[str, float | None] = {'learned': len(learned)}
@@ -86,7 +91,7 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _trained(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> dict[str, Any]:
-    """Return the numbers of one training, from a saved part if an earlier run was interrupted."""
+    """Return the numbers of one training, from its file if an interrupted run has saved them."""
     part = f'layers_{seed}_{"_".join(map(str, hidden))}_{training}'
     numbers: dict[str, Any] = study.remember(part, partial(_learn, study, seed, hidden, training))
     return numbers
@@ -113,7 +118,7 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
 
 
 def layers(_: Study, rows: Rows) -> Plot:
-    """Draw the error of each layout before and after online learning."""
+    """Draw the errors of each choice of hidden layers, before and after online learning."""
     seed, row = first_individual(rows)
     trained = row.traces['layers']
     groups = {

@@ -3,11 +3,16 @@
 
     min_θ Σ_m (l_m − l_m(θ, T))² / (σ_l² + (∂L_e/∂T)² (σ_T² + (μ_m T_m)²))
 
-With the true routes and elastic constants, this is the oracle: a reference that estimators without
-further knowledge can hardly beat. The oracle takes friction as zero and does not know the offsets
-and gains of the sensors. With the geometric model, this is the classical estimator without
-learning. With the calibrated body of a learner, its error shows which part of the network's error
-is due to the body.
+Here l_m(θ, T) is the length of muscle m by the body model. σ_l and σ_T are the standard deviations
+of the measured lengths and tensions, ∂L_e/∂T is the compliance of the series elastic element, and
+μ_m is the tendon friction. The body model determines the purpose of the estimator:
+
+- With the true routes and elastic constants, it is the oracle: a reference that estimators without
+  further knowledge can hardly beat. The oracle assumes zero friction and does not know the offsets
+  and gains of the sensors.
+- With the geometric model, it is the classical estimator without learning.
+- With the calibrated body of a learner, its error shows which part of the network's error is due to
+  the body.
 """
 
 from collections.abc import Callable
@@ -43,7 +48,10 @@ class LeastSquares:
     friction: Array | float = 0.0  # tendon friction μ (M,); 0 if it is unknown
 
     def estimate(self, tension: Array, length: Array) -> Array:
-        """Return θ [rad] (N, D) for T [N] (N, M) and l [m] (N, M), starting at mid-range."""
+        """Return θ [rad] (N, D) for T [N] (N, M) and l [m] (N, M).
+
+        The iterations start in the middle of the joint ranges.
+        """
         lower, upper = self.robot.lower, self.robot.upper
         theta = np.tile(0.5 * (lower + upper), (len(tension), 1))
         absolute = self.length_at_zero + self.lengths(theta, np.zeros_like(tension))
@@ -91,7 +99,10 @@ def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
 
 
 def on_calibrated_body(robot: Robot, body: CalibratedBody) -> LeastSquares:
-    """Return the estimator that uses a calibrated body, averaged over both friction directions."""
+    """Return the estimator that uses a learner's calibrated body with its mean lengths.
+
+    The mean is taken over both directions of friction in every tendon.
+    """
 
     def lengths(theta: Array, tension: Array) -> Array:
         return body.lengths(theta, tension, np.zeros_like(tension))[0]
@@ -107,11 +118,11 @@ def on_calibrated_body(robot: Robot, body: CalibratedBody) -> LeastSquares:
 
 
 def oracle_errors(arm: Arm, seed: int, recording: Recording) -> dict[str, float]:
-    """Return the errors of the oracle on messages of an arm [rad].
+    """Return the mean errors [rad] of the oracle on the messages of an arm.
 
-    `oracle_rad` uses the recorded messages. `sensor_rad` uses messages that are recomputed without
-    friction, so that only the errors of the sensors act: noise, offsets, and gains of the tension
-    sensors.
+    `oracle_rad` is the error on the recorded messages. `sensor_rad` is the error on messages that
+    are recomputed without friction. They contain sensor errors only: noise, offsets, and gain
+    errors of the tension sensors.
     """
     body, part = arm.individual, recording.part(EVERY)
     estimator = oracle(arm.robot, body)

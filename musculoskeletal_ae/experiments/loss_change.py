@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation under external forces and constraints.
 
-Paper (§IV-D). The elbow is bent to 90°, −50 N in z and 50 N in y act on the hand, then S-p is
-forced to 30°.
+Paper (§IV-D). The elbow is bent to 90°. A force of −50 N in z acts on the hand, then one of 50 N
+in y. Then the shoulder pitch S-p is forced to 30°.
 
 Here. The elbow is flexed to 90°. A force of −50 N in z acts on the hand, then one of 50 N in y.
 Then the shoulder is held at 30° and released. Each preset runs its own simulator on its networks
-before and after learning; preset `paper` minimises L_sim,2 while the shoulder is held, and
-L_sim,1 in all other phases. Each preset's `proposed` computes the command that holds the posture,
-with its learned network. The same forces act on an emulated arm with the same command. Its joints
-cannot be held at an angle, so it is compared in the first three phases only. On robots without
-elbow_pitch and shoulder_pitch, joints named elbow and shoulder take their roles, or else the last
-and the first revolute joint.
+before and after learning. Preset `paper` minimises the paper's loss L_sim,2 while the shoulder is
+held, and L_sim,1 in all other phases. The command that holds the flexed posture comes from method
+`proposed` of each preset, with its learned network. The same forces act on an emulated arm with the
+same command. The joints of the emulated arm cannot be held at an angle, so it is compared in the
+first three phases only. On robots without joints named elbow_pitch and shoulder_pitch, joints named
+elbow and shoulder replace them, or else the last and the first revolute joint.
 """
 
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ ENDS = np.cumsum([round(phase.duration / STEP) for phase in PHASES]) - 1
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Simulate all phases with the networks of one individual; compare with its emulated arm."""
     robot = study.robot
     theta = np.clip(np.zeros(robot.joint_count), robot.lower, robot.upper)
     theta[elbow(robot)] = flexed(robot)
@@ -89,10 +89,12 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
-    """Return the states of arm and simulators at the end of each phase, by name of the phase.
+    """Return the final states of the arm and of the simulators, by name of the phase.
 
-    `flexed_rad` and `forced_rad` are the angles of the joint to flex and of the joint to force.
-    `error_rad` and `error_n` are the distances of a simulator from the arm.
+    `flexed_rad` is the angle of the flexed joint (the elbow), and `forced_rad` that of the forced
+    joint (the shoulder). `error_rad` and `error_n` are the distances between a simulator and the
+    arm, in θ and in T. In the phases in which the arm does not take part, its values and these
+    distances are missing.
     """
     numbers = dict[str, Any]()
     for phase, end in zip(PHASES, ENDS, strict=True):
@@ -116,9 +118,10 @@ def _numbers(robot: Robot, motions: Mapping[str, Motion]) -> dict[str, Any]:
 
 
 def _command(robot: Robot, mae: Mae, theta: Array, preset: str) -> Array:
-    """Return the length command [m] (M,) by which `proposed` of a preset holds θ [rad] (D,).
+    """Return the length command [m] (M,) by which a preset's method `proposed` holds θ [rad] (D,).
 
-    If a muscle has no range of tensions, the command is that for T_bias on the geometric model.
+    If T_limit does not exceed T_bias for a muscle, the command holds the lengths of the geometric
+    model at T_bias instead.
     """
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     if (limits.limit <= limits.bias).any():
@@ -167,7 +170,7 @@ def _phases(numbers: dict[str, Any]) -> list[str]:
 
 
 def loss_change(study: Study, rows: Rows) -> Plot:
-    """Draw joint angles and tensions over time, a column for each preset."""
+    """Draw joint angles and tensions of simulator and arm over time, a column for each preset."""
     (seed, row), robot = first_individual(rows), study.robot
     presets = list(row.traces)
     figure, panels = plots.new_figure(
@@ -209,7 +212,7 @@ def loss_change(study: Study, rows: Rows) -> Plot:
 
 
 def loss_change_pictures(study: Study, rows: Rows) -> Plot:
-    """Draw the arm at the end of each phase."""
+    """Draw the simulated arm at the end of each phase."""
     seed, (numbers, traces) = first_individual(rows)
     names = [name.replace('\n', ' ') for name in _phases(numbers)[:4]]
     moments = dict(zip(names, map(int, ENDS[:4]), strict=True))

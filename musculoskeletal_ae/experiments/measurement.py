@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run of `experiment`: measures, and writes results, plots, report and pages."""
+"""Run the command `experiment`: measure, and write results, plots, report and pages."""
 
 import json
 import tempfile
@@ -29,7 +29,12 @@ BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 
 
 def measure(args: Namespace) -> None:
-    """Run the experiments as the options specify; write results, plots and report."""
+    """Run the experiments that the options name; write results, plots, report and pages.
+
+    Raises:
+        MusculoskeletalError: After writing, if some of the experiments failed.
+        KeyboardInterrupt: If the run was interrupted; nothing is written to the output folder.
+    """
     start = time.perf_counter()
     names, robot = args.names, Robot.load(args.robot)
     if args.readme:  # check the file before hours of work
@@ -66,7 +71,7 @@ def measure(args: Namespace) -> None:
 
 @contextmanager
 def _work_folder(args: Namespace) -> Iterator[Path]:
-    """Yield the folder of networks and recordings: that of `--keep`, or a temporary one.
+    """Yield the folder for networks and recordings: the folder of `--keep`, or a temporary folder.
 
     Raises:
         MusculoskeletalError: If the kept folder belongs to a run with other options, or contains

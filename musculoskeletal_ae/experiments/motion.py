@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion.
 
-Paper (§IV-C). Postures are approached in 5 s. The paper shows no fast motion.
+Paper (§IV-C). The arm approaches each posture in 5 s. The paper shows no fast motion.
 
 Here. After learning, the arm follows minimum-jerk trajectories in 1 s and in 2 s between random
 postures that the true body can hold, and rests for 0.6 s after each. Inverse dynamics computes the
 commands. Three other methods receive the same postures as targets and approach them in the same
 time: `proposed` by a trajectory of its own, `first` and `second` by ramps of the lengths. `tension`
 receives the desired posture in every message. The controller may use the full speed of the emulated
-winches. Where they cannot follow, a trajectory is slowed, and errors refer to the slowed
-trajectory. Afterwards, `target_pose` moves the hand along circles of 10 cm diameter at 0.1 m/s,
-with 50 poses a second; a planar arm draws them in its plane. Then forces of 10 to 50 N in random
-directions push the hand: that of the resting arm for 1.5 s, and that of the exploring arm for 1 s.
-At rest, a joint stop may carry a part of the force. In method `float` the arm is first left alone,
-and then guided with 15 to 20 N. If the controller stops on a trajectory, the individual fails. If
-another method stops, or if no circle is reachable, the number of that method or of the circles is
-missing.
+winches. A trajectory that is too fast for the winches is slowed, and errors refer to the slowed
+trajectory. Afterwards, the hand moves along circles of 10 cm diameter at 0.1 m/s, for which
+`target_pose` receives 50 poses a second. A planar arm draws the circles in its plane. Then forces
+of 10 to 50 N in random directions push the hand: for 1.5 s while the arm rests, and for 1 s while
+it explores. At rest, a joint stop may carry a part of the force. In method `float`, the arm is
+first left alone, and then guided with 15 to 20 N. If the controller stops on a trajectory, the
+experiment fails for this individual. If it stops in another method, the numbers of this method are
+missing. If no circle is reachable, the error on circles is missing.
 
 - tracking: mean of ‖θ_desired − θ_true‖ over the motion
 - settled: the same distance 0.5 s after the end of the motion
@@ -24,7 +24,8 @@ missing.
 - attainable: the same ratio if the least T also overcomes winch drag and friction
 - settle: time from a target of `proposed` until the arm stays within 0.05 rad of it
 - wrench_error: |‖F_est‖ − ‖F‖| / ‖F‖ in the last half second of a push
-- false contacts: contacts found in one hour of healthy exploration (shared by the individuals)
+- false contacts: contacts that are detected in one hour of exploration (shared by the individuals)
+  without external forces
 """
 
 from collections.abc import Callable
@@ -86,22 +87,28 @@ LAP = 2.0 * np.pi * RADIUS / SPEED  # duration of a circle [s]
 
 
 class TrackedMotion(NamedTuple):
-    """One motion of N messages: desired and true posture, and tension."""
+    """Desired and true postures of one motion and the rest after it, and the tensions.
+
+    N messages cover the motion and the rest, and the first N' of them the motion itself.
+    """
 
     desired: Array  # desired θ [rad], (N, D)
     theta: Array  # true θ [rad], (N, D)
-    tension: Array  # true ‖T‖ during the motion itself [N], (N',)
+    tension: Array  # true ‖T‖ during the motion [N], (N',)
     bound: Array  # the bounds of ‖T‖ during the motion, see `bounds` [N], (…, N')
     slowed: float  # factor by which the trajectory was slowed
 
     @property
     def error(self) -> Array:
-        """‖θ_desired − θ_true‖ [rad], (N,)."""
+        """Distance ‖θ_desired − θ_true‖ at each message [rad], (N,)."""
         return np.linalg.norm(self.desired - self.theta, axis=1)
 
 
 def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> ClosedLoop:
-    """Return a loop for motions of `duration` [s] by a method; its arm is at `start` [rad] (D,)."""
+    """Move an arm to `start` [rad] (D,); return its closed loop with a control method.
+
+    The settings of the method are chosen such that its motions take `duration` [s].
+    """
     # A ramp takes RAMP_SHARE of the duration that its setting states. Method `second` has two
     # ramps.
     ramp = duration / RAMP_SHARE
@@ -123,7 +130,13 @@ def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> C
 def follow(
     loop: ClosedLoop, start: Array, goal: Array, method: str, duration: float
 ) -> TrackedMotion:
-    """Move from `start` to `goal` [rad] (D,) in `duration` [s] by a method; return the motion."""
+    """Move from `start` to `goal` [rad] (D,) in `duration` [s] with a control method.
+
+    The returned motion includes the rest after it.
+
+    Raises:
+        MusculoskeletalError: If the controller stopped.
+    """
     core, arm = loop.core, loop.arm
     planned = Trajectory.to(Setpoint.resting(start), goal, duration)
     if method == OURS:
@@ -170,8 +183,9 @@ def bounds(arm: Arm, motion: Setpoint) -> Array:
     """Return the least ‖T‖ [N] that moves the true, exactly known body along a path.
 
     Returns:
-        Rows (2, N) or (3, N): by inverse dynamics alone; also with the drag of the winches; and,
-        for emulator model `kin` only, also with the friction of tendons and joints.
+        An array (2, N) or (3, N) for N points of the path. The first row follows from inverse
+        dynamics alone. The second row adds the drag of the winches. The third row also adds the
+        friction of tendons and joints; it exists for emulator model `kin` only.
     """
     robot, limits, true = arm.robot, arm.robot.tension, arm.individual
     jacobian, bias = true.muscle_jacobian(motion.theta), limits.bias
@@ -194,7 +208,11 @@ def bounds(arm: Arm, motion: Setpoint) -> Array:
 def circles(
     robot: Robot, mae: Mae, rng: np.random.Generator, count: int
 ) -> list[tuple[Array, Place]]:
-    """Return random reachable circles: a start posture, and the hand's desired pose over time."""
+    """Return at most `count` random circles that the hand can follow.
+
+    Each circle consists of a start posture [rad] (D,), and of a function that returns the desired
+    pose of the hand at a time [s]. `mae` decides whether the arm can hold the postures on the way.
+    """
     reachable = list[tuple[Array, Place]]()
     for theta, _ in holdable_postures(robot, robot.random_postures(TRIES, rng), 40):
         centre = robot.kinematics.end_effector_pose(theta).translation
@@ -238,7 +256,7 @@ def circle(loop: ClosedLoop, start: Array, place: Place) -> tuple[Array, Array]:
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Measure tracking with every control method, circles of the hand, and contact."""
     mae, rng = study.network(seed), np.random.default_rng([seed, 0x307])
     robot = study.robot
     count = 1 if study.quick else MOTIONS
@@ -297,7 +315,7 @@ def _summary(runs: list[TrackedMotion]) -> dict[str, float]:
 
 
 def motion(_: Study, rows: Rows) -> Plot:
-    """Draw the tracking error of the first individual over time."""
+    """Draw the tracking errors of the first individual over time."""
     seed, row = first_individual(rows)
     figure, panels = plots.new_figure(11.0, 6.4, 2)
     for panel, duration in zip(panels, DURATIONS, strict=True):
@@ -315,7 +333,7 @@ def motion(_: Study, rows: Rows) -> Plot:
 
 
 def motion_hand(_: Study, rows: Rows) -> Plot:
-    """Draw the circles of the hand, desired and true, each in its plane."""
+    """Draw the desired and the true circles of the hand, each in the plane of the circle."""
     seed, row = first_individual(rows)
     laps = row.traces['laps']
     figure, panels = plots.new_figure(4.0 * max(len(laps), 1), 4.2, 1, max(len(laps), 1))

@@ -5,15 +5,16 @@ Paper (§IV-A). The arm learns during ten minutes of random motion in three step
 `second`, 3 s random tension, T_bias 30 N, T_limit 200 N). The exponential fit of the error falls
 from 0.324 to 0.154 rad.
 
-Here. The initial network knows only the geometric model. Each preset explores by itself, as the
-nodes do: in closed loop through estimator and controller, with the network that is being trained.
-Preset `paper` moves to random postures. The default preset puts a quarter of the joint targets at
-their limits, where stops reveal the offsets of the joint sensors. "Same stream" is preset `paper`
-trained on the messages of the default preset’s exploration. All are evaluated on one held-out
-motion, a fixed list of commands to random postures from a random stream that is never used for
-learning. The error is ‖θ_est − θ_true‖, the 2-norm over all joints, averaged over all messages at
-100 Hz, in motion and at rest, with the true joint angles of the emulator. Oracle: weighted least
-squares on one message with the true routes, elastic constants and noise; friction is taken as zero.
+Here. The initial network knows only the geometric model. With each preset, the arm explores on its
+own, as with the nodes: in closed loop through estimator and controller, with the network that is
+being trained. Preset `paper` moves to random postures. The default preset puts a quarter of the
+joint targets at joint limits, where the joint stops reveal the offsets of the joint sensors. "Same
+stream" is preset `paper` trained on the messages of the default preset’s exploration. All networks
+are evaluated on the held-out motion. It follows a fixed list of commands to random postures, whose
+random seed is never used for learning. The error is ‖θ_est − θ_true‖, the 2-norm over all joints,
+averaged over all messages at 100 Hz, in motion and at rest. θ_true are the joint angles of the
+emulated arm. The oracle is weighted least squares on one message with the true routes, elastic
+constants and noise; it assumes zero friction.
 """
 
 import json
@@ -92,9 +93,10 @@ def teach(
     stream: Iterable[tuple[Array, ...]],
     view: JointView = lambda _learner, _n, _true, read: read,
 ) -> None:
-    """Feed the rows of a recording to a learner one by one, as the node feeds messages.
+    """Feed the messages of a recording to a learner one by one, as the learner node does.
 
-    The learner receives the joint-sensor readings, unless `view` replaces them.
+    For each message, `view` returns the joint angles [rad] that the learner receives, or None. By
+    default, these are the joint-sensor readings.
     """
     for n, (true, read, length, tension, _) in enumerate(stream):
         learner.step(n * SAMPLE_TIME, view(learner, n, true, read), tension, length)
@@ -103,10 +105,10 @@ def teach(
 def teach_and_evaluate(
     learner: Learner, stream: Iterable[tuple[Array, ...]], held_out: Recording
 ) -> tuple[Curve, Recording]:
-    """Feed messages to a learner, and evaluate each of its networks on the held-out motion.
+    """Feed messages to a learner, and evaluate it on the held-out motion after each update.
 
     Returns:
-        The course of learning, and the messages.
+        The course of learning, and a recording of the messages.
     """
     samples, rows, running = list[int](), list[tuple[Array, ...]](), list[float]()
     errors, mae, direction = list[float](), None, FrictionDirection()
@@ -127,7 +129,7 @@ def teach_and_evaluate(
 
 
 def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:
-    """Yield the messages of `duration` [s] of exploration with the learner's latest network."""
+    """Explore for `duration` [s] with the learner's latest network; yield each message."""
     for _ in range(round(duration / SAMPLE_TIME)):
         if learner.mae is not loop.mae:
             loop.use(learner.mae)
@@ -135,7 +137,7 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
 
 
 def train_initial(study: Study, preset: str) -> None:
-    """Train a network on the geometric model; save it and the course of its errors."""
+    """Train a preset's network on the geometric model; save it and its errors during training."""
     robot, rows = study.robot, list[list[float]]()
     test = preset_named(preset).training_states(robot, TEST_STATES, np.random.default_rng([0, 2]))
 
@@ -155,7 +157,10 @@ def train_initial(study: Study, preset: str) -> None:
 
 
 def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
-    """Return a learner with the initial network, which learns from the θ of `source`."""
+    """Return a learner that starts with the initial network of a preset.
+
+    `source` names where its joint angles come from, such as the joint sensors.
+    """
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
 
@@ -219,7 +224,10 @@ def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) 
 
 
 def samples_to_halve(curve: Curve) -> int | None:
-    """Return the number of samples after which the error stays halved, or None if it never does."""
+    """Return after how many samples the error stays below half its initial value.
+
+    Return None if the last error still exceeds this half.
+    """
     above = [i for i, error in enumerate(curve.errors) if error > 0.5 * curve.errors[0]]
     return None if above[-1] + 1 >= len(curve.errors) else curve.samples[above[-1] + 1]
 
@@ -239,7 +247,7 @@ def exponential_fit(time: Array, error: Array) -> Array:
 
 
 def initial_training(study: Study, _: Rows) -> Plot:
-    """Draw the errors of both presets during initial training."""
+    """Draw the errors of the networks of both presets during their initial training."""
     figure, panels = plots.new_figure(12.0, 6.2, 2, 3, sharex='row')
     for p, (preset, colour) in enumerate(COLOURS.items()):
         step, *errors = np.load(study.folder / f'{preset}_initial.npy').T
@@ -259,7 +267,11 @@ def initial_training(study: Study, _: Rows) -> Plot:
 
 
 def online_learning(study: Study, rows: Rows) -> Plot:
-    """Draw the running error with its exponential fit, and the held-out error over samples."""
+    """Draw how the errors of all individuals fall while they learn.
+
+    The left panel shows the errors over the time of exploration, with an exponential fit. The right
+    panel shows the error on the held-out motion over the number of rest samples.
+    """
     figure, (left, right) = plots.new_figure(12.0, 5.2, 1, 2, width_ratios=(3, 2))
     every = round(1.0 / SAMPLE_TIME)
     for preset, colour in COLOURS.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page that shows every figure and number of the paper beside ours.
+"""The page that compares every figure and number of the paper with the results of this package.
 
     python -m musculoskeletal_ae.experiments.paper_page doc/results/paper.md
 
@@ -113,7 +113,7 @@ def text(results: Results, folder: Path) -> str:
 
 
 def rows(results: Results, name: str, table: str = '') -> str:
-    """Return a table of an experiment as Markdown; '' if the experiment was not run.
+    """Return a table of an experiment as Markdown, or '' if the experiment was not run.
 
     Args:
         results: All results.
@@ -132,7 +132,7 @@ def rows(results: Results, name: str, table: str = '') -> str:
 
 
 def number(values: Mapping[str, Any], key: str, digits: int = 3) -> str:
-    """Return a number as text; a dash if it was not measured."""
+    """Return the number with this key as text, or a dash if it was not measured."""
     value = values.get(key)
     return NOTHING if value is None else f'{value:.{digits}f}'
 
@@ -142,7 +142,7 @@ def _who(result: Mapping[str, Any]) -> str:
 
 
 def _reduced(file: Path) -> bytes:
-    """Return the picture in a file as a PNG of at most LARGEST bytes, with a palette."""
+    """Return a picture as a PNG with a colour palette, reduced to at most LARGEST bytes."""
     from PIL import Image  # matplotlib depends on it
 
     with Image.open(file) as opened:

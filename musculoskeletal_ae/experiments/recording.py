@@ -57,13 +57,13 @@ class Motion(NamedTuple):
 
 
 class ClosedLoop:
-    """An arm, the estimate and the controller, connected as the nodes connect them.
+    """An emulated arm, the estimator and the controller, connected as the nodes connect them.
 
-    sense → estimate → control → command
+    Each message passes through sense → estimate → control → command.
     """
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
-        """Connect an arm in its present posture. `seed` determines the exploration."""
+        """Connect an arm in its present posture; `seed` determines the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self._direction = FrictionDirection()
         self._read, self._now = arm.sense(), 0.0
@@ -98,10 +98,14 @@ class ClosedLoop:
         return self.mae.estimate(known, read.length).theta
 
     def on_command(self, command: Command | None, now: float) -> None:
-        """Handle the command at `now` [s]; subclasses override this."""
+        """Do nothing; subclasses that need the command at `now` [s] override this."""
 
     def explore(self) -> tuple[Array, ...]:
-        """Reset a stop whose cause has cleared, then explore for one message; see `step`."""
+        """Explore for one message, and return a row of a recording.
+
+        If the controller has stopped, it is reset first, which succeeds as soon as the cause of the
+        stop has cleared.
+        """
         core = self.core
         supervisor = core.supervisor
         if not supervisor.is_running and core.reset(self._now) is None:
@@ -114,13 +118,13 @@ class ClosedLoop:
         """Move towards θ [rad] (D,) for `duration` [s].
 
         Raises:
-            MusculoskeletalError: If the controller stopped meanwhile.
+            MusculoskeletalError: If the controller has stopped at the end.
         """
         self.approach(theta, duration)
         self.check()
 
     def approach(self, theta: Array, duration: float) -> None:
-        """Move towards θ [rad] (D,) for `duration` [s]; do not report a stop of the controller."""
+        """Move towards θ [rad] (D,) for `duration` [s], and ignore a stop of the controller."""
         self.target(theta)
         self.wait(duration)
 
@@ -147,16 +151,19 @@ def record(
 
     Every command is computed by method `first`. Method `second` would need the current tension,
     which a fixed list cannot contain. The step of `second` is therefore replaced by `first` with
-    the least tension that holds the posture on the geometric model. While a muscle is switched off,
-    all modules follow tensions: 0 N for this muscle, and those of muscle stiffness control for all
-    other muscles. If the modules are position-controlled, the switched-off one is paid out instead.
+    the least tension that holds the posture on the geometric model.
+
+    While a muscle is switched off, all muscle modules receive tension commands: 0 N for this
+    muscle, and the tensions of muscle stiffness control for all other muscles. Position-controlled
+    modules have no such tensions. They follow their lengths, and the tendon of the switched-off
+    muscle is paid out instead.
 
     Args:
         arm: The arm.
         mae: The network that computes the commands.
-        stream: Random seed of the postures, or the steps themselves.
+        stream: Random seed of the exploration steps, or the steps themselves.
         duration: Duration [s], rounded up to whole steps.
-        script: Called before every message.
+        script: Function that is called before every message; see `Script`.
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts at the present lengths, so that the command does not jump.
@@ -183,7 +190,7 @@ def record(
 
 
 def columns(rows: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Return rows of equal length as one array for each column."""
+    """Convert rows of equal length to a tuple with one array for each column."""
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 

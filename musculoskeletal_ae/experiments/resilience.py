@@ -6,19 +6,20 @@ successor of the method (arXiv 2409.14951) continues without a ruptured muscle.
 
 Here. The held-out motion is estimated with all muscles, without each muscle and without each pair
 of muscles. Then the arm explores in closed loop through estimator and controller, with `on_anomaly:
-isolate`, until a muscle ruptures. An isolation is correct if the first verification ends within 16
-s and leaves exactly this muscle isolated. Afterwards, `proposed` moves the arm to random postures
-that the true body can hold without the muscle, for at most a minute each. Every muscle is ruptured
-in turn. In the same way, every length sensor and every tension sensor fails in turn: it reads 0.
-The error of the estimate is averaged from the isolation on, or from the fault if nothing is
+isolate`, until a muscle ruptures. The estimator isolates the suspect muscle, and the controller
+then verifies it. An isolation is correct if the first verification ends within 16 s and leaves
+exactly the ruptured muscle isolated. Afterwards, `proposed` moves the arm to random postures that
+the true body can hold without the muscle, for at most a minute each. Every muscle is ruptured in
+turn. In the same way, every length sensor and every tension sensor fails in turn: it reads 0. The
+error of the estimate is averaged from the isolation on, or from the fault on if nothing is
 isolated. Finally, healthy arms explore for five hours, shared by the individuals. They grasp or
 release 3.6 kg each minute, and a force of 10 to 30 N acts on the hand for one of every ten seconds.
-Every isolation of these hours is wrong.
+Every isolation in these hours counts as wrong.
 
-- held: share of the holdable postures that remain holdable without the muscle; if there are none,
-  the muscle has no targets, but its other numbers count
-- known: share of the targets that the learned body considers holdable; the controller refuses
-  others
+- held: share of the holdable postures that remain holdable without the muscle. If none remain, no
+  targets are approached without this muscle, but its other numbers count.
+- known: share of the targets that the learned body considers holdable. The controller refuses all
+  other targets.
 - trapped: number of targets whose motion ended at a joint stop, in a posture that the remaining
   muscles can neither hold nor leave
 """
@@ -62,7 +63,7 @@ PUSH = (10.0, 30.0)  # range of the forces of pushes [N]
 
 
 class IsolatingLoop(ClosedLoop):
-    """A closed loop with the estimator's detector, which isolates faulty muscles."""
+    """A closed loop in which the estimator detects faulty muscles and isolates them."""
 
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
         """Connect an arm at rest."""
@@ -97,7 +98,7 @@ class IsolatingLoop(ClosedLoop):
         return estimate.state.theta
 
     def on_command(self, command: Command | None, now: float) -> None:
-        """Pass the command on to the estimator."""
+        """Inform the estimator of the command, which its detector compares with the sensors."""
         if command is not None:
             self.estimator.commanded(now, **{command.kind: command.value})
 
@@ -123,8 +124,8 @@ def run_with_fault(
         sensor: 'length' or 'tension' for a sensor that fails; '' for a rupture.
 
     Returns:
-        The loop, and the errors [rad] from the isolation on; from the fault on if no muscle is
-        isolated.
+        The loop, and the errors of the estimate [rad] since the isolation, or since the fault if no
+        muscle was isolated.
     """
     loop = IsolatingLoop(arm, mae, seed)
     loop.run(1.0)
@@ -146,7 +147,7 @@ def run_with_fault(
 
 
 class Reach(NamedTuple):
-    """The postures that an arm can hold and approach without a muscle.
+    """Measures of which postures an arm can hold and approach without one of its muscles.
 
     Attributes:
         share: Share of the holdable postures of the true body that remain holdable.
@@ -164,7 +165,7 @@ class Reach(NamedTuple):
 def measure_reach(
     loop: IsolatingLoop, muscle: int, rng: np.random.Generator, targets: int
 ) -> Reach:
-    """Measure which postures an arm can hold without a muscle, and approach some of them."""
+    """Measure which postures an arm can hold without a muscle, and approach `targets` of them."""
     robot, held, count = loop.arm.robot, [], 0
     reduced_robot = robot.without([muscle])
     postures = robot.random_postures(TRIES, rng)
@@ -207,7 +208,11 @@ def measure_reach(
 def isolations_of_healthy_arm(
     arm: Arm, mae: Mae, seed: int, duration: float
 ) -> list[tuple[int, ...]]:
-    """Return the muscles that each verification isolated on a healthy arm; () stands for none."""
+    """Let a healthy arm explore for `duration` [s]; return which muscles are wrongly isolated.
+
+    The result has one tuple of muscles for each verification of a suspect. The tuple is empty if
+    the verification isolates no muscle.
+    """
     loop, rng = IsolatingLoop(arm, mae, seed), np.random.default_rng([seed, 0x4EA])
     loop.run(1.0)
     every, wrench = round(PUSH_EVERY / SAMPLE_TIME), np.zeros(6)
@@ -225,7 +230,7 @@ def isolations_of_healthy_arm(
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Measure how well one individual continues without each muscle and with each faulty sensor."""
     robot, mae, rng = study.robot, study.network(seed), np.random.default_rng([seed, 0x2E5])
     stream, stride = study.stream(seed, 'held_out'), EVERY * (10 if study.quick else 1)
     error = make_error_function(stream, stride)
@@ -276,7 +281,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def isolated(study: Study, rows: Rows) -> Plot:
-    """Draw the error of the estimate without each muscle, relative to that with all muscles."""
+    """Draw the estimation error without each muscle, relative to the error with all muscles."""
     figure, (panel,) = plots.new_figure(8.0, 0.35 * study.robot.muscle_count + 1.5)
     place = np.arange(study.robot.muscle_count)
     for row in rows.values():

@@ -45,10 +45,12 @@ NOTHING = '–'
 def write(
     study: Study, measured: Mapping[str, Mapping[int, Measured | str]], out: Path
 ) -> list[Path]:
-    """Write result.json and the plots of every experiment to a folder; return the files.
+    """Write result.json and the plots of every experiment to a folder.
 
-    Plots are written as PNG and, except in a shortened run, also as PDF. The PDF files are not
-    among the returned ones.
+    Plots are written as PNG and, except in a shortened run, also as PDF.
+
+    Returns:
+        The written files except the PDF files.
 
     Raises:
         MusculoskeletalError: If a number is not finite.
@@ -97,7 +99,7 @@ class Plot(Strict, frozen=True):
 
 
 class Result(Struct, frozen=True):
-    """Contents that all result.json files share, beside the numbers of their experiment."""
+    """Entries that every result.json has, besides the numbers of its experiment."""
 
     about: About
     seeds: dict[str, dict[str, Any]]  # numbers of each individual, by its seed
@@ -106,7 +108,10 @@ class Result(Struct, frozen=True):
 
 
 def read(folder: Path) -> Results:
-    """Read every result.json in a folder, by experiment; skip damaged files with a warning."""
+    """Return the content of every result.json in a folder, by name of the experiment.
+
+    A damaged file is skipped with a warning.
+    """
     results: dict[str, Any] = {}
     for name in EXPERIMENTS:
         file = folder / name / 'result.json'
@@ -169,7 +174,10 @@ class Cells(NamedTuple):
 
 
 class Row(Strict, frozen=True):
-    """One quantity of an experiment; keys are dotted paths in its result.json."""
+    """One row of the results table, which shows a quantity of an experiment.
+
+    A key is the path of a value in result.json, with a dot between the names.
+    """
 
     quantity: str  # name of the quantity, with its unit
     default: str  # key of the value with the preset of the run
@@ -182,7 +190,7 @@ class Row(Strict, frozen=True):
     worst: bool = False  # show the worst individual instead of the mean
 
     def number(self, result: Mapping[str, Any], key: str) -> float | None:
-        """Return the measured value of a key, or None."""
+        """Return the value of a key, or None if it was not measured."""
         if not self.worst:
             return flat(result).get(key)
         every = [flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
@@ -263,13 +271,14 @@ def failures(results: Results) -> list[str]:
 
 
 def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
-    """Rewrite the table of a page from the folder of results beside it; return the written files.
+    """Rewrite the results table of a page; return the written files.
 
-    If `measured` is a folder, its result.json files are copied to the folder of results first.
+    The numbers come from the folder of results beside the page. If `measured` is a folder, its
+    result.json files are first copied there.
 
     Raises:
         OSError: If the page cannot be read or written.
-        MusculoskeletalError: If the page does not have the two markers.
+        MusculoskeletalError: If the page lacks the marker before or after the table.
     """
     (head, rest), files = text_around_table(readme), list[Path]()
     kept = readme.parent / (KEPT.name if readme.parent.resolve().name == 'doc' else KEPT)
@@ -287,7 +296,7 @@ def text_around_table(readme: Path) -> tuple[str, str]:
     """Return the text of a page before and after the results table.
 
     Raises:
-        MusculoskeletalError: If the page does not have the two markers.
+        MusculoskeletalError: If the page lacks the marker before or after the table.
     """
     text = readme.read_text(encoding='utf-8')
     head, _, rest = text.partition(BEGIN)
@@ -339,7 +348,11 @@ def _page(folder: Path, results: Results) -> str:
 
 
 def flat(values: Mapping[str, Any], before: str = '') -> dict[str, Any]:
-    """Return the values of nested mappings in one mapping, by dotted path."""
+    """Return the values of nested mappings in a single dictionary.
+
+    Its keys are the paths of the values, with a dot between the keys of each level. `before` is
+    put before every path.
+    """
     rows: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):

@@ -8,14 +8,14 @@ Here. The default network and that of preset `paper` explore individuals of both
 in online learning. The body of `kin` differs from its geometric model only in ways that the learner
 can fit; `foreign` also has mechanics that the learner does not model. The results include the error
 of the joint sensors, because the networks learn from them. The ablation removes one group of
-effects of `foreign`, and keeps the rest of the individual.
+effects of `foreign` at a time, and leaves the rest of the individual unchanged.
 
 - oracle: least squares on one message with the true routes and elastic constants
-- informed oracle: the same with the true errors of the tension and length sensors, and the true
-  friction of each tendon. Neither oracle knows what one message does not show: the sliding
+- informed oracle: an oracle that also knows the true errors of the tension and length sensors, and
+  the true friction of each tendon. Neither oracle knows what one message does not show: the sliding
   direction of a tendon, hysteresis, creep and drift.
-- links: an additional effect, errors of link lengths, axes and masses. The paper assumes that these
-  are exact.
+- links: error with an additional effect, wrong link lengths, axes and masses. The paper assumes
+  that these are exact.
 """
 
 import json
@@ -66,7 +66,10 @@ OTHER_RUN = 1000  # number that is added to the seed of exploration and training
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Measure an individual of each emulator model, with the ablation for the first few seeds."""
+    """Measure the errors of one individual of each emulator model.
+
+    The ablation of `foreign` is measured for the first ABLATION_INDIVIDUALS seeds only.
+    """
     parts = {reality: _study_of_model(study, seed, reality) for reality in REALITIES}
     numbers: dict[str, Any] = {at: _numbers(part, seed) for at, part in parts.items()}
     if not study.quick:
@@ -84,7 +87,11 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _study_of_model(study: Study, seed: int, reality: str) -> Study:
-    """Return the study of an emulator model, after online learning on this model if necessary."""
+    """Return a study whose individuals have the emulator model `reality`.
+
+    If the given study has another model, the individual of `seed` first learns online with this
+    one.
+    """
     if reality == study.reality:
         return study
     part = replace(study, reality=reality, folder=study.folder / reality)
@@ -140,10 +147,13 @@ def _informed_oracle_error(arm: Any, recording: Recording) -> float:
 def _error_with_effects(
     study: Study, seed: int, effects: Mapping[str, float], run: int | None = None
 ) -> float:
-    """Return the error after learning [rad] on an individual with other sizes of some effects.
+    """Return the error [rad] of an individual of `foreign` after learning with changed effects.
 
-    `effects` has the new sizes by name. `run` is the seed of exploration and training, by default
-    the seed of the individual.
+    Args:
+        study: The study of the emulator model `foreign`.
+        seed: Seed of the individual.
+        effects: Sizes of the changed effects by name; 0 removes an effect.
+        run: Seed of exploration and training, by default the seed of the individual.
     """
     from musculoskeletal_ae.emulator.effects import Effects
     from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -196,7 +206,7 @@ def foreign(_: Study | None, rows: Rows) -> Plot:
 
 
 def ablation(_: Study | None, rows: Rows) -> Plot:
-    """Draw the change of the error without each group of effects of emulator model `foreign`."""
+    """Draw how the error changes if one group of effects of `foreign` is removed."""
     known = {seed: row.numbers for seed, row in rows.items() if row.numbers.get('ablation_rad')}
     ablated = {seed: numbers['ablation_rad'] for seed, numbers in known.items()}
     changes = {

@@ -12,7 +12,7 @@ ELBOW, SHOULDER = ('elbow_pitch', 'elbow'), ('shoulder_pitch', 'shoulder')
 
 
 def elbow(robot: Robot) -> int:
-    """Return the joint to flex, in the role of elbow_pitch.
+    """Return the index of the joint that plays the role of elbow_pitch in the experiments.
 
     This is the first revolute joint with "elbow_pitch" in its name, or else with "elbow", or else
     the last revolute joint. Without revolute joints, it is the last joint.
@@ -23,8 +23,8 @@ def elbow(robot: Robot) -> int:
 def elbows(robot: Robot) -> Bools:
     """Return a mask of the elbow joints, (D,).
 
-    These are all joints with "elbow" in their names; if there are none, the joint that `elbow`
-    returns.
+    These are all joints with "elbow" in their names. If there are none, it is the joint whose
+    index `elbow` returns.
     """
     named = np.array([ELBOW[-1] in name for name in robot.joints])
     named[elbow(robot)] |= not named.any()
@@ -50,7 +50,7 @@ def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
 
 
 def plot_unit(robot: Robot, joint: int) -> tuple[float, str]:
-    """Return the factor and the unit by which plots show a joint's θ."""
+    """Return the factor that converts θ of a joint to the unit of plots, and that unit."""
     return (1000.0, 'mm') if robot.kinematics.slides[joint] else (math.degrees(1.0), 'deg')
 
 

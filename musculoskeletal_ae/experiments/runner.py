@@ -3,11 +3,12 @@
 
     train both presets → for each individual: record, learn → its other experiments
 
-The experiments of an individual start as soon as its network is trained. Every part has its own
-random seeds, so the results do not depend on the number of processes. If a part fails, only the
-parts that need its results are skipped. If a worker process is killed, for example by lack of
-memory, its parts run again, one at a time. A part that is running when a worker is killed for the
-second time fails.
+A part of the work is one experiment on one individual, or the initial training of one preset. The
+experiments of an individual start as soon as its network is trained. Every part has its own random
+seeds, so the results do not depend on the number of processes. If a part fails, only the parts that
+need its results are skipped. If a worker process is killed, for example for lack of memory, all
+parts that were running start again, one at a time. A part during which a worker is killed a second
+time fails.
 """
 
 import multiprocessing
@@ -39,14 +40,14 @@ def run(
 ) -> dict[str, dict[int, Measured | str]]:
     """Measure experiments on all individuals; return results by experiment and seed.
 
-    The result of a failed part is its error message.
+    If an experiment fails for an individual, its result is the error message.
 
     Args:
         study: Options of the run.
         names: Names of the experiments.
         jobs: Number of processes.
-        report: Called regularly with the completed share of the work and the names of running
-            parts.
+        report: Function that is called regularly with the completed share of the work and the
+            names of the running parts.
     """
     os.environ.update(SINGLE | dict(os.environ))
     schedule, workers = _Schedule(study, names), _Workers(study, jobs)
@@ -97,7 +98,7 @@ class _Schedule:
         return self._measured.items()
 
     def on_result(self, part: Part, result: Any) -> None:
-        """Keep the result of a part, and let the parts that need it begin."""
+        """Store the result of a part, and append the parts that need it to `waiting`."""
         name, seed = part
         self._done += self._weights[name]
         if name in self._measured:
@@ -110,7 +111,7 @@ class _Schedule:
                 self.waiting += [(LEARNING, each) for each in self._study.seeds]
 
     def on_failure(self, part: Part, error: BaseException) -> None:
-        """Note the error as the result of a part and of all parts that need it."""
+        """Store the error message as the result of a part and of all parts that need it."""
         name, seed = part
         self._done += self._weights[name]
         lost = self._names if name in (LEARNING, *PRESETS) else (name,)
@@ -133,12 +134,12 @@ class _Workers:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a part runs, or has to run again."""
+        """Whether a part is running or has to run again."""
         return bool(self._running or self._suspects)
 
     @property
     def parts(self) -> Iterable[Part]:
-        """The parts that run."""
+        """The parts that are running."""
         return self._running.values()
 
     def start_from(self, waiting: list[Part]) -> None:
@@ -172,10 +173,10 @@ class _Workers:
         STOP.raise_if_received()
 
     def ended(self) -> list[tuple[Part, Future[Any]]]:
-        """Wait for a moment; return the parts that have ended.
+        """Wait until a part ends, but at most POLL [s]; return the ended parts and their futures.
 
-        They do not include parts that were running for the first time when a process was killed,
-        because these parts run again.
+        Parts that were running for the first time when a process was killed are not returned,
+        because they run again.
         """
         ended = list[tuple[Part, Future[Any]]]()
         for future in wait(self._running, POLL, FIRST_COMPLETED).done:
@@ -190,7 +191,7 @@ class _Workers:
         return ended
 
     def abort(self) -> None:
-        """End all processes immediately, without waiting for the parts that run."""
+        """End all processes immediately, without waiting for running parts."""
         # End the processes before the pool. Otherwise, a process that is just starting would print
         # a traceback.
         for child in multiprocessing.active_children():
@@ -198,7 +199,7 @@ class _Workers:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
-        """End the processes, which have nothing left to do."""
+        """End the processes after the last part has ended."""
         self._pool.shutdown()
 
 

@@ -8,7 +8,8 @@ Here. Learners with fewer sensors learn from the messages of the default network
 which used all joint sensors. All are evaluated on the held-out motion.
 
 - all: all joint sensors
-- elbow: only the joint sensors of the elbows (joints so named, or else the last revolute joint)
+- elbow: only the joint sensors of the elbow (all joints with "elbow" in their names, or else the
+  last revolute joint)
 - none: no joint sensors
 - marker: no joint sensors, but a marker on the hand in one of ten samples, from which the estimator
   computes θ by inverse kinematics
@@ -81,7 +82,10 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def sighted(learner: Learner) -> bool:
-    """Return whether the camera detects the marker in the messages up to the next sample."""
+    """Return whether the emulated camera now detects the marker.
+
+    It does so for one of SIGHTED rest samples: from the sample before it until it is accepted.
+    """
     # Count accepted samples, because the number of stored ones is bounded.
     return learner.samples.accepted % SIGHTED == 0
 
@@ -105,7 +109,7 @@ BARS = {
 
 
 def sensors(_: Study | None, rows: Rows) -> Plot:
-    """Draw the error for each set of sensors."""
+    """Draw the errors of the learners with each set of sensors."""
     figure, (panel,) = plots.new_figure(8.0, 3.2)
     measured = {key: [row.numbers[key] for row in rows.values()] for key in BARS}
     ranked = sorted(BARS, key=lambda key: plots.mean_of_known(measured[key])[0], reverse=True)

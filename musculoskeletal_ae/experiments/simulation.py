@@ -36,7 +36,7 @@ MOMENTS = 5  # number of moments that the pictures show
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Return the results and traces of one individual."""
+    """Measure how far the simulators of one individual deviate from the emulated arm."""
     recording = study.stream(seed, 'held_out')
     arm = Motion(recording.theta, recording.tension)
     numbers, traces = dict[str, Any](), dict[str, Any]()
@@ -67,7 +67,10 @@ def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motio
 
 
 def _distances(motion: Motion, arm: Motion) -> dict[str, Array]:
-    """Return the distances of a motion from that of the arm, in θ [rad] and in T [N], (N,) each."""
+    """Return the distances between a motion and that of the arm at each step, (N,) each.
+
+    `rad` is the distance in θ [rad], and `n` the distance in T [N].
+    """
     return {
         'rad': np.linalg.norm(motion.theta - arm.theta, axis=1),
         'n': np.linalg.norm(motion.tension - arm.tension, axis=1),
@@ -80,7 +83,7 @@ def _errors(name: str, motion: Motion, arm: Motion) -> dict[str, float]:
 
 
 def simulation_pictures(study: Study, rows: Rows) -> Plot:
-    """Draw arm and simulators at several moments."""
+    """Draw the arm and its simulators at several moments."""
     seed, (_, traces) = first_individual(rows)
     arm = traces[study.preset]['arm']
     # Times near the ends of cycles, where the arm rests at the random tensions of the third step.
@@ -99,7 +102,7 @@ def simulation_pictures(study: Study, rows: Rows) -> Plot:
 
 
 def simulation_errors(_: Study, rows: Rows) -> Plot:
-    """Draw the errors over time, a column for each preset."""
+    """Draw the errors of the simulators over time, a column for each preset."""
     seed, row = first_individual(rows)
     traces = row.traces
     figure, panels = plots.new_figure(

@@ -67,7 +67,7 @@ class Study:
 
     @property
     def presets(self) -> tuple[str, ...]:
-        """Preset `paper`, and the preset of the run if that is another one."""
+        """The compared presets: `paper`, and the preset of the run if it is another one."""
         return tuple(dict.fromkeys((PAPER_PRESET, self.preset)))
 
     @property
