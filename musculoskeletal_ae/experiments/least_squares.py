@@ -99,9 +99,10 @@ def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
 
 
 def on_calibrated_body(robot: Robot, body: CalibratedBody) -> LeastSquares:
-    """Return the estimator that uses a learner's calibrated body with its mean lengths.
+    """Return the estimator that uses the calibrated body of a learner.
 
-    The mean is taken over both directions of friction in every tendon.
+    One message does not show the direction of tendon friction. The lengths of the body are
+    therefore those midway between winding in and paying out.
     """
 
     def lengths(theta: Array, tension: Array) -> Array:

@@ -72,11 +72,11 @@ class Study:
 
     @property
     def held_out_time(self) -> float:
-        """Duration of the motion that is never used for learning [s]."""
+        """Duration of the held-out motion, which is never used for learning [s]."""
         return 10.0 if self.quick else 300.0
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
-        """Return the individual of a seed at rest, with or without friction."""
+        """Return a new emulated arm at rest: the individual of a seed, with or without friction."""
         return make_arm(self.robot, seed, self.reality, friction)
 
     def network_file(self, preset: str, seed: int | None) -> Path:

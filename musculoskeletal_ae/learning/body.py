@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated body: the geometric model with fitted constants, plus a residual model.
+"""The calibrated body: the geometric model with fitted parameters, plus a residual model.
 
     l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + ψ(θ)ᵀ v
 
@@ -50,8 +50,8 @@ LARGEST_LOG = 1.5  # largest |κ|
 class Layout:
     """Positions of the parameters δ, κ, μ, o, r and v in the vector of one muscle.
 
-    δ has three values for each route point. If motor currents are measured, the vector also
-    contains γ, b and F of `Transmission`.
+    The symbols are explained in the module. δ has three values for each route point. If tensions
+    come from motor currents, the vector also contains the constants γ, b and F of `Transmission`.
     """
 
     def __init__(
@@ -73,9 +73,10 @@ class Layout:
 
 
 class ResidualModel(NamedTuple):
-    """ψ of one muscle: K random Fourier features, projected onto the F directions that vary most.
+    """Residual model ψ of one muscle, made of random Fourier features of θ.
 
-    ψ uses single precision, in which cosines take a seventh of the time of double precision.
+    K features are drawn and projected onto the F directions in which they vary most. ψ is computed
+    in single precision, in which cosines take a seventh of the time of double precision.
     """
 
     frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
@@ -130,7 +131,7 @@ class Poses(NamedTuple):
 
 
 class CalibratedBody:
-    """Computes muscle lengths of the calibrated body, and derivatives for its `parameters`."""
+    """Computes the muscle lengths of the calibrated body and their parameter derivatives."""
 
     def __init__(
         self,
@@ -175,7 +176,7 @@ class CalibratedBody:
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
-        """Return the calibrated body of one group of joints and muscles, with its parameters."""
+        """Return the part of the calibrated body with these joints and muscles only."""
         of_group = [self.smooth[m] for m in muscles]
         smooth = [own._replace(frequency=own.frequency[:, joints]) for own in of_group]
         parameters = [self.parameters[m] for m in muscles]
@@ -212,12 +213,15 @@ class CalibratedBody:
 
     @property
     def drive(self) -> Array | None:
-        """γ, b [N] and F [N] of every muscle, (3, M); None for tension sensors."""
+        """The constants γ, b [N] and F [N] of every muscle's motor current, (3, M).
+
+        `Transmission` explains them. The value is None if the robot has tension sensors.
+        """
         count = len(self.layouts)
         return np.array([*map(self._drive, range(count))]).T if self._has_drive else None
 
     def _drive(self, m: int) -> Array:
-        """Return γ, b [N] and F [N] of one muscle, (3,)."""
+        """Return the constants γ, b [N] and F [N] of one muscle's motor current, (3,)."""
         own = self.parameters[m][self.layouts[m].drive]
         drive: Array = self.drive_units[:, m] * np.clip(own, -LARGEST_DRIVE, LARGEST_DRIVE)
         return drive
@@ -230,7 +234,7 @@ class CalibratedBody:
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
         """Return T_end [N] (N,) of one muscle, and ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4).
 
-        With tension sensors, the derivatives are only ∂T_end/∂μ, (N, 1).
+        If the robot has tension sensors, only the derivative ∂T_end/∂μ exists, (N, 1).
 
         Args:
             m: The muscle.
@@ -265,7 +269,10 @@ class CalibratedBody:
         return Poses(at.rotation, at.translation, robot.routes.detours(theta))
 
     def _world(self, poses: Poses, m: int) -> tuple[Array, Array]:
-        """Return the route points in the root link's frame, and the rotations of their links."""
+        """Return a muscle's route points in the root link's frame, and their links' rotations.
+
+        The points [m] have the shape (N, points, 3), and the rotations (N, points, 3, 3).
+        """
         layout, routes = self.layouts[m], self.robot.routes
         joint = routes.joint[layout.points]
         shift = self.parameters[m][layout.attachment].reshape(-1, 3)

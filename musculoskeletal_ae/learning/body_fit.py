@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated body of one arm across updates.
+"""Fits the calibrated body of one arm again in every update.
 
 Every update fits the body to all samples and starts from the last fit. The prior is the geometric
-model. If a network has already learned a real arm, a body fitted to that network is the prior
-instead (`fit_to_network`), unless the first samples show that the network learned another arm.
+model. If a network has already learned a real arm, the prior is a body that was fitted to this
+network (`fit_to_network`). The geometric model replaces it if the first samples show that the
+network learned another arm.
 """
 
 import numpy as np
@@ -26,14 +27,14 @@ OUTLIER = 6.0  # smallest residual of a sample that contradicts the body, in sta
 
 
 class BodyFit:
-    """Fits the calibrated body of one arm and keeps the result.
+    """Fits the calibrated body of one arm and stores the result.
 
     Attributes:
         body: The most recently fitted body.
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, seed: int = 0) -> None:
-        """Begin with a body fitted to the network `mae`; without one, with the geometric model."""
+        """Begin with a body that is fitted to `mae`, or with the geometric model if it is None."""
         if mae is not None:
             robot = robot.with_elasticity(mae.elasticity)
         self.body = CalibratedBody(robot, seed=seed)
@@ -78,7 +79,7 @@ class BodyFit:
     def lengthened(self) -> Array:
         """Return the growth of each muscle's mean length since the previous call [m], (M,).
 
-        The mean is over a fixed set of postures and tensions.
+        The mean is taken over a fixed set of postures and tensions.
         """
         before, self._mean_length = self._mean_length, self._probe_lengths()
         return self._mean_length - before
@@ -90,10 +91,13 @@ class BodyFit:
 
 
 def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
-    """Return the muscles whose newest samples contradict the body with residuals of the same sign.
+    """Return the muscles that seem to have changed, because their newest samples do not fit.
+
+    The newest samples of such a muscle all have large length residuals of the same sign, while
+    enough earlier samples exist.
 
     Returns:
-        Index of each such muscle, and the number of its newest samples that contradict the body.
+        The index of each such muscle, and the number of its newest samples with such residuals.
     """
     muscles = []
     for m, noise in enumerate(fit.noise):

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration of the anomaly detector from residuals of ② on messages of the healthy arm.
+"""Calibrates the anomaly detector with the residuals of messages of the healthy arm.
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold of d = margin · (1 + n_few/samples) · max d
                                    threshold of A = margin · (1 + n_few/samples) · max A
 
-e are the residuals of a message, and A is the size of e (`mae.residuals`). μ and Σ are mean and
-covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
+e are the residuals of a message: the tensions and lengths that the network restores from it, minus
+the measured ones. A is the size of e (`mae.residuals`). μ and Σ are mean and covariance of e,
+margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
 
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
-network gets the statistics of its own residuals on these messages. The threshold uses the maximum,
+network gets the statistics of its own residuals on these messages. The thresholds use the maximum,
 because friction gives d heavy tails. This maximum includes messages that were not used to
 compute Σ. Single messages far beyond all others count as sensor glitches and are excluded.
 
-Where joint sensors read all angles, the network also learns from every second recent message
+If joint sensors read all angles, the network also learns from every second recent message
 (`update`). The other recent messages serve to validate its estimates.
 """
 
@@ -65,7 +66,7 @@ class Healthy(NamedTuple):
 
 
 class Reservoir:
-    """Keeps a uniform random selection of healthy messages, of bounded size, and counts rests."""
+    """Keeps a bounded random selection of healthy messages, and counts distinct rests."""
 
     def __init__(
         self,
@@ -93,7 +94,9 @@ class Reservoir:
         self._rests = SampleStore(settings, radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
-        """Consider a message for the selection, at most one every SPACING seconds.
+        """Add a message to the selection with a probability that keeps the selection uniform.
+
+        Messages that come less than SPACING after the last considered one are ignored.
 
         Args:
             reading: The message, with NaN for unmeasured θ.
@@ -120,12 +123,15 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Forget all messages if some lack the values of a muscle that is not in `isolated`."""
+        """Forget all messages if a muscle was isolated in some of them, but is not isolated now.
+
+        These messages lack the values of that muscle. `isolated` are the muscles isolated now.
+        """
         if self._missing - frozenset(isolated):
             self.clear()
 
     def forget_newest(self, seconds: float) -> None:
-        """Forget the messages of the last `seconds` of healthy time."""
+        """Forget the messages of the last `seconds` in which the arm was considered healthy."""
         self._kept = [row for row in self._kept if row[-1] <= self.time - seconds]
 
     def clear(self) -> None:
@@ -155,10 +161,10 @@ class Reservoir:
 
 
 def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:
-    """Return a network with new statistics of its residuals.
+    """Return a network with statistics of its residuals on messages of the healthy arm.
 
-    Calibrated statistics are not replaced by uncalibrated ones. After a restart there are few
-    messages, so the statistics of the saved network stay in use until there are enough.
+    Calibrated statistics are not replaced by uncalibrated ones. After a restart, the statistics of
+    the saved network therefore stay in use until there are enough messages.
 
     Args:
         mae: The network.
@@ -186,7 +192,7 @@ def is_learned(mae: Mae) -> bool:
 
 
 def is_calibrated(mae: Mae) -> bool:
-    """Return whether a network's statistics describe the real arm well enough."""
+    """Return whether a network's statistics come from enough messages and samples of the arm."""
     return mae.anomaly is not None and mae.anomaly.calibrated
 
 

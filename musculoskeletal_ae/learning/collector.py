@@ -5,8 +5,8 @@
     θ, gravity ──────────────────────────────────┴► paired by time (`pairing`)
          ─► θ plausible ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
 
-Values of isolated muscles are replaced by 0 before they are paired. A sample carries the version of
-the body state and the isolated muscles under which it was taken.
+Values of isolated muscles are replaced by 0 before messages are paired. A sample contains the
+version of the body state at that time, and the muscles that were isolated then.
 """
 
 import math
@@ -45,8 +45,8 @@ class SampleCollector:
         samples: The samples so far.
         healthy: Messages of the healthy arm, from motion and rest.
         rejected: Number of messages and rests that were not used, by reason.
-        used_at: Time of the last message that could be learned from [s]; −∞ before the first.
-        obstacle: Why no message since `used_at` could be learned from.
+        used_at: Time of the last message that was suitable for learning [s]; −∞ before the first.
+        obstacle: Why all messages since `used_at` were unsuitable.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class SampleCollector:
 
     @property
     def has_jumped(self) -> bool:
-        """Whether a jump of lengths was observed and the length offsets date from before it."""
+        """Whether lengths were observed to jump after the last length calibration."""
         displaced = self._stream.displaced
         return bool(displaced.muscles) and not displaced.is_unseen
 
@@ -182,10 +182,10 @@ class SampleCollector:
         return self._pairing.muscles(time, sample)
 
     def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
-        """Process a message with its θ; return the samples that were stored.
+        """Detect rests in a message and its θ; return the samples that were stored.
 
-        A message is used only after it has been held back by `margin`; during an anomaly and
-        shortly after it, messages are ignored.
+        A message is used only after `margin` has held it back for some time. Messages during an
+        anomaly and shortly after it are ignored.
         """
         dt = min(paired.dt + self._skipped, self._longest_pause)
         measured = self._unmeasured if paired.theta is None else paired.theta
@@ -237,7 +237,7 @@ class SampleCollector:
         return False
 
     def accept(self, sample: Sample) -> None:
-        """Store a sample; it describes only the muscles that are not isolated."""
+        """Store a sample as a description of those muscles that are not isolated."""
         self.samples.add(sample, self.body.used.copy())
 
     # -- changes of state -----------------------------------------------------------------------

@@ -42,13 +42,14 @@ def estimate_covariance(
 ) -> Array:
     """Return the expected covariance of a network's errors θ_est − θ [rad²], (D, D).
 
-    It is computed from errors drawn at random postures with tensions of the samples. An error has
-    two parts. One comes from the error of the joint-sensor offset, which validation messages do not
-    show because they contain the same offset. If there are at least MANY_MESSAGES validation
-    messages, the other part is scaled by the ratio between the network's actual errors on these
-    messages and errors drawn at their postures. The ratio uses errors at the same postures, because
-    the validation messages are mostly near the samples, where errors are smaller than at random
-    postures. With fewer validation messages, the covariance is multiplied by UNVALIDATED_FACTOR.
+    The covariance is computed from errors that are drawn at random postures with tensions of the
+    samples. An error has two parts. The first part is the error of the joint-sensor offset.
+    Validation messages do not show this part, because they contain the same offset. The second part
+    is everything else. If there are at least MANY_MESSAGES validation messages, it is multiplied by
+    a ratio: the network's actual errors on these messages, relative to errors that are drawn at the
+    same postures. The postures have to be the same, because validation messages are mostly near the
+    samples, where errors are smaller than at random postures. With fewer validation messages, the
+    covariance is multiplied by UNVALIDATED_FACTOR instead.
 
     Args:
         mae: The network.
@@ -56,7 +57,7 @@ def estimate_covariance(
         fit: The fit of that body.
         tension: Tensions at the elastic elements in the samples [N], (N, M).
         seed: Seed of the draws.
-        judging: Validation messages, if any.
+        judging: Validation messages, or None.
     """
     rng = np.random.default_rng(seed)
 
@@ -75,13 +76,14 @@ def estimate_covariance(
 
 
 def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
-    """Return the posterior covariances of γ, b and F of motor currents, (M, 3, 3).
+    """Return the posterior covariances of the constants γ, b and F of motor currents.
 
-    The information of all samples counts as that of at most INDEPENDENT_SAMPLES samples, because
-    errors of the body model are common to all samples.
+    `Transmission` explains the constants. All samples together count as at most
+    INDEPENDENT_SAMPLES samples, because errors of the body model are common to all of them.
 
     Returns:
-        The covariances, with b and F in [N]; None for tension sensors.
+        The covariance of γ, b [N] and F [N] for each muscle, (M, 3, 3), or None if the robot has
+        tension sensors.
     """
     if body.drive is None:
         return None
@@ -112,13 +114,14 @@ def _drawn_errors(
     tension: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Draw one error for each posture, and the part of it that joint sensors do not show.
+    """Draw one estimation error for each posture, and the error of the joint-sensor offsets in it.
 
-    Bodies and joint-sensor offsets are drawn from the posterior of the fit (Laplace approximation,
-    lengths linearised in the parameters). The network estimates θ from the lengths of each body.
+    Bodies and joint-sensor offsets are drawn from the posterior of the fit. The posterior is a
+    Laplace approximation, in which lengths are linear in the parameters. The network estimates θ
+    from the lengths of each drawn body.
 
     Returns:
-        θ_est − θ [rad], and the error of the joint-sensor offset [rad], both of shape
+        The errors θ_est − θ [rad], and the errors of the joint-sensor offsets [rad], both of shape
         (BODIES · POSTURES_PER_BODY, D).
     """
     bodies = np.repeat(np.arange(BODIES), POSTURES_PER_BODY)
@@ -150,7 +153,10 @@ def _spread(error: Array) -> Array:
 
 
 def _excess(covariance: Array, error: Array) -> float:
-    """Return by which factor a covariance must grow to contain 95 % of the errors."""
+    """Return the factor by which a covariance must grow for its ellipsoid to hold 95 % of errors.
+
+    `covariance` [rad²] has the shape (D, D), and `error` [rad] the shape (N, D).
+    """
     return float(np.quantile(ellipsoids(covariance, error), CONTAINED_SHARE))
 
 

@@ -2,9 +2,9 @@
 """Fits the calibrated body to samples.
 
 The fit is a robust maximum a posteriori estimate (`gauss_newton`) of the parameters together with
-the samples' postures (`postures`). It starts from the last fit. The prior spreads s are physical:
-how accurately attachments are placed by hand, and how much elastic elements of one kind differ.
-With known postures, each muscle is fitted separately:
+the samples' postures (`postures`). It starts from the last fit. The prior spreads s have physical
+causes: attachments are placed by hand with limited accuracy, and elastic elements of one kind
+differ. With known postures, each muscle is fitted separately:
 
     min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k ((w_k − w̄_k) / s_k)²
 
@@ -62,9 +62,9 @@ def fit_body(
     """Fit the parameters of a body in place, together with the samples' postures.
 
     The fit starts from the present parameters. A muscle counts as changed if at least
-    LEAST_BEFORE_CHANGE samples no longer describe it although it was not isolated when they were
-    taken. In that case the muscle is first fitted to these samples, and the result is the prior
-    mean of its new parameters.
+    LEAST_BEFORE_CHANGE samples no longer describe it, although it was not isolated when they were
+    taken. Such a muscle is first fitted to these earlier samples, and the result is the prior mean
+    of its new parameters.
 
     Args:
         body: The body.
@@ -104,10 +104,10 @@ def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
 def _reopened(
     body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
 ) -> MusclePrior:
-    """Return the prior of muscle `m` after a possible change of the muscle.
+    """Return a wide prior for muscle `m` if the muscle was changed, else return `prior`.
 
-    If the muscle was changed, its parameters before the change are fitted and set in `body`. The
-    result is then a wide prior around them, otherwise it is `prior`.
+    The wide prior lies around the parameters before the change. They are fitted to the samples from
+    before the change, and are set in `body`.
     """
     # Exclude tensions of 0 N, which mean that the muscle was isolated.
     before = ~observed.known[:, m] & (observed.tension[:, m] != 0.0)

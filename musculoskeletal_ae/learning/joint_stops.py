@@ -9,10 +9,11 @@ fraction of a degree. For the readings y_n of a joint at rest and each of its tw
     p(y | z, π, σ) = (1 − π) / range + π N(y − z − limit; σ)
     p(z | y) ∝ p(z) Π_limits Σ_π,σ p(π, σ) Π_n p(y_n | z, π, σ)
 
-Here π is the share of rests at that stop, often 0, and σ the width of the cluster. Beyond the limit
-the first term is nearly 0 and the cluster is wider, because stops are compliant. Sensors are
-calibrated accurately or roughly with equal probability: p(z) is the sum of a narrow and a wide
-normal distribution. A limit may also not be a mechanical stop; its readings are then uninformative.
+Here π is the share of rests at that stop, which is often 0, σ is the width of the cluster, and N is
+the normal density. Beyond the limit, the first term is nearly 0 and the cluster is wider, because
+stops are compliant. A sensor is calibrated accurately or roughly with equal probability, so the
+prior p(z) is the sum of a narrow and a wide normal density. A limit may also not be a mechanical
+stop, in which case the readings near it do not determine z.
 """
 
 from __future__ import annotations
@@ -79,10 +80,12 @@ def _zero(own: Array, lower: float, upper: float, elsewhere: Bools) -> tuple[flo
 
 
 def _at_stop(within: Array, span: float) -> Array:
-    """Return log p(y | z) for each z in OFFSETS, relative to a uniform density.
+    """Return the log likelihood of a joint's readings y near one limit, for each offset in OFFSETS.
+
+    The likelihood is relative to that of readings which are uniform over the joint's range.
 
     Args:
-        within: Distances of the readings from a limit, positive within the range [rad], (N,).
+        within: Distances of the readings from the limit, positive within the range [rad], (N,).
         span: The joint's range [rad].
     """
     single = np.float32  # logarithms in single precision take a fraction of the time
@@ -102,7 +105,7 @@ def _at_stop(within: Array, span: float) -> Array:
 
 
 def _different(own: Array, elsewhere: Bools) -> Array:
-    """Return the readings of a joint at distinct rests, (N,) or fewer.
+    """Return the readings of a joint at distinct rests; at most N.
 
     Repeated readings of a parked joint, or of an arm that returns to the same posture, would
     otherwise look like a cluster at a stop.
@@ -127,7 +130,10 @@ def _normal(x: Array, sigma: float) -> Array:
 
 
 class Stops:
-    """Detects joints at their stops, and draws back joints that are beyond a stop."""
+    """Detects joints at their mechanical stops, and computes their displacements back to the stops.
+
+    These displacements keep the postures that a fit estimates within the joints' ranges.
+    """
 
     def __init__(self, model: PostureModel) -> None:
         """Start with no joint at a stop."""
@@ -148,12 +154,16 @@ class Stops:
         self._at = np.full(model.by_sensor.shape, np.nan)
 
     def lean(self, own: Array, score: Array) -> Bools:
-        """Detect the joints at their stops; return where the torque balance is informative, (N, D).
+        """Detect which joints are at their stops.
 
         Args:
             own: θ [rad], (N, D).
-            score: Residual torque at each joint relative to its usual size, (N, D). Positive
-                values push the joint towards its upper limit; the stop balances this torque.
+            score: Residual torque at each joint relative to its usual size, (N, D). A positive
+                torque pushes the joint towards its upper limit.
+
+        Returns:
+            A mask (N, D) of the joints whose torque balance the fit can use. A joint at its stop is
+            not among them, because the stop exerts an unknown torque.
         """
         # A joint with a sensor stays at its stop until the torque pulls it away. The score of a
         # joint without a sensor has to exceed LEAST_PUSH at every call. Otherwise a stop that was
@@ -165,9 +175,10 @@ class Stops:
         return self.is_balanced & ~(above | below)
 
     def pull(self, own: Array, repeated: Array) -> tuple[Array, Array]:
-        """Return the displacements back to the stops [rad] and their weights, (N, D) each.
+        """Return the displacements [rad] that move joints back to their stops, and their weights.
 
-        Both are nonzero only for joints at a stop or beyond it.
+        Both have the shape (N, D). They are 0 for all joints that are neither at a stop nor beyond
+        a joint limit.
 
         Args:
             own: θ [rad], (N, D).
@@ -179,6 +190,6 @@ class Stops:
 
     @property
     def least_weight(self) -> Array:
-        """A small weight for every angle that keeps the normal equations regular, (D,)."""
+        """A small weight for each joint angle, which keeps the normal equations regular, (D,)."""
         weight: Array = SMALL / (STOP_SPREAD * self._radian) ** 2
         return weight

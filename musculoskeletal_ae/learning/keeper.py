@@ -42,7 +42,7 @@ class Publication:
         self._published_at = -math.inf
 
     def offer(self, data: bytes | None) -> None:
-        """Replace the checkpoint and mark it for publication."""
+        """Replace the checkpoint and mark it for publication; None withdraws it."""
         self.checkpoint, self._is_pending = data, data is not None
 
     def hurry(self) -> None:
@@ -102,7 +102,10 @@ class CheckpointKeeper:
     def observe(
         self, message: MuscleSample, dt: float, is_anomaly: bool, theta: Array | None = None
     ) -> None:
-        """Use a plausible message for later validations, and to measure the healthy torque.
+        """Record a plausible message for the validation of networks and for contact detection.
+
+        Contact detection uses the torque of a healthy arm. The message contributes to it only if no
+        anomaly is present.
 
         Args:
             message: The message.
@@ -121,14 +124,14 @@ class CheckpointKeeper:
         self.validation.forget()
 
     def reset(self) -> None:
-        """Restart the torque filter, for example after a backward jump of the clock."""
+        """Restart the filter of the torque, for example after a backward jump of the clock."""
         self._torque.reset()
 
     def set_anomaly(self, is_anomaly: bool, adapt: Callable[[Mae], Mae]) -> None:
         """Set whether an anomaly is present.
 
-        At the start of an anomaly, the last network that was in use long enough without one is
-        published again, unless it is still in use. `adapt` is applied to it first.
+        When an anomaly begins, the last network that was in use long enough without an anomaly is
+        published again, unless it is still in use. Before that, `adapt` converts this network.
         """
         earlier = self.validation.anomaly(is_anomaly, self._time)
         if earlier is not None:
@@ -160,7 +163,7 @@ class CheckpointKeeper:
         return True
 
     def numbered(self, mae: Mae) -> Mae:
-        """Return the network with a higher version than before and than the network in use."""
+        """Return the network with a version above its own and that of the network in use."""
         before = 0 if self.mae is None else self.mae.version
         return replace(mae, version=1 + max(mae.version, before))
 
@@ -185,7 +188,10 @@ class CheckpointKeeper:
     # -- the disk -------------------------------------------------------------------------------
 
     def load(self) -> Mae | None:
-        """Load the saved samples into the store; return the saved network if it is usable."""
+        """Load the saved samples into the store; return the saved network, or None.
+
+        A network that the validation rejects is kept as a backup and not returned.
+        """
         if self._state is None:
             return None
         saved = self._state.load(self._samples)
@@ -196,9 +202,9 @@ class CheckpointKeeper:
         return None
 
     def store(self, changed: bool = True) -> None:
-        """Save samples and network if they `changed`; otherwise check that the files still exist.
+        """Save samples and network if they have `changed`.
 
-        Failed saves are retried either way.
+        If they have not, check that the files still exist. In both cases, a failed save is retried.
         """
         if self._state is not None:
             self._state.keep(self._samples, self.publication.checkpoint, changed)
@@ -241,7 +247,7 @@ class CheckpointKeeper:
         return '' if self._state is None else self._state.trouble(self._samples)
 
     def values(self) -> dict[str, str]:
-        """Return values for /diagnostics."""
+        """Return the values for /diagnostics by name."""
         values = {}
         if self.rejected:
             values['rejected networks'] = str(self.rejected)

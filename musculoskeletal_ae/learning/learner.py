@@ -134,7 +134,17 @@ class Learner:
     # -- messages → samples ---------------------------------------------------------------------
 
     def step(self, time: float, theta: Array | None, tension: Array, length: Array) -> bytes | None:
-        """Process the measurements at `time` [s], then `poll`; θ is None if it was not measured."""
+        """Learn from the measurements at `time` [s], and then call `poll`.
+
+        Args:
+            time: Time of the measurements [s].
+            theta: θ [rad], (D,), or None if it was not measured.
+            tension: T [N], (M,).
+            length: l [m], (M,).
+
+        Returns:
+            A checkpoint if one is due for publication, else None.
+        """
         if theta is not None:
             self.joints(time, theta)
         self.muscles(np.array([length, tension, np.full(len(length), np.nan)]), time)
@@ -195,7 +205,10 @@ class Learner:
         return check.is_believed and not self.collector.has_jumped
 
     def _believe_offsets(self) -> None:
-        """Use the present length offsets, because they agree with the messages."""
+        """Accept the present length offsets, because they agree with the messages.
+
+        Samples that were taken under other offsets are dropped or corrected (`offset_history`).
+        """
         before = self.offset_history.corrected
         self.offset_history.use(self.body.offsets.offset)
         if self.offset_history.corrected != before:
@@ -298,7 +311,7 @@ class Learner:
     def enable(self, enabled: bool) -> None:
         """Stop or resume learning; samples and network are kept.
 
-        The result of an update that arrives while learning is stopped is discarded.
+        If an update finishes while learning is stopped, its result is discarded.
         """
         if enabled and not self.enabled:
             self.reset()
@@ -312,7 +325,7 @@ class Learner:
     # -- samples → checkpoints ------------------------------------------------------------------
 
     def poll(self, now: float) -> bytes | None:
-        """Start the next update if it is due, and take over an update that has finished.
+        """Start the next update if it is due, and use the network of an update that has finished.
 
         Args:
             now: The present time on the clock of the messages [s].
@@ -448,7 +461,10 @@ class Learner:
 
     @property
     def idle_time(self) -> float:
-        """Time without a message that could be learned from [s]; 0 before the first poll."""
+        """Time since the last message that was suitable for learning [s].
+
+        It is 0 before the first call of `poll`.
+        """
         if self.collector.used_at != self._used_at or math.isinf(self._polled_at):
             return 0.0
         return self._polled_at - self._progress_at

@@ -56,7 +56,13 @@ class AnomalyMargin:
         self._time += dt
 
     def hold(self, dt: float, reading: Sample, rest: Sample | None) -> list[Waiting]:
-        """Hold a message back; return the messages that have waited long enough."""
+        """Hold a message back; return the messages that have been held back for `MARGIN`.
+
+        Args:
+            dt: Time since the previous message [s].
+            reading: The measurements.
+            rest: Mean of the rest that ended with the message, or None.
+        """
         self._waiting.append(Waiting(self._time, dt, reading, rest))
         released = []
         while self._waiting and self._time - self._waiting[0].time >= MARGIN:

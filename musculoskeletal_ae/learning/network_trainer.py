@@ -77,7 +77,10 @@ class NetworkTrainer:
 
 
 def _loss(network: Network, entered: Tensor, true: Tensor, mask: Tensor) -> Tensor:
-    """Return the sum of the mean error norms of standardised θ, T and l over all three masks."""
+    """Return the training loss: the sum of the mean error norms of standardised θ, T and l.
+
+    The means are taken over the samples and over all three masks of the network's inputs.
+    """
     error = network.decoder(network.encode(entered.repeat(3, 1), mask))
     error = error - ((true - network.mean) / network.std).repeat(3, 1)  # (3N, D+2M)
     parts = error.square().split([network.joints, network.muscles, network.muscles], dim=1)

@@ -3,10 +3,12 @@
 
     e = |l − o − ①(θ, T_end)|,   median over COUNT messages, for each muscle
 
-θ is measured, or else estimated by ②. New offsets o are accepted if e is at most LARGEST_RATIO
-times the error with the previous offsets and the same network, or at most LEARNED_ERROR. With
-fewer than COUNT messages under the previous offsets, the limit of e is LEARNED_ERROR for a network
-that has learned an arm, and UNLEARNED_ERROR for any other.
+l − o is the measured length with the new offsets o. ①(θ, T_end) is the length that the network
+predicts for the measured θ, or for θ estimated from T_end and l − o if it was not measured. New
+offsets are accepted if e is at most LARGEST_RATIO times the error with the previous offsets and the
+same network, or at most LEARNED_ERROR. With fewer than COUNT messages under the previous offsets,
+the limit of e is LEARNED_ERROR for a network that has learned an arm, and UNLEARNED_ERROR for any
+other network.
 
 Offsets within CALIBRATION_SPREAD of the accepted ones are accepted without a comparison, unless the
 offsets were unknown in between. Learning pauses while the published offsets disagree with the
@@ -51,7 +53,7 @@ class OffsetCheck:
         self.is_believed, self.problem = True, ''
 
     def use(self, offsets: LengthOffsets) -> None:
-        """Check other offsets from now on; they may be unknown."""
+        """Check these offsets from now on; unknown offsets are allowed, but never accepted."""
         self._offsets = offsets
         self._now.clear()
         self.problem = ''

@@ -5,7 +5,7 @@ A finding may revoke the offsets, because lengths have jumped or disagree with t
 The finding comes some time after the fault. Therefore the samples of the last seconds are held
 back until the next length calibration:
 
-    same offsets         the finding was false; the samples are put back
+    same offsets         the finding was false, so the samples are used again
     other offsets        the samples are dropped, because it is unknown which of them are wrong
 
 Offsets may also have been wrong from the start, for example after a bad calibration. This is
@@ -41,8 +41,8 @@ class OffsetHistory:
     def __init__(self, samples: SampleStore, offset: Array) -> None:
         """Start with the present offsets [m], (M,).
 
-        Some samples may have been held back since before a restart of the learner. They are judged
-        by the offsets under which they were taken.
+        If samples have been held back since before a restart of the learner, the offsets under
+        which they were taken are used instead of `offset`.
         """
         self._samples = samples
         self._offset = samples.held_offset if samples.held else offset
@@ -71,7 +71,12 @@ class OffsetHistory:
         self._is_revoked = True
 
     def use(self, offset: Array) -> None:
-        """Use plausible offsets [m] (M,) from now on, and put back, drop or correct samples."""
+        """Use plausible offsets [m] (M,) from now on.
+
+        If they equal the previous ones, samples that were held back are used again. Otherwise these
+        samples are dropped. If the previous offsets were wrong from the start, all samples since
+        then are corrected.
+        """
         change = self._offset - offset
         size = float(np.nanmax(np.abs(change)))  # NaN for a muscle that was added at a restart
         if size <= CALIBRATION_SPREAD:

@@ -7,9 +7,10 @@
     gravity   u_ni − R_iᵀ(θ_n) ĝ
 
 Here w are the parameters of the body, θ_n the postures of the samples and z the joint-sensor
-offsets (`postures`). K and b describe the joints' springs (`springs`). y_nj are measured angles and
-u_ni measured directions of gravity in the frame of joint i. R_i is the rotation of this frame, and
-ĝ is the direction of gravity in the frame of the root link.
+offsets (`postures`). g(θ) are the torques that hold the weight, G is the muscle Jacobian, and T_end
+are the bone-side tensions. K and b describe the joints' springs (`springs`). y_nj are measured
+angles and u_ni measured directions of gravity in the frame of joint i. R_i is the rotation of this
+frame, and ĝ is the direction of gravity in the frame of the root link.
 """
 
 from __future__ import annotations
@@ -59,7 +60,11 @@ class Residuals(NamedTuple):
 
 
 class Bent(NamedTuple):
-    """Cache of Σ T ∂²l/∂θ² of the geometric model, which hardly changes between fits."""
+    """Cache of the joint stiffness Σ T ∂²l/∂θ² that muscle tensions cause.
+
+    It belongs to the geometric model. Between two fits it hardly changes, because the postures of
+    the samples hardly change.
+    """
 
     theta: Array  # postures of the last evaluation [rad], (N, D)
     stiffness: Array  # Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
@@ -173,10 +178,10 @@ class PostureModel:
         )
 
     def _down(self, theta: Array) -> Array:
-        """Return gravity's direction in the frames of the tree's joints, (1+D, N, 3J).
+        """Return the direction of gravity in the frames of the tree's joints, (1+D, N, 3J).
 
-        The first entry is at θ. In each of the others, one joint of the group is moved by
-        `DIFFERENCE`. Without an IMU the result has 0 columns.
+        The first entry is the direction at θ (N, all joints). For each of the D others, one joint
+        of the group is moved by `DIFFERENCE`. Without an IMU, the result has 0 columns.
         """
         if not self._tilt.size:
             return np.zeros((1 + len(self.joints), len(theta), 0))
@@ -188,7 +193,10 @@ class PostureModel:
         return down.reshape(-1, *self._tilt.shape)
 
     def stiffness(self, at: Unknowns) -> Array:
-        """Return −∂τ/∂θ [N·m/rad] (N, D, D), with the muscles' part from the geometric model."""
+        """Return the joint stiffness −∂τ/∂θ [N·m/rad], (N, D, D).
+
+        The part that muscle tensions cause comes from the geometric model.
+        """
         within, theta = (self.joints[:, None], self.joints), at.theta
         kinematics = self._kinematics
         if kinematics.elasticity.is_present:
@@ -199,7 +207,10 @@ class PostureModel:
         return stiffness + self._muscle_stiffness(theta[:, self.joints])
 
     def _muscle_stiffness(self, own: Array) -> Array:
-        """Return Σ T ∂²l/∂θ² of the geometric model (N, D, D), at or near θ (N, D)."""
+        """Return the joint stiffness Σ T ∂²l/∂θ² [N·m/rad] that muscle tensions cause, (N, D, D).
+
+        It is that of the geometric model at θ (N, D), or from the cache at a posture near θ.
+        """
         joints, radian = self.joints, self.body.robot.kinematics.radian
         at = self._bent.theta[:, joints]
         moved = np.flatnonzero(~(np.abs(own - at) < REUSED_MOTION * radian).all(axis=1))

@@ -9,8 +9,9 @@ The minimum is over the parameters w of the calibrated body, the postures θ_n, 
 offsets z and the corrections e = (α, β) of the joints' springs (`springs`), by robust Gauss–Newton
 (`gauss_newton`). y are joint angles that a joint sensor (with offset z) or a camera measured, or
 that a user stated. u are directions of gravity in links that carry an IMU. Any of these
-measurements may be missing. ω are robust weights. z̄ and s_z are derived from the joints' stops
-(`joint_stops`).
+measurements may be missing. ω are robust weights, and σ are standard deviations of the residuals.
+w̄ and s are prior means and prior spreads (`priors`). z̄ and s_z are derived from the joints' stops
+(`joint_stops`). `posture_model` explains the other symbols.
 
 The problem can be solved because M > D. N rests give N (M − D) more length equations than there are
 angles, and N D torque equations. A joint that muscles push against its stop harder than friction
@@ -175,7 +176,11 @@ class GroupFit:
         return root
 
     def _widen(self, residuals: Residuals, root: Array) -> None:
-        """Add the parameter uncertainty of relearned muscles to their length noise."""
+        """Widen the length noise of muscles that some samples do not describe.
+
+        Fewer samples determine the parameters of such a muscle. The length error that follows from
+        the posterior of these parameters is added to its noise.
+        """
         for m in np.flatnonzero((self._known == 0.0).any(axis=0)):
             by_parameters = np.zeros((len(root), len(self._known)))
             by_parameters[self.model.columns[m]] = residuals.by_body[m].T
@@ -294,7 +299,7 @@ class GroupFit:
         return RightSides(of_postures, np.concatenate([right, of_zero, of_springs]))
 
     def _springs(self, unknowns: Unknowns) -> Array:
-        """Return α and then β of those joints of the group that have springs, (2S,)."""
+        """Return the corrections of the group's springs, (2S,): α of all S springs, then β."""
         return unknowns.springs[:, self.model.sprung].ravel()
 
     def moved(self, point: Point, step: Step) -> Point:

@@ -84,9 +84,11 @@ class GroupPrior:
         zero: Prior mean of the joint-sensor offsets z̄ [rad], (D,).
         zero_precision: 1/s_z², (D,).
         angle_precision: 1/σ_y²; 0 where the angle was not measured, (N, D).
-        repeated: Number of readings of a joint sensor that count as one, (D,).
-        unread: Number of samples that count as one for a joint without a sensor, (D,).
-        spring_precision: 1/s_e² of the α, then of the β of the joints with springs, (2S,).
+        repeated: Number of readings of a joint sensor that together count as a single independent
+            one, (D,).
+        unread: Number of samples that together count as a single independent one for a joint
+            without a sensor, (D,).
+        spring_precision: 1/s_e² of α of all S joints with springs, then of β, (2S,).
     """
 
     mean: Array

@@ -51,7 +51,7 @@ class Sample(NamedTuple):
 
 
 class StoredSample(NamedTuple):
-    """A sample with the data that its store keeps about it."""
+    """A sample with its number in the store, and the muscles that it describes."""
 
     sample: Sample
     known: Bools  # whether the sample describes each muscle, (M,)
@@ -177,7 +177,7 @@ class SampleStore:
             held.known[muscle] = False
 
     def hold(self, numbers: Set[int], offset: Array) -> None:
-        """Hold back the samples with these numbers until it is decided whether they are right.
+        """Hold back the samples with these numbers until it is known whether they are correct.
 
         Args:
             numbers: Numbers of the samples.
@@ -248,7 +248,9 @@ class SampleStore:
     def _scaled(self, samples: Sequence[Sample]) -> Array:
         """Return samples as points (N, D + 2 M) in units of the thresholds.
 
-        The coordinates are θ, T and l. Those that are not compared are NaN.
+        The coordinates are θ, T and l. Samples with all joint angles are compared without l, and
+        samples without some angle also by l. Coordinates that are unmeasured or not compared are
+        NaN.
         """
         theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
         distances = self._settings.new_joint_distance, self._settings.new_tension_distance
@@ -271,6 +273,9 @@ class SampleStore:
 
 
 def _filled(parts: Sequence[Array], nothing: float) -> Array:
-    """Stack arrays of equal size; empty ones are filled with `nothing`."""
+    """Stack arrays, of which all have the same size or are empty, as the rows of one array.
+
+    The row of an empty array is filled with the value `nothing`.
+    """
     size = max(part.size for part in parts)
     return np.array([part if part.size else np.full(size, nothing) for part in parts])

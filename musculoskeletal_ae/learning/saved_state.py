@@ -41,7 +41,8 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The samples, oldest first, and the newest network as the content of a checkpoint.
 
     `held` are the samples that the store holds back, and `held_offset` the length offsets [m] under
-    which they were taken; empty without such samples. `accepted` counts all samples ever accepted.
+    which they were taken. Both are empty if no samples are held back. `accepted` is the number of
+    all samples that the store has ever accepted.
     """
 
     joints: tuple[str, ...]

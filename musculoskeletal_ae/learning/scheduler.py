@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides when an update of the network begins, and composes its job.
+"""Decides when an update of the network begins, and collects the inputs of the update.
 
 An update begins when there are new data and enough samples, and the last update began at least
 `LEAST_INTERVAL` ago. The caller supplies all times from its clock, which may jump backward.
@@ -30,7 +30,7 @@ class UpdateScheduler:
     """
 
     def __init__(self, least_samples: int, steps: int) -> None:
-        """Require `least_samples` samples; train for `steps` steps in each update."""
+        """Schedule updates of `steps` training steps each, which need `least_samples` samples."""
         self.updates = 0
         self.last_update: Update | None = None
         self.statistics_hold = True
@@ -69,7 +69,10 @@ class UpdateScheduler:
         )
 
     def finish(self, update: Update) -> Mae:
-        """Count an update; return its network, uncalibrated if a muscle has changed meanwhile."""
+        """Count a finished update and return its network.
+
+        If a muscle has changed since the update began, the network is marked as uncalibrated.
+        """
         self.last_update = update
         self.updates += 1
         mae = uncalibrated(update.mae) if self._has_changed or update.changed else update.mae

@@ -153,10 +153,10 @@ class StateStore:
     # -- writing --------------------------------------------------------------------------------
 
     def keep(self, samples: SampleStore, network: bytes | None, changed: bool = True) -> None:
-        """Save the state if it `changed`, and retry a failed save (see `trouble`).
+        """Save the state if it has `changed`, and retry a failed save (see `trouble`).
 
-        Call this method often. Without a change it only checks from time to time that the files
-        still exist.
+        Call this method often. If the state has not changed, the method only checks from time to
+        time that the files still exist.
         """
         now = time.monotonic()
         if now < self._next_attempt and (self._problem or not changed):

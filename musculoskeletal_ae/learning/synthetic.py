@@ -39,10 +39,12 @@ def synthetic_samples(
 
         target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
 
-    T_r is the tension at the elastic elements. Measured tensions allow an estimator to compute T_r,
-    except for the share u (UNKNOWN_FRICTION) of the friction. The network's input contains this
-    error and the noise ε, and its target does not. ② therefore learns to weight muscles by the
-    accuracy of their lengths, as in weighted least squares.
+    θ_r are random postures, T_r random tensions at the elastic elements, and s_r random directions
+    of sliding. From measured tensions, an estimator can compute T_r except for a share u of the
+    friction (UNKNOWN_FRICTION). The lengths in the network's input contain this share of the
+    friction and the noise ε, and those in its target do not. The network therefore learns to weight
+    muscles by the accuracy of their lengths when it estimates θ from T and l, as in weighted least
+    squares.
 
     Args:
         body: The calibrated body.
