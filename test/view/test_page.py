@@ -202,6 +202,10 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
     def see(text: str) -> None:
         graph.wait(lambda: text in page.text, f'{text!r} on the page')
 
+    def is_at_rest() -> bool:
+        latest = graph.received['estimated_joint_states'][-100:]
+        return np.ptp([message.position for message in latest], axis=0).max() < 0.02
+
     try:
         # Controls and readings appear as their nodes are discovered, one after the other.
         for text in ('Faults of the', 'error 0.', 'triceps_long', 'Explore', 'Stop', 'payload'):
@@ -223,6 +227,9 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         assert not targets and not any(message.data for message in detected)
         page.click(*page.centre('End exploring'))
         graph.wait(lambda: modes[-1].data == 'idle', 'the end of the exploration')
+        # The sliders follow the arm, and would replace a number that is typed while it moves.
+        graph.wait(is_at_rest, 'the arm to come to rest')
+        graph.next('estimated_joint_states', 100)  # time for the page to show this posture
         page.type_at('elbow', '-1.2')
         graph.wait(lambda: targets and list(targets[-1].position) == [-1.2], 'the target')
         page.click(*page.centre('Explore'))
