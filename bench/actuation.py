@@ -82,7 +82,7 @@ class Watched:
         self._arm, self.highest = arm, 0.0
 
     def note(self) -> None:
-        """Update the highest tension by the present ones."""
+        """Raise `highest` if a present tension exceeds it."""
         share = self._arm.tension / self._arm.robot.tension.limit
         self.highest = max(self.highest, float(share.max()))
 
@@ -103,9 +103,10 @@ def learn(
 
 
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
-    """Explore for a time [s]; return the mean error of the estimate [rad], and its wrong results.
+    """Explore for a time [s]; return the mean estimation error [rad] and the number of mistakes.
 
-    Wrong results are isolations, and a stop that lasts at the end.
+    Each isolation of a muscle is a mistake, because the arm is healthy. A stop that has not ended
+    by then is another one.
     """
     loop = IsolatingLoop(arm, mae, EXPLORATION_STREAM + 50 + seed)
     loop.run(1.0)
@@ -120,7 +121,12 @@ def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) ->
 
 
 def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tuple[float, int]:
-    """Return the mean distance from targets after HELD seconds [rad], and the number of stops."""
+    """Move to `targets` random holdable postures, each of which the arm holds for HELD seconds.
+
+    Returns:
+        The mean distance between the target and the posture that the arm reached [rad], and the
+        number of stops.
+    """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xAC])
     postures = (robot.random_postures(1, rng)[0] for _ in range(TRIES))
     errors, stops, loop = [], 0, ClosedLoop(arm, mae)
@@ -142,9 +148,9 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
     """Rupture `count` muscles in turn.
 
     Returns:
-        The share of ruptures after which a muscle was isolated, the share after which only the
-        ruptured muscle was, and the mean time from rupture to first isolation [s], which is LATEST
-        for a rupture without isolation.
+        The share of ruptures after which any muscle was isolated, the share after which only the
+        ruptured muscle was isolated, and the mean time from a rupture to the first isolation [s].
+        A rupture without isolation counts in this mean with LATEST, the longest wait.
     """
     isolated, named, times = 0, 0, []
     for m in np.random.default_rng([seed, 0x2B]).permutation(arm.robot.muscle_count)[:count]:

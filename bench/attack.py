@@ -86,14 +86,15 @@ class Steps(NamedTuple):
 
 
 def changes(time: Array, number: Array, value: Array, rate: float, relieved: Array) -> Steps:
-    """Return how fast the commands of one controller process changed, and which were too fast.
+    """Check how fast the commands of one controller process changed, against the legal rate.
 
     Args:
         time: Times of publishing [s], (N,).
-        number: Sequence numbers, (N,); messages may be missing.
-        value: Muscle lengths [m], (N, M).
+        number: Sequence numbers of the commands, (N,); some messages may be missing.
+        value: Commanded muscle lengths [m], (N, M).
         rate: Largest legal rate [m/s].
-        relieved: Whether a muscle's excess tension was being relieved, (N, M).
+        relieved: Whether the controller may pay a muscle out faster because its tension had
+            exceeded the limit, (N, M).
     """
     step, allowed = np.diff(value, axis=0), rate * (np.diff(time)[:, None] + JITTER)
     finite = np.isfinite(value).all()
@@ -114,12 +115,14 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
 
 
 def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscles: int) -> Array:
-    """Return for each command which muscles exceeded `limit` [N] in the RELIEF seconds before it.
+    """Return for each command which muscles exceeded their tension limit shortly before it.
+
+    The period before a command is RELIEF seconds long.
 
     Args:
         time: Times of the commands [s], (N,).
-        loads: Times [s] and measured T [N] (M,).
-        limit: Limits of the tensions [N].
+        loads: Pairs of a time [s] and the tensions measured at that time [N], (M,).
+        limit: Tension limit of each muscle [N], (M,).
         muscles: Number of muscles M.
 
     Returns:
@@ -134,9 +137,10 @@ def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscle
 
 
 def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array:
-    """Return the longest uninterrupted time [s] of each muscle above `highest` [N].
+    """Return the longest uninterrupted time [s] for which each muscle was above `highest` [N].
 
-    `loads` are times [s] and measured T [N] (M,). The result is (M,), or (0,) without loads.
+    `loads` are pairs of a time [s] and the tensions measured at that time [N], (M,). The result
+    is (M,), or (0,) if `loads` is empty.
     """
     if not loads:
         return np.zeros(0)
@@ -166,7 +170,11 @@ def without(times: Array, intervals: list[tuple[float, float]]) -> Bools:
 def attack_graph(
     folder: Path, initial: Path, size: Size, seed: int, planned: list[tuple[str, int, str]]
 ) -> list[Row]:
-    """Run the system for one seed, attack it, and return the checked promises."""
+    """Run the system for one seed and attack it; return the promises with their violations.
+
+    `planned` lists the known attacks: for each the kind, the number of the variant, and the state
+    of the arm. Random events and hostile messages follow.
+    """
     from bench.attack_graph import Attack
     from bench.attack_kinds import Scene, random_event
 

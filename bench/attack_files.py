@@ -101,7 +101,10 @@ def changed_numbers(text: str, rng: random.Random) -> str:
 
 
 def damage(data: bytes, other: bytes, rng: random.Random) -> bytes:
-    """Return `data` with one to three random faults, some of them pieces of `other`."""
+    """Return `data` with one to three random faults.
+
+    A fault deletes, changes or repeats bytes, or overwrites them with bytes of `other`.
+    """
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         at = rng.randrange(len(changed) + 1)
@@ -166,7 +169,7 @@ class Reader:
         self.bag = {file.name: file.read_bytes() for file in sorted(bag.iterdir())}
 
     def attempt(self, kind: str, rng: random.Random) -> Callable[[], object]:
-        """Write one hostile file; return the function that reads it."""
+        """Write one hostile file of a kind; return the function that reads it."""
         trial = self.folder / 'trial'
         shutil.rmtree(trial, ignore_errors=True)
         if kind in ('urdf', 'muscles', 'table'):

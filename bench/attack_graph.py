@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole system on an emulated arm, with a hostile node on its graph.
+"""Runs the whole system on an emulated arm, and attacks it by a hostile node on its ROS graph.
 
 The hostile node publishes on every subscribed topic and calls every service. It also injects faults
 into sensors, tendons and motors, and kills nodes. All commands of the controller are recorded.
@@ -104,7 +104,7 @@ class Process:
         return self.process.poll() is None
 
     def look(self) -> None:
-        """Record the memory of the process."""
+        """Record the resident memory of the process at its present age."""
         with suppress(OSError):  # the process has just ended
             self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
@@ -200,7 +200,10 @@ class Attack:
         self.publishers.clear()
 
     def process(self, name: str, log: str = '', remapping: Sequence[str] = ()) -> Process:
-        """Start the process of a node."""
+        """Start the process of the node `name`, with the parameters that the bench sets for it.
+
+        `log` names the log file if the node's name does not. `remapping` are further ROS arguments.
+        """
         # A second node needs a state directory of its own, because the first one locks its own.
         saved = f'state_directory:={self.folder / (log or "state")}'
         own = {
@@ -279,7 +282,7 @@ class Attack:
         self.samples = accepted
 
     def spin(self, seconds: float) -> None:
-        """Handle messages for a time [s], and check the processes."""
+        """Process messages for a time [s], and check the processes."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.executor.spin_once(0.05)
@@ -300,7 +303,10 @@ class Attack:
                         self.start(name)
 
     def wait(self, condition: Callable[[], Any], promise: str, what: str) -> bool:
-        """Handle messages until a condition holds; return False if it does not hold in time."""
+        """Process messages until a condition holds; return False if it does not hold in time.
+
+        A timeout is recorded as a violation of `promise`; `what` states what the bench waited for.
+        """
         end = time.monotonic() + PATIENCE
         while not condition():
             if time.monotonic() > end:
@@ -350,7 +356,10 @@ class Attack:
         self.call(SetParameters, 'hardware_emulator/set_parameters', request)
 
     def moving(self) -> bool:
-        """Clear anomalies and stops, and explore; return whether the arm moves in time."""
+        """Remove all faults, reset the nodes and explore; return whether the arm moves.
+
+        If the arm does not move in time, this is recorded as a violation.
+        """
         self.wait(
             lambda: set(self.levels) == set(NODES), 'every node goes on', 'reports of all nodes'
         )

@@ -34,17 +34,23 @@ OFFSET = 0.08  # absolute value of false length offsets [m]
 
 
 class Scene:
-    """An arm that holds or explores, attacked in one known way."""
+    """Performs one known attack on an arm that holds or explores, and recovers the arm."""
 
     def __init__(self, attack: Attack) -> None:
-        """Use a running system and the hostile node of `attack`."""
+        """Attack the running system of `attack`, by the hostile node of that system."""
         self.attack, self.rng = attack, attack.rng
         self.what = ''  # description of the present attack, for the reports of violations
 
     # -- the course of an attack ----------------------------------------------------------------
 
     def play(self, kind: str, shape: int, moment: str) -> None:
-        """Bring the arm into a state, attack it, and recover it as /diagnostics advises."""
+        """Bring the arm into a state, attack it, and recover it as /diagnostics advises.
+
+        Args:
+            kind: Kind of the attack, a key of KINDS.
+            shape: Number of the variant of this kind.
+            moment: State of the arm, 'holding' or 'exploring'.
+        """
         self.what = f'{kind}, shape {shape}, {moment}'
         if not self.bring(moment):
             return
@@ -55,7 +61,10 @@ class Scene:
 
     @contextmanager
     def wrong(self) -> Iterator[None]:
-        """Return a context in which the status line must report a problem after REPORT_TIME."""
+        """Return a context in which something is wrong and the status line has to say so.
+
+        A status line that reports OK later than REPORT_TIME after the start is a violation.
+        """
         begin = time.time()
         yield
         silent = [
@@ -130,7 +139,7 @@ class Scene:
             self._take(STEPS[identifier])
 
     def _take(self, step: Step) -> None:
-        """Take one step of a remedy."""
+        """Do what one step of the advice on /diagnostics says, as an operator would."""
         attack = self.attack
         if step in (Step.STOP_SECOND_PUBLISHER, Step.STOP_OTHER_ROBOT):
             attack.end_strangers()
@@ -153,9 +162,9 @@ class Scene:
             attack.spin(0.5)
 
     def _calibrate_lengths(self) -> None:
-        """Calibrate the lengths, which takes half a minute of gentle motion.
+        """Request a length calibration, and wait until it has ended.
 
-        Every call of the service restarts the calibration, so this waits for the end.
+        The calibration takes half a minute of gentle motion. A second request would restart it.
         """
         attack = self.attack
         attack.call(Trigger, 'estimator/zero')
@@ -183,7 +192,7 @@ class Scene:
             attack.spin(period)
 
     def latch(self, topic: str, *messages: Any) -> None:
-        """Publish messages on a latched topic, and check the status line."""
+        """Publish false messages on a latched topic; the status line must report the problem."""
         with self.wrong():
             self.publish(topic, *messages, qos=LATCHED)
             self.attack.spin(LASTING)
@@ -289,7 +298,10 @@ def repeat_an_estimate(scene: Scene) -> None:
 
 
 def shifted(topic: str, joints: float) -> Callable[[Scene], None]:
-    """Return an attack that publishes shifted joint states beside the genuine ones."""
+    """Return an attack that publishes false joint states between the genuine messages of `topic`.
+
+    The false angles are the genuine ones plus `joints` [rad].
+    """
 
     def attack(scene: Scene) -> None:
         with scene.wrong():
@@ -338,7 +350,10 @@ def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
 
 
 def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae], Mae]:
-    """Return a function that scales and shifts [m] all or some lengths of a network."""
+    """Return a function that falsifies the lengths of a network by a factor and an offset [m].
+
+    It changes the lengths of every muscle, or of every second one if `every` is 2.
+    """
 
     def change(mae: Mae) -> Mae:
         mean, std = mae.mean.copy(), mae.std.copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures the deviation of emulated arms from their model: the calibration of `Spread`.
+"""Measures how far emulated arms deviate from their model, to check the constants of `Spread`.
 
     python -m bench calibration [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 5]
 

@@ -3,11 +3,11 @@
 
 python -m bench covariance [--robot …] [--seeds 20,…,29] [--realities kin,foreign] [--minutes 5]
 
-Each individual explores as preset default does, with commands of the network of the geometric
-model (`--exploration paper`: as preset paper does, without targets at the joints' limits). At the
-end one network learns from the rest samples and messages with the readings of the joint sensors,
-and one without them, in a few long updates. On 40 s of held-out motion, the bench prints for both
-networks
+Each individual explores as in preset `default`; the network of the geometric model computes its
+commands. With `--exploration paper` it explores as in preset `paper`, which has no targets at the
+limits of the joints. Two networks then learn from this exploration in a few long updates: one with
+the readings of the joint sensors, and one without them. On 40 s of held-out motion, the bench
+prints for both networks
 
     rad     the mean error of the estimate
     inside  the share of messages whose true angles lie in the 95 % confidence ellipsoid
@@ -70,7 +70,7 @@ class Honesty(NamedTuple):
     nees: float  # mean of eᵀ Σ⁻¹ e / D
 
     def text(self) -> str:
-        """Return the three numbers with their names."""
+        """Return the mean error, the share inside the ellipsoid and the NEES as text."""
         return f'{self.error:.3f} rad, {self.inside:.3f} inside, NEES {self.nees:.2f}'
 
 
@@ -81,7 +81,7 @@ def errors(mae: Mae, recording: Recording) -> Array:
 
 
 def honesty(covariance: Array, error: Array) -> Honesty:
-    """Compare a covariance [rad²] (D, D) with errors [rad] (N, D)."""
+    """Return how well a covariance [rad²] (D, D) describes the errors [rad] (N, D) of a network."""
     squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
     return Honesty(
         float(np.linalg.norm(error, axis=1).mean()),
@@ -97,7 +97,15 @@ class Never(Trainer):
 
 
 def learned(robot: Robot, driver: Mae, exploring: Recording, seed: int, source: str) -> Mae:
-    """Return the network that learns from the exploration `exploring`, with one source of θ."""
+    """Return the network that has learned from the recorded exploration of an individual.
+
+    Args:
+        robot: The geometric model.
+        driver: The network to start from, which also commanded the exploration.
+        exploring: The recording of the exploration.
+        seed: Seed of the learner.
+        source: Whether the joint angles come from joint sensors or from nowhere, a key of VIEWS.
+    """
     learner = Learner(robot, driver, seed=seed, trainer=Never, joint_source=source)
     teach(learner, zip(*exploring, strict=True), VIEWS[source])
     observed, healthy = learner.samples.observations(), learner.collector.healthy.healthy()
@@ -108,7 +116,7 @@ def learned(robot: Robot, driver: Mae, exploring: Recording, seed: int, source: 
 
 
 def main(argv: list[str]) -> None:
-    """Print a line for each individual, and the means."""
+    """Print a line for each individual, and a line of means for each emulator model."""
     parser = Parser('covariance', (__doc__ or '').partition('\n')[0])
     parser.add_robot()
     parser.add_seeds(tuple(range(20, 30)))

@@ -6,9 +6,9 @@
 The commands are those of the ```sh blocks, in order, with one shell for each page. The bench
 understands these marks in a page:
 
-- `Ctrl-C ends it` in the comment of a command: the command runs in the background until the next
-  such command of the same script, or the end of the page. The next command starts when `bringup.sh`
-  has printed its first status line.
+- `Ctrl-C ends it` in the comment of a command: the command runs in the background. It ends at the
+  next marked command of the same script, or at the end of the page. The next command starts when
+  `bringup.sh` has printed its first status line.
 - `<!-- bench: skip REASON -->` above a block: the block is listed but not run.
 - `<!-- bench: ros2 -->` above a block of doc/howto/install.md: the block builds the command `ros2`.
   If `ros2` is not installed, the block runs before the first command that needs it.

@@ -170,7 +170,14 @@ class EagerSimulation:
         return load, self.springs - self.onto.T @ both @ self.onto
 
     def _slopes(self, theta: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
-        """Return G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D), as `add_slopes` computes them."""
+        """Return the derivatives of the muscle lengths l with respect to the joint angles θ.
+
+        `add_slopes` computes the same.
+
+        Returns:
+            The muscle Jacobian G = ∂l/∂θ [m/rad] (N, M, D), and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D,
+            D).
+        """
         count, joints = theta.shape
         jacobian = theta.new_zeros(count, tension.shape[1], joints)
         curvature = theta.new_zeros(count, joints, joints)
@@ -185,7 +192,18 @@ class EagerSimulation:
         return jacobian, curvature
 
     def _turn(self, theta: Tensor, push: Tensor, matrix: Tensor, h: float) -> tuple[Tensor, Tensor]:
-        """Return θ after a step, and a mask of joints at a limit or forced to an angle, (N, D)."""
+        """Solve the linear system of a time step for the motion of the joints, within their limits.
+
+        Args:
+            theta: Joint angles before the step [rad], (N, D).
+            push: Right side of the system for each joint, (N, D).
+            matrix: Matrix of the system, (N, D, D).
+            h: Duration of the step [s].
+
+        Returns:
+            The joint angles after the step [rad] (N, D), and a mask (N, D) of the joints that a
+            limit stops or that are fixed to an angle.
+        """
         low, high, most, fixed = self.body.lower, self.body.upper, JOINT_SPEED * h, self.fixed
         forced = torch.isfinite(fixed)
         held = forced | ((theta <= low) & (push < 0.0)) | ((theta >= high) & (push > 0.0))

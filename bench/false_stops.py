@@ -5,21 +5,23 @@
 
 New individuals explore and learn for an hour of simulated time each. The cores of estimator,
 controller and learner run in one process. They exchange messages as their nodes do, best-effort and
-with a queue of QUEUE messages. With --load, the computer is busy. The driver and each node then
-wait for the processor: WAIT on average before each run, and once in STALL_EVERY another STALL.
-These times are multiplied by the number of other processes per core. Messages that arrive meanwhile
-wait as well. When the process continues, it takes the oldest message at once. Of the others it
-finds only the last QUEUE, so that a late message is followed by one that was sent much later. The
-modules and the arm do not wait.
+with a queue of QUEUE messages.
 
-The constants are as severe as a measurement on two cores at a load of 20. A process woke up 100
-times a second and computed for a few milliseconds. It took 13 ms in the mean and 46 ms in 1 % of
-all cases. Ten times in 150 s it stood still for 0.12 to 0.41 s.
+With --load, the computer is busy: the driver and each node wait for the processor. The wait before
+a run is WAIT on average; about once in STALL_EVERY seconds, STALL is added. Both times are
+multiplied by the number of other processes per core. Messages that arrive during a wait stay in the
+queue. After the wait, the process receives the oldest message and the last QUEUE messages; those in
+between are lost. A late message may therefore be followed by one that was sent much later. The arm
+and its muscle modules do not wait.
+
+These times are as long as those measured on two cores at a load of 20. There, a process that
+computed for a few milliseconds 100 times a second took 13 ms on average, and 46 ms in 1 % of all
+cases. Ten times in 150 s it did not run for 0.12 to 0.41 s.
 
 The bench prints the false findings and stops, the pauses (stops that end by themselves, for example
 after 0.2 s without messages), the number of messages that the controller lost, and the longest
-delay of a message. An individual's hour ends with its first finding or stop. Exit status 1 if there
-was one.
+delay of a message. An individual's hour ends with its first finding or stop. The exit status is 1
+if there was one.
 """
 
 from __future__ import annotations
@@ -68,10 +70,10 @@ class Message(NamedTuple):
 
 
 class Process:
-    """A process that waits for the processor of a busy computer, and its subscription."""
+    """A simulated process that waits for the processor of a busy computer before it reads messages."""
 
     def __init__(self, load: float, seed: list[int]) -> None:
-        """Run beside `load` other processes, on average."""
+        """Share the computer with `load` other processes, on average."""
         self._per_core, self._rng = load / CORES, np.random.default_rng(seed)
         self._runs_at = 0.0  # time at which the process runs next [s]
         self._waiting: list[Message] = []
@@ -80,11 +82,11 @@ class Process:
         self.longest_delay = 0.0  # longest delay of a message [s]
 
     def send(self, message: Message) -> None:
-        """Deliver a message, which waits until the process runs."""
+        """Put a message into the queue of the process, which reads it when it runs next."""
         self._waiting.append(message)
 
     def runs(self, now: float) -> float | None:
-        """Return when the process runs in the period that begins at `now` [s], or None."""
+        """Return when the process runs [s] in the sample period from `now`; None if it does not."""
         if self._runs_at >= now + SAMPLE_TIME:
             return None
         runs_at = max(now, self._runs_at)
@@ -95,7 +97,10 @@ class Process:
         return runs_at
 
     def receive(self, now: float) -> list[tuple[float, float, Any]]:
-        """Return time of reception [s], delay [s] and content of the messages received at `now`."""
+        """Return the messages that the process receives when it runs at the time `now` [s].
+
+        Each entry is the time of reception [s], the delay since sending [s] and the content.
+        """
         waiting, self._waiting = self._waiting, []
         kept = waiting[:1] + waiting[1:][-QUEUE:]
         self.lost += len(waiting) - len(kept)
@@ -175,7 +180,7 @@ class BusyLoop:
         )  # fmt: skip
 
     def step(self) -> None:
-        """Simulate SAMPLE_TIME."""
+        """Simulate the arm, the driver and the nodes for one sample period."""
         now = self.now
         if self.learner.mae is not self._mae:
             self._mae = self.learner.mae

@@ -56,7 +56,10 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
     browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
 
     def take(seconds: float, every: float, until: Callable[[str], bool] = lambda _: False) -> bool:
-        """Take pictures for a time, or until a condition on the page's text holds."""
+        """Take a picture every `every` seconds; return whether `until` held within `seconds`.
+
+        `until` receives the text of the page, and ends the series when it returns True.
+        """
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             begun = time.monotonic()
@@ -93,7 +96,10 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
 
 
 def write(frames: list[Image.Image], kept: dict[str, int], out: Path) -> None:
-    """Write the film with one palette for all frames, and the separate pictures."""
+    """Write the film with one palette for all frames, and the separate pictures.
+
+    `kept` gives the index in `frames` of each separate picture, by file name.
+    """
     several = frames[:: max(1, len(frames) // 8)]
     collage = Image.new('RGB', (SCALED[0], SCALED[1] * len(several)))
     for i, frame in enumerate(several):

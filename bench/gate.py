@@ -6,12 +6,12 @@
 For each individual and preset, a learner learns from an exploring arm that carries 3.6 kg every
 second minute. Each published checkpoint is validated on the messages of the arm. The bench prints:
 
-- the largest value of each measure over all networks and its limit, and the same for messages
-  (`signals/limits.py`),
+- each measure of the networks: its largest value over all of them, and its limit,
+- each measure of the messages: its largest value, and its limit (`signals/limits.py`),
 - the networks that were refused (there should be none),
 - how many initial and final networks are refused after each attack on them.
 
-Exit status 1 if a healthy network was refused, or an attack was not.
+The exit status is 1 if a healthy network was refused, or an attacked one was not.
 """
 
 from collections import defaultdict
@@ -54,7 +54,10 @@ MESSAGES = {
 
 
 def message_measures(robot: Robot, mae: Mae, stream: Recording) -> dict[str, float]:
-    """Return the largest value of each measure in MESSAGES over a recording; θ_est is by `mae`."""
+    """Return the largest value over a recording of each measure in MESSAGES, by its name.
+
+    The joint angles that the measures need are those that `mae` estimates.
+    """
     theta = mae.estimate(end_tensions(mae, stream), stream.length).theta
     values = (
         np.abs(np.diff(stream.length, axis=0)).max(),
@@ -68,7 +71,7 @@ class Spread:
     """The largest value of each measure over networks, and the refused networks."""
 
     def __init__(self) -> None:
-        """Start with no network."""
+        """Begin without any measured network."""
         self.most: defaultdict[str, float] = defaultdict(float)
         #: largest d among the ruptured muscles of a network, as a multiple of the detection
         #: threshold; the smallest of these values over all networks
@@ -76,7 +79,7 @@ class Spread:
         self.refused, self.count = list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
-        """Measure and validate a network."""
+        """Measure a network, and record it as refused if the validation rejects it."""
         self.count += 1
         values = {key: error.max() for key, error in filter(None, gate.postures.errors(mae))}
         errors = gate.message_errors(mae)
@@ -97,7 +100,19 @@ class Spread:
 
 
 def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: Spread) -> Mae:
-    """Learn one individual, validate each checkpoint, and return the last network."""
+    """Let a network learn from one exploring individual, and validate each checkpoint.
+
+    Args:
+        arm: The emulated individual.
+        mae: The network before learning.
+        driver: The network that commands the exploration.
+        seed: Seed of the individual and of the learner.
+        minutes: Duration of the exploration.
+        spread: Receives the measures of every checkpoint.
+
+    Returns:
+        The network after learning.
+    """
     robot, gate = arm.robot, CheckpointValidator(arm.robot)
 
     def script(arm: Arm, time: float) -> None:

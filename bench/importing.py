@@ -112,7 +112,10 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
 
 
 def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Comparison | None:
-    """Return `comparison`, or for a cardsflow.xml a comparison with lengths by MuJoCo."""
+    """Compare the muscle lengths of a robot imported from a cardsflow.xml with those by MuJoCo.
+
+    For other files, and without a model.urdf beside the file, return `comparison` unchanged.
+    """
     if file.name != 'cardsflow.xml' or not file.with_name('model.urdf').exists():
         return comparison
     source = read_source(file)

@@ -37,7 +37,7 @@ DEADLINE = 60.0  # longest wait for a child to start [s]
 
 
 def samples(robot: Robot, life: int) -> Iterator[Sample]:
-    """Yield the samples that the child process number `life` accepts, which are random."""
+    """Yield the random samples that child process number `life` accepts."""
     rng = np.random.default_rng([life, 0x51])
     while True:
         theta = robot.random_postures(1, rng)[0]
@@ -56,7 +56,11 @@ def digest(store: SampleStore) -> int:
 
 
 def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
-    """Run a learner that accepts the samples of `life`, and print its reports until killed."""
+    """Run a learner that accepts one random sample after another, until the process is killed.
+
+    It prints a line for each sample that it has accepted and for each network that it publishes.
+    `life` is the number of this process.
+    """
 
     def say(*words: object) -> None:
         print(*words, flush=True)
@@ -108,12 +112,12 @@ class Child:
         self._reader.join()
 
     def trouble(self) -> str:
-        """Return the process's stderr."""
+        """Return the error output of the process."""
         assert self._process.stderr is not None
         return self._process.stderr.read()
 
     def numbers_after(self, word: str) -> list[int]:
-        """Return the numbers that were reported after a word."""
+        """Return the number in each line of the child's output that begins with `word`."""
         return [int(line[1]) for line in self.lines if line[0] == word and len(line) > 1]
 
     @property
@@ -123,7 +127,11 @@ class Child:
 
 
 def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> list[str]:
-    """Kill `kills` children one after another, check with one more; return what was lost."""
+    """Kill `kills` learners one after another; return a line for each loss of saved data.
+
+    Each learner is checked against what the earlier ones had reported. A last learner follows,
+    which shows what was left after the last kill.
+    """
     rng = np.random.default_rng(seed)
     # All stores that may be on disk: the kill may come after a sample was saved and before the
     # child has reported it.
@@ -165,7 +173,11 @@ def run(robot: Robot, directory: Path, initial: Path, kills: int, seed: int) -> 
 
 
 def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[SampleStore]:
-    """Return the stores that a child may leave: with the samples it reported, and with one more."""
+    """Return the two stores that a killed child may leave on disk.
+
+    One has the samples that the child reported as accepted. The other has one more, because the
+    kill may come between saving a sample and reporting it.
+    """
     drawn = samples(robot, life)
     for _ in range(accepted):
         store.add(next(drawn))

@@ -27,13 +27,13 @@ SELDOM, STEPS = 20.0, 400
 
 
 class Seldom(Trainer):
-    """A trainer that updates less often than that of the node."""
+    """A trainer that updates less often than that of the node, which shortens long experiments."""
 
     _asked = 0
 
     @property
     def ready(self) -> bool:
-        """Whether SELDOM seconds of messages, and enough new data, have arrived."""
+        """Whether an update may begin: SELDOM seconds have passed, and enough data are new."""
         self._asked += 1
         if self._asked < SELDOM / SAMPLE_TIME or not super().ready:
             return False

@@ -115,7 +115,11 @@ class Body:
         self.muscles, self.signs = list[Muscle](), list[tuple[str, ...]]()
 
     def add_arm(self, number: int, wires: int | str) -> None:
-        """Add an arm; odd numbers are on the right."""
+        """Add arm number `number`; arms with odd numbers are on the right.
+
+        `wires` is the number of tendons of a wrist; 0 adds no wrist. 'held' adds no wrist either,
+        and fixes the last joint of the arm.
+        """
         right, pair = number % 2, number // 2
         prefix = ('left_', 'right_')[right] + (f'{pair + 1}_' if pair else '')
         held, wires = ('elbow_yaw' if wires == 'held' else ''), wires if wires != 'held' else 0

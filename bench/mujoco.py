@@ -86,10 +86,10 @@ MuscleJacobian = Callable[[Array], Array]
 
 
 class Individuals(Study):
-    """A study of individuals of a MuJoCo file instead of a shipped robot."""
+    """The experiments on a MuJoCo file: each seed is an individual that deviates from the file."""
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
-        """Return an individual at rest."""
+        """Return the individual of a seed at rest, with or without tendon friction."""
         return make_arm(self.robot, seed, self.reality, friction, deviates=True)
 
 
@@ -105,7 +105,7 @@ def parse(text: str) -> tuple[str, Path, dict[str, Any]]:
 
 
 def speed(arm: Arm) -> float:
-    """Return how many seconds of an emulated arm one core computes in a second."""
+    """Return the speed of an emulated arm on one core, as a multiple of real time."""
     arm.step(0.2)
     start = time.process_time()
     arm.step(2.0)
@@ -136,10 +136,12 @@ def can_exert(limits: reach.Limits, muscle_jacobian: MuscleJacobian, planned: Tr
 
 
 def exertable_path(study: Study, seed: int) -> list[Array]:
-    """Return MOTIONS + 1 postures (D,) between which the muscles can move the arm from rest.
+    """Return MOTIONS + 1 holdable postures (D,) that the arm can reach one after another.
+
+    Between two of them the arm moves from rest to rest, as far as its muscles are strong enough.
 
     Raises:
-        MusculoskeletalError: If the random postures contain too few such postures.
+        MusculoskeletalError: If too few of the random postures qualify.
     """
     arm, limits = study.arm(seed), reach.Limits(study.robot, study.network(seed))
     path, duration = [arm.theta], motion.STARTING
@@ -203,7 +205,7 @@ def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
 
 
 def arm_errors(arm: Arm, muscle_jacobian: MuscleJacobian) -> Array:
-    """Return the root mean square error of each muscle's moment arms over the workspace, (M,)."""
+    """Return each muscle's moment arm error, as a root mean square over postures [m], (M,)."""
     theta = arm.robot.random_postures(ARM_POSTURES, np.random.default_rng(0x308))
     error = muscle_jacobian(theta) - arm.individual.muscle_jacobian(theta)
     result: Array = np.sqrt((error**2).sum(axis=2).mean(axis=0))

@@ -4,14 +4,14 @@
     experiment online_learning --seeds 0,1 --keep FOLDER
     python -m bench paper_readings FOLDER --seeds 0,1
 
-The paper does not print the unit of τ in w₆ = 0.001, and its English and Japanese texts differ in
-what l_sim is. For each interpretation ("reading"), the simulator of preset `paper` follows the
-commands of the held-out motion with the networks before and after learning, as `experiment
-simulation` does. Prints a Markdown table of the mean errors, and of the share of tensions at
-T_bias.
+The paper leaves two things open. It does not print the unit of the torque τ that the weight
+w₆ = 0.001 belongs to, and its English and Japanese texts differ in what the length l_sim is. For
+each interpretation ("reading"), the simulator of preset `paper` follows the commands of the
+held-out motion with the networks before and after learning, as `experiment simulation` does. The
+bench prints a Markdown table of the mean errors, and of the share of tensions at T_bias.
 
-"Sent" is l_target, "in the simulation" is l_target − l_comp(T_sim), and "measured" is the measured
-length of the arm.
+In the table, l_sim is "sent" for the commanded length l_target, "in the simulation" for
+l_target − l_comp(T_sim), and "measured" for the measured length of the arm.
 """
 
 from pathlib import Path

@@ -138,7 +138,7 @@ def core(measured: Iterable[timings.Timed]) -> str:
 
 
 def wire(seconds: float) -> dict[tuple[str, float, str], Wire]:
-    """Measure the running system; return the results by robot, rate and kind of nodes."""
+    """Measure the running system; return the results by robot, rate [Hz] and set of nodes."""
     return {
         (robot, rate, kind): result
         for robot in SIZES
@@ -167,7 +167,10 @@ def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
 
 
 def goals(numbers: dict[str, tuple[float, str, float]]) -> str:
-    """Return the table of goals; `numbers` has a measured value, ≤ or ≥, and a limit for each."""
+    """Return the table of goals.
+
+    `numbers` has for each goal the measured value, the sign ≤ or ≥, and the limit.
+    """
     cells = []
     for name, (value, sign, limit) in numbers.items():
         met = value <= limit if sign == '≤' else value >= limit
@@ -184,7 +187,11 @@ def resident(pid: int) -> tuple[float, float]:
 
 
 def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
-    """Return by node the CPU time until the first command [s], and the memory later [MB]."""
+    """Start the system, and return the CPU time [s] and the memory [MB] of each node by name.
+
+    The CPU time is that until the first command. The memory, with its file-backed part, is measured
+    after the start.
+    """
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
         deadline = time.monotonic() + STARTING
@@ -203,7 +210,13 @@ def started(network: Path) -> tuple[dict[str, float], dict[str, tuple[float, flo
 
 
 def starting(used: dict[str, float], held: dict[str, tuple[float, float]], network: Path) -> str:
-    """Return the table of start-up times and memory."""
+    """Return the table of the CPU time until the first command, and of the memory, of each node.
+
+    Args:
+        used: CPU time of each node [s].
+        held: Resident memory of each node, and its file-backed part [MB].
+        network: Checkpoint for the nodes of the last row, which only exchange messages.
+    """
     cells = (
         (name, f'{used[name]:.1f}', BEFORE_MEMORY[name], f'{held[name][0]:.0f}') for name in held
     )
@@ -218,7 +231,7 @@ def starting(used: dict[str, float], held: dict[str, tuple[float, float]], netwo
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:
-    """Draw a flame graph of each node, and return the text for the page."""
+    """Draw a flame graph of each node, and return the text of the page with links to the graphs."""
     out.mkdir(parents=True, exist_ok=True)
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:

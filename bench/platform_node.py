@@ -29,7 +29,7 @@ START = 'from musculoskeletal_ae.executables import estimator; raise SystemExit(
 
 
 def check(file: Path) -> str:
-    """Check the node, and return one line about the result.
+    """Check the node; return one line that describes the result.
 
     Raises:
         RuntimeError: If the node publishes no estimate or a wrong one, or fails to end cleanly.

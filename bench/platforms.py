@@ -123,7 +123,10 @@ def _environment(home: Path) -> dict[str, str]:
 
 
 def interpreter(version: str) -> Path | None:
-    """Return the path of a Python of a version such as 3.12, from PATH or pyenv, or None."""
+    """Return the path of a Python of `version`, such as 3.12.
+
+    The result is None if neither PATH nor pyenv has this version.
+    """
     pyenv = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv')) / 'versions'
     candidates = [shutil.which(f'python{version}'), *sorted(pyenv.glob(f'{version}.*/bin/python'))]
     for candidate in filter(None, candidates):
@@ -295,7 +298,10 @@ def check_system(name: str, folder: Path, tests: tuple[str, ...]) -> str:
 
 
 def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
-    """Return the pinned requirements in `file` for a Python version; of `names` only, if given."""
+    """Return the pinned requirements in `file` that apply to a Python version.
+
+    If `names` is given, only requirements of these packages are returned.
+    """
     lines = []
     for line in file.read_text('utf-8').splitlines():
         requirement, _, condition = line.partition(';')
@@ -308,7 +314,7 @@ def pinned(file: Path, version: str, names: tuple[str, ...] = ()) -> list[str]:
 
 
 def check_node(name: str, folder: Path, checkpoint: Path) -> str:
-    """Check the core and one node in a virtual environment; return one line about it."""
+    """Check the core and one node in a virtual environment; return one line with the result."""
     is_sourced = not name.startswith('wheels-')
     version = '3.12' if is_sourced else name.removeprefix('wheels-')
     site, venv = Site(folder), folder / 'venv'

@@ -5,12 +5,13 @@
 
 DIR has one clone for each repository of `recordings_read.repositories`, named OWNER+NAME or NAME
 (a working tree or a git directory). A repository without a clone is cloned into DIR if --fetch is
-given, and left out otherwise. Nothing of the data is kept. The results are result.json and
+given, and left out otherwise. None of the data is stored. The results are result.json and
 tables.md, which `python doc/make.py` writes into doc/results.md.
 
-Every model is trained on the training rests, and tested on all rows of other runs (neck), files
-(arm) or poses (stand). For neck and arm, polynomials are also fitted to all rows of the training
-runs. All constants are in `recordings_learn`; none was chosen by an error on test rows.
+Every model is trained on the rest samples of the training runs. It is tested on all rows of other
+runs (neck), files (arm) or poses (stand). For neck and arm, polynomials are also fitted to all rows
+of the training runs. All constants are in `recordings_learn`; none was chosen by an error on test
+rows.
 """
 
 from __future__ import annotations
@@ -64,7 +65,11 @@ def _rows(run: Run, rows: Any) -> Run:
 
 
 def neck_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the soft neck: training with one payload, or with two and test with one."""
+    """Yield splits of the recording of the soft neck, a link that three tendons bend.
+
+    The training data have one payload or two. The test data have the same payload in other poses,
+    or another payload.
+    """
     none, half, whole = recording.runs
     own = none.at_rest(HALF)
     # The rests of every other pose (HALF) are for training, so test on all rows of the poses
@@ -81,7 +86,10 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
 
 
 def arm_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the soft arm: test with other files of a payload, or with other payloads."""
+    """Yield splits of the recording of the soft arm, a link that three tendons bend.
+
+    The test data are other files with the same payload, or files with other payloads.
+    """
     files = {load: [run for run in recording.runs if run.load == load] for load in (0.0, 0.5)}
     others = [run for run in recording.runs if run.load not in files]
     bare, held_out = files[0.0][0::2], files[0.0][1::2]
@@ -93,7 +101,10 @@ def arm_splits(recording: Recording) -> Iterator[Split]:
 
 
 def stand_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the test stand: training with 20 or 100 poses, and test with all others."""
+    """Yield splits of the recording of the test stand for a continuum robot.
+
+    The training data are 20 or 100 poses. The test data are all other poses.
+    """
     run = recording.runs[0]
     order = np.random.default_rng(0).permutation(len(run.length))
     for count in (20, 100):
@@ -144,7 +155,7 @@ def models(
 
 
 def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str, Any]]:
-    """Return the errors of all models on a repository, and further results of its runs."""
+    """Return the errors of all models on one repository, and the `observations` on its runs."""
     recording = repository.read(files)
     name, results = recording.link.name, list[Result]()
     learned = dict[tuple[str, bool], Model]()
@@ -159,7 +170,7 @@ def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str,
 
 
 def observations(recording: Recording) -> dict[str, Any]:
-    """Return what runs of a recording show without a model of θ, such as slopes and R², by name."""
+    """Return quantities by name that describe a recording without a model of θ, such as slopes."""
     shown: dict[str, Any] = {}
     azimuths = np.array(recording.link.azimuths)
     if recording.link.name == 'soft_neck':

@@ -70,9 +70,10 @@ def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
 
 
 def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
-    """Return a function that computes the tensions [N], (N, M), of a run.
+    """Return a function that computes the tensions of a run [N], (N, M).
 
-    With efforts, the tension is T_bias plus the scaled effort; otherwise, the assumed tension.
+    With efforts, a tension is T_bias plus a multiple of the effort of the motor. Without, it is the
+    tension that the robot assumes for muscles without a tension sensor.
     """
     if not with_effort:
         return lambda run: np.tile(robot.actuation.assumed_tension, (len(run.length), 1))
@@ -145,7 +146,11 @@ class Statics:
         return np.concatenate(parts)
 
     def posture(self, run: Run, values: Array | None = None) -> Array:
-        """Return the rest postures of a run with a known payload [rad], (N, D)."""
+        """Return the postures at which the forces of a run are in balance [rad], (N, D).
+
+        The tendon lengths and the payload are those of the run. `values` are the fitted unknowns;
+        by default those found from the rest samples.
+        """
         spring, stiff, scale, pretension, share = (self.values if values is None else values)[:5]
         robot = self._robot.with_elasticity(
             JointElasticity(np.exp(spring) * np.eye(2), np.zeros(2), np.zeros(2))
@@ -199,7 +204,13 @@ def payload_share(runs: list[Run], with_effort: bool, with_theta: bool) -> float
 
 
 def bend_gain(run: Run, azimuths: Array) -> float:
-    """Return how far the link bends at rest [rad] per tendon length commanded to bend it [m]."""
+    """Return the slope of the bend at rest over the commanded bend [rad/m].
+
+    Args:
+        run: The run.
+        azimuths: Azimuth of each tendon [rad], (M,). With these, the tendon lengths [m] give the
+            commanded bend in two directions.
+    """
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound = -rest.length @ out
@@ -208,7 +219,13 @@ def bend_gain(run: Run, azimuths: Array) -> float:
 
 
 def effort_slope(run: Run, azimuths: Array) -> float:
-    """Return how much the efforts at rest rise per tendon length commanded to bend the link [m]."""
+    """Return the slope of the efforts at rest over the commanded bend [unit of the effort per m].
+
+    Args:
+        run: The run.
+        azimuths: Azimuth of each tendon [rad], (M,). With these, the tendon lengths [m] give the
+            commanded bend in two directions.
+    """
     out = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     rest = run.at_rest()
     wound, effort = -rest.length @ out, rest.effort @ out

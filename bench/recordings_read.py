@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers of public recordings of tendon-driven robots. Nothing of their data is kept here.
+"""Readers of public recordings of tendon-driven robots. The data are not part of this repository.
 
 A recording is read from a clone: a working tree, or a git directory without one. Each reader
 returns runs with tendon lengths, efforts and true joint angles, in SI units, and the rest samples
@@ -56,7 +56,7 @@ class Run:
     rests: Array  # first row of each rest, and the row after its last row, (R, 2)
 
     def at_rest(self, rows: slice = slice(None)) -> Run:
-        """Return the rest samples as a run."""
+        """Return a run with one row for each rest: the means of lengths, efforts and θ in it."""
         spans = self.rests[rows]
         length, effort, theta = (
             np.array([part[a:b].mean(axis=0) for a, b in spans])
@@ -77,7 +77,7 @@ class SoftLink:
     limit: float  # largest bend [rad]
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory, and return it; its winches follow positions."""
+        """Write the robot directory and return its path; the muscle modules regulate positions."""
         directory.mkdir(parents=True, exist_ok=True)
         low, high, half = -self.limit, self.limit, 0.5 * self.height
         urdf = URDF.format(name=self.name, half=half, mass=self.mass, low=low, high=high)
@@ -174,9 +174,10 @@ def _columns(text: str) -> dict[str, Array]:
 
 
 def _ends(changes: Array, count: int, rows: int) -> Array:
-    """Return the last `rows` rows of each pose, (R, 2): the first row, and the row after the last.
+    """Return for each pose its last `rows` rows, as the first row and the row after the last one.
 
-    A pose ends at a row in `changes` or at `count`. Poses of at most twice `rows` are left out.
+    A pose ends at a row in `changes` or at `count`. Poses of at most twice `rows` are left out. The
+    result is (R, 2) for R poses.
     """
     ends = np.append(changes, count)
     starts = np.append(0, changes)
@@ -185,7 +186,10 @@ def _ends(changes: Array, count: int, rows: int) -> Array:
 
 
 def soft_neck(files: Files) -> Recording:
-    """Read the open-loop runs of the soft neck: encoders [degrees] and an IMU, 100 per second."""
+    """Read the open-loop runs of the soft neck, with 100 rows per second.
+
+    They contain the angles of motor encoders [degrees] and the orientation of the tip by an IMU.
+    """
     folder = 'paper-results/csv-results/Frontiers-Test-Bench-Evaluation-Soft-Robotic-Link'
     # radius of the spool [m], and distance of the tendons from the middle as a multiple of it
     spool, ratio = 0.01, 5.69
@@ -210,7 +214,10 @@ def soft_neck(files: Files) -> Recording:
 
 
 def soft_arm(files: Files) -> Recording:
-    """Read the control runs of the soft arm: motors [rad], currents [mA], IMU, 50 per second."""
+    """Read the control runs of the soft arm, with 50 rows per second.
+
+    They contain motor angles [rad], motor currents [mA] and the orientation of the tip by an IMU.
+    """
     # radius of the spool, and distance of the tendons from the middle of the link [m]
     spool, distance = 0.0093, 0.0382
     runs = []
@@ -231,13 +238,14 @@ def soft_arm(files: Files) -> Recording:
 
 
 def continuum_stand(files: Files) -> Recording:
-    """Read the test stand: commanded shortenings [0.1 mm] of three tendons, and a tracked tip [mm].
+    """Read the recording of the test stand of a continuum robot.
 
-    The tip moves on a sphere. Its bend is the direction from the centre of that sphere, seen along
-    the axis that the unloaded link has. The publication does not state where the tendons run;
-    `fitted` estimates it from the training rows. A tendon that is not shortened is slack where the
-    link bends away from it. Lengths are returned ten times as large as they are, because the
-    learner is made for links of human size.
+    It contains the commanded shortenings of three tendons [0.1 mm] and the tracked positions of the
+    tip [mm]. The tip moves on a sphere. The bend follows from the direction from the centre of this
+    sphere to the tip, relative to the axis of the unloaded link. The publication does not state
+    where the tendons run; `fitted` estimates it from the training rows. A tendon that is not
+    shortened is slack where the link bends away from it. Lengths are returned ten times as large as
+    they are, because the learner is made for links of human size.
     """
     rows = [line.split(',') for line in files.text('Dataset/Dataset.txt').split()]
     table = np.array(rows, float)

@@ -5,15 +5,18 @@
 
 The bodies are arm26 and those of `bench limbs`. For each, a separate process measures:
 
-- the time of initial training, and the resulting error of ② per joint on the geometric model,
+- the time of initial training, and the resulting error of the network's estimate on the geometric
+  model,
 - the times of the core's steps,
-- the error of ② on the held-out motion before and after learning ten minutes of individual 0, in
-  updates of 400 steps every 20 s, and the error of the oracle,
+- the error of the estimate on the held-out motion, before and after individual 0 has learned for
+  ten minutes in updates of 400 steps every 20 s, and the error of the oracle,
 - the time of one update of the learner with default settings and a full store,
 - the largest memory.
 
-Times are those of one core. The results are a table and a plot. DIR keeps networks and rows; a
-later run continues from them.
+The estimate uses the network's pass from tensions and lengths to joint angles. Errors are divided
+by the square root of the number of joints, so that bodies can be compared. Times are those of one
+core. The results are a table and a plot. DIR keeps networks and rows; a later run continues from
+them.
 """
 
 import json
@@ -69,7 +72,7 @@ Row = dict[str, float]
 
 
 def measure(body: str, folder: Path, minutes: float) -> Row:
-    """Return the results of a body; errors are divided by √D."""
+    """Return the results of a body. Errors [rad] are divided by √D, for D joints."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
     # Training is timed, so a file that an interrupted run left must not replace it.

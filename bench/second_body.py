@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares emulator model `foreign` with the paper's Musashi: the calibration of `Effects`.
+"""Compares emulator model `foreign` with the paper's Musashi, to check the sizes of its effects.
 
     python -m bench second_body [--quick] [--seeds 200,…,209] [--off EFFECT,…]
 
-The sizes in `emulator/effects.py` were set once, on individuals 200–209 of musashi_left_arm, which
-no table shows, and with the learner of commit 86c8dfc. They are never changed to improve a result.
-The targets, without the error of the network itself, were:
+The sizes in `emulator/effects.py` were set once, with the learner of commit 86c8dfc, on individuals
+200–209 of musashi_left_arm. No table of the documents uses these individuals. The sizes are never
+changed to improve a result. The targets, which leave out the error of the network itself, were:
 
 - Least squares on the nominal geometry has an error of 0.32–0.41 rad on the held-out motion.
 - l(θ_S-p) without tension has an error of up to 40 mm over the paper's −120…30°.
@@ -22,8 +22,8 @@ checkpoint validation, which the paper does not have; `after` is the error of th
      205                0.483          31                0.534  0.105             88     0.95
     mean                0.378          31                0.528  0.106             98     0.76
 
-Eight of these individuals, with each effect at the middle of its range, and half of the tendons
-without kinks:
+For comparison, eight of these individuals with each effect at the middle of its range, and with
+kinks in only half of the tendons:
     mean                0.372          33                0.680  0.111             83     0.77
 """
 
@@ -74,9 +74,15 @@ class Row(NamedTuple):
 def measured(
     robot: Robot, default: Mae, paper: Mae, seed: int, effects: Effects, share: float
 ) -> Row:
-    """Record an individual, learn it with preset `paper`, and return its results.
+    """Let the network of preset `paper` learn one individual, and return the results.
 
-    `share` scales all durations.
+    Args:
+        robot: The geometric model.
+        default: Initial network of preset `default`, which commands the motion.
+        paper: Initial network of preset `paper`.
+        seed: Seed of the individual.
+        effects: Effects of the emulator model.
+        share: Factor of all durations.
     """
 
     def arm() -> ForeignArm:

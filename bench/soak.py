@@ -3,12 +3,12 @@
 
 python -m bench soak [--hours 24] [--creep 1] [--moving 60] [--quick]
 
-The emulated arm explores continuously, and every message goes through the learner. To fit a day
-into one or two hours, the learner updates only after every `--every`-th sample, except for the
-first ones; the node updates after each. The bench therefore covers fewer updates than a day has.
-With --moving the arm moves for only a part of every five minutes. With --creep all tendons lengthen
-over time. Each report is one line: robot time, samples, held-out error, threshold of d, memory,
-time of an update.
+The emulated arm explores continuously, and every message goes through the learner. The node updates
+after each sample. To fit a day into one or two hours, the bench updates only after every
+`--every`-th sample, and more often at the beginning. It therefore covers fewer updates than a day
+has. With --moving the arm moves for only a part of every five minutes. With --creep all tendons
+lengthen over time. Each report is one line: robot time, samples, held-out error, threshold of d
+(the measure that detects faulty muscles), memory, time of an update.
 
 Exit status 1 in any of these cases:
 

@@ -4,8 +4,9 @@
     python -m bench tension [--robot musashi_left_arm] [--seeds 5,…,14] [--quick]
 
 New individuals start with the initial network, in closed loop with estimator, controller and
-learner, in one process. Each explores for a minute and learns meanwhile. It then moves to random
-targets with every control method and the initial network, and holds them. The bench prints:
+learner, in one process. Each explores for a minute and learns at the same time. Then the learner is
+off: each individual moves to random targets with every control method and the initial network, and
+holds them. The bench prints:
 
 - the highest measured tension as a multiple of `tension.limit`,
 - the longest uninterrupted time above `ALLOWED` times the limit,
@@ -104,7 +105,12 @@ class Observed:
 def explore(
     arm: Arm, initial: Mae, seed: int, seconds: float, held_out: Recording
 ) -> tuple[Excess, int, int, float]:
-    """Explore and learn for a time [s]; return excess, stops, samples and held-out error [rad]."""
+    """Explore and learn for a time [s].
+
+    Returns:
+        How tensions exceeded their limit, the number of stops, the number of samples, and the mean
+        estimation error on `held_out` after learning [rad].
+    """
     observed = Observed(arm, initial, Settings(), seed)
     loop, learner = observed.loop, Learner(arm.robot, initial, 'default', seed)
     count = 0
@@ -124,7 +130,11 @@ def explore(
 
 
 def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Excess, int]:
-    """Move to random targets with one method and hold them; return excess and stops."""
+    """Move to random targets with one control method and hold them.
+
+    Returns:
+        How tensions exceeded their limit, and the number of stops.
+    """
     observed = Observed(arm, initial, Settings(method=method), seed)
     robot, loop = arm.robot, observed.loop
     rng = np.random.default_rng([seed, 0x7E])

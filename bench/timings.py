@@ -5,8 +5,9 @@
 
 The torch side runs the same algorithm on the same input. Its network runs in torch, and autograd
 computes the gradients. Further rows of the simulator also have the mechanics in torch
-(`eager_simulation`). The bound is the time of the network's multiply-adds alone, at the rate of
-matrix products of that size on this machine: one row for a single call, a batch for many arms.
+(`eager_simulation`). The column "bound" estimates a lower bound: the time that this machine needs
+for the multiply-adds of the network alone, as matrix products. The products have one row for a
+single call, and a batch of rows for many arms.
 """
 
 import time
@@ -81,7 +82,10 @@ def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
 
 
 def gemm_rate(rows: int) -> float:
-    """Return the multiply-adds per µs of this machine in products of (rows, 200) and (200, 100)."""
+    """Return how many multiply-adds this machine computes per µs in a matrix product.
+
+    The product is that of a (rows, 200) and a (200, 100) matrix in single precision.
+    """
     left, right = np.ones((rows, 200), np.float32), np.ones((200, 100), np.float32)
     return rows * right.size / microseconds(lambda: left @ right)
 
@@ -174,7 +178,10 @@ def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
 
 
 def _enter(network: Network, theta: Tensor, tension: Tensor) -> Tensor:
-    """Return z = ①(θ, T) of scaled rows."""
+    """Return the latent state z that the encoder computes from joint angles and tensions.
+
+    The inputs and z have one row for each state; the inputs are scaled as the network expects.
+    """
     length = torch.zeros(*theta.shape[:-1], network.muscles)
     values = torch.cat([theta, tension, length], dim=-1)
     mask = torch.full((len(values),), list(Mask).index(Mask.THETA_TENSION))

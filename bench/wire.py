@@ -10,8 +10,8 @@ muscle_states to that of the next muscle_length_command. Other rows are for comp
 - estimator and controller in one process,
 - one plain rclpy node with an estimate in eager torch that converts a tension to a length, without
   safety or control,
-- a lower bound: as many nodes that exchange the same messages with the same executor, and compute
-  nothing.
+- a lower bound: the same number of nodes, which exchange the same messages with the same executor,
+  and compute nothing.
 
     late      messages without a command within two periods
     missed    messages of the emulator that did not arrive
@@ -226,7 +226,7 @@ class System:
 
 
 class Wire(NamedTuple):
-    """What was measured of a running system of nodes."""
+    """Latency, losses and CPU time of a running system of nodes."""
 
     latency: tuple[float, ...]  # median, 99th percentile and maximum [ms]
     late: float  # messages of the emulator without a command within two periods [%]

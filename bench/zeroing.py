@@ -6,10 +6,10 @@ python -m bench zeroing [--robot …] [--seeds 0,1,2,3,4] [--folder DIR] [--out 
 An individual that has learned for ten minutes is switched off and on. It hangs, and every length
 sensor has an offset of 50–130 mm. Estimator and controller run as in their nodes. The bench prints:
 
-- the ratio of the held-out errors [rad] after and before the calibration,
-- the time that it took, and the largest error of an offset,
-- the alarms meanwhile, and in half a minute of exploration afterwards,
-- the fastest muscle and the highest tension meanwhile.
+- the held-out errors before and after the calibration [rad], and their ratio,
+- the duration of the calibration, and the largest error of an offset,
+- the number of false alarms during the calibration, and in half a minute of exploration after it,
+- the speed of the fastest muscle and the highest tension during the calibration.
 
 Calibration does not change the network or the learner's samples.
 """
@@ -63,7 +63,7 @@ class Loop:
         self._zeros = self.estimator.body.offsets
 
     def step(self, joints: bool) -> MuscleSample | None:
-        """Simulate 10 ms, with joint sensors if `joints`; return the estimator's muscle sample."""
+        """Simulate 10 ms, with joint sensors if `joints`; return the controller's muscle sample."""
         self.time += SAMPLE_TIME
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
@@ -88,7 +88,11 @@ class Loop:
 
 
 def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[str, Any]:
-    """Calibrate the lengths of one individual in the way `how`; return the results by name."""
+    """Calibrate the lengths of one individual after power-on; return the results by name.
+
+    `how` is the kind of calibration, a key of GOALS: 'posture' states the posture of the arm, and
+    'sensors' uses joint sensors.
+    """
     rng = np.random.default_rng([seed, 0x0F])
     offset = rng.uniform(LEAST, MOST, robot.muscle_count)
     offset *= rng.choice([-1.0, 1.0], robot.muscle_count)

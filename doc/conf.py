@@ -61,7 +61,11 @@ def name_files(_: Sphinx, page: str, source: list[str]) -> None:
 
 
 def as_written(*event: Any) -> None:
-    """Preserve bars, stars and `code`, and show indented blocks as equations."""
+    """Show docstrings as they are written, although Sphinx reads them as reStructuredText.
+
+    Vertical bars and asterisks are escaped, `code` becomes literal text, and indented blocks become
+    equations.
+    """
     lines: list[str] = event[-1]
     text = re.sub(r'(?<!`)`([^`]+)`(?!`)', r'``\1``\ ', '\n'.join(lines))
     equation = False

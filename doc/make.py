@@ -283,7 +283,7 @@ def capabilities_table() -> str:
 
 
 def _with_numbers(text: str, result: dict[str, Any]) -> str:
-    """Return a text with the numbers of a result and with counts that follow from them."""
+    """Replace the placeholders in a text by numbers of a result and counts derived from them."""
     numbers = dict(result)
     numbers['hours'] = result.get('healthy_s', 0.0) / 3600.0
     if 'named_share' in result:
@@ -307,7 +307,10 @@ TABLES = {
 
 
 def with_tables(text: str) -> str:
-    """Return a document with those of the TABLES that it marks, from the committed results."""
+    """Update the generated tables of a document from the committed results.
+
+    A table lies between `<!-- NAME -->` and `<!-- /NAME -->`, where NAME is a key of TABLES.
+    """
     for name, make in TABLES.items():
         if f'<!-- {name} -->' not in text:
             continue

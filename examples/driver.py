@@ -53,7 +53,7 @@ class Bus:
 
 
 class Driver(Node):
-    """Publishes the states, and regulates tension by the last command."""
+    """Publishes the states, and regulates each tension by the last command."""
 
     def __init__(self) -> None:
         super().__init__('driver')
@@ -72,7 +72,7 @@ class Driver(Node):
         self.get_logger().info(f'publishing at {RATE:g} Hz for {name}')
 
     def command(self, message: Float64MultiArray, by_tension: bool) -> None:
-        """Receive a command: lengths, or tensions if `by_tension`; ignore a malformed one."""
+        """Store the target lengths or, if `by_tension`, tensions; ignore a malformed message."""
         target = np.array(message.data)
         if len(target) == self.robot.muscle_count and np.isfinite(target).all():
             self.target, self.by_tension, self.commanded_at = target, by_tension, time.monotonic()

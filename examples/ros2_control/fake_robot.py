@@ -5,8 +5,8 @@
 
 The node replaces a controller_manager with the file controllers.yaml of this directory. The
 hardware is an emulated arm whose motors are joints named MUSCLE_motor. Half of the spools wind in
-the opposite direction, and every encoder has another zero. nodes.yaml corrects both.
-doc/howto/ros2_control.md describes the connection.
+the opposite direction, and every encoder reads a different angle at the zero posture. nodes.yaml
+corrects for both differences. doc/howto/ros2_control.md describes the connection.
 """
 
 import math
@@ -30,7 +30,7 @@ SPOOL_RADIUS = 0.012  # radius of the spools [m]
 
 
 class Hardware:
-    """An emulated hardware component: motors with encoders and torque sensors; joint sensors."""
+    """An emulated hardware component: motors with encoders and torque sensors, joint sensors."""
 
     def __init__(self, robot: str) -> None:
         self.robot = Robot.load(robot)
@@ -54,7 +54,7 @@ class Hardware:
         return states
 
     def write(self, angles: dict[str, float]) -> None:
-        """Command a spool angle [rad] to each drive, which follows it as muscles.yaml states."""
+        """Send each drive its target angle [rad], which it follows as muscles.yaml states."""
         angle = np.array([angles[motor] for motor in self.motors])
         self.arm.command_length(self.direction * SPOOL_RADIUS * (angle - self.zero))
 
@@ -73,7 +73,7 @@ class FakeRobot(Node):
         self.create_timer(1.0 / UPDATE_RATE, self.update)
 
     def on_commands(self, message: Float64MultiArray) -> None:
-        """Keep a command, as forward_command_controller does, unless a value is not finite."""
+        """Store a command until the next one; drop it with a warning if it is not finite."""
         if all(map(math.isfinite, message.data)):
             self.commands = list(message.data)
         else:
