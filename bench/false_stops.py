@@ -70,7 +70,7 @@ class Message(NamedTuple):
 
 
 class Process:
-    """A simulated process that waits for the processor of a busy computer before it reads messages."""
+    """A simulated process that waits for the processor of a busy computer before it reads."""
 
     def __init__(self, load: float, seed: list[int]) -> None:
         """Share the computer with `load` other processes, on average."""

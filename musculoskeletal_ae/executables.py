@@ -23,8 +23,8 @@ from musculoskeletal_ae.stop_signals import INTERRUPTED, STOP, Reaction
 def _prepare_process() -> None:
     """Prepare terminal output, crash reports and the import of MuJoCo.
 
-    A native crash prints the stacks of all threads. MuJoCo is kept from loading a graphics library,
-    because importing it with glfw would start processes that look for a display.
+    A native crash prints the stacks of all threads. An environment variable stops MuJoCo from
+    loading a graphics library; otherwise the import could start processes that look for a display.
     """
     replace_unprintable()
     os.environ.setdefault('MUJOCO_GL', 'disable')

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read files that a user names, and write files atomically.
 
-Of a user's files, only regular ones up to a size limit are read. The argument
+A file of a user is read only if it is a regular file up to a size limit. The argument
 `refuse(file, problem)` of the functions that read them returns the exception to raise.
 """
 
@@ -177,10 +177,10 @@ def _check(text: str) -> None:
 
 @contextmanager
 def new_directory(directory: Path, refuse: Refuse) -> Iterator[None]:
-    """Create a directory, or take an empty one, and let a `with` block write files into it.
+    """Create a directory into which a `with` block writes files; an empty one may exist already.
 
-    After an error or Ctrl-C, the files and a new directory are removed again, so that no partial
-    result remains.
+    After an error or Ctrl-C, the files are removed again, and the directory if it was new, so that
+    no partial result remains.
     """
     is_there = os.path.lexists(directory)
     if is_there and (not directory.is_dir() or any(directory.iterdir())):

@@ -99,7 +99,7 @@ class Equations(NamedTuple):
 
     @classmethod
     def of_common(cls, common: Array) -> Equations:
-        """Return the matrix of a fit whose unknowns are all shared."""
+        """Return the matrix of a fit without unknowns of single samples; `common` is C, (P, P)."""
         return cls(np.zeros((0, 0, 0)), np.zeros((0, 0, len(common))), common)
 
 
@@ -111,7 +111,7 @@ class RightSides(NamedTuple):
 
     @classmethod
     def of_common(cls, common: Array) -> RightSides:
-        """Return the right sides of a fit whose unknowns are all shared."""
+        """Return the right sides of a fit without unknowns of single samples; `common` is c."""
         return cls(np.zeros((0, 0)), common)
 
 
@@ -165,7 +165,7 @@ Point = TypeVar('Point')
 
 
 class Problem(Protocol[Point]):
-    """A problem to fit. A point holds values of all unknowns, and the residuals at these values."""
+    """A problem to fit. A point holds values of all unknowns and the residuals at these values."""
 
     #: e_θ (D,) and e_w (P,): 1 over the square of a typical step
     usual: tuple[Array, Array]
@@ -242,7 +242,10 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
 
 
 def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Result[Point]:
-    """Take the least damped step that lowers the cost, if any, and return the new state."""
+    """Take the step with the least damping that lowers the cost; return the new state.
+
+    If no step lowers the cost enough, the state keeps its point.
+    """
     before = problem.cost(fit.point)
     equations = problem.equations(fit.point)
     right = problem.right_sides(fit.point)

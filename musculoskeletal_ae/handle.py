@@ -19,7 +19,7 @@ class HandleType(types.StructRef):  # type: ignore[misc]
 
 
 class Handle(structref.StructRefProxy):  # type: ignore[misc]
-    """Tuples of arrays as one argument. The arrays are shared, not copied."""
+    """Passes tuples of arrays to compiled code as one argument, without copying the arrays."""
 
     held: Any  # only compiled code may read it
 

@@ -94,7 +94,15 @@ class Parameter:
 def settable(
     default: Any, meaning: str, unit: str = '', *within: float, legal: tuple[str, ...] = ()
 ) -> Any:
-    """Return the dataclass field of a parameter that may be set while a node runs."""
+    """Return the dataclass field of a parameter that may be set while a node runs.
+
+    Args:
+        default: Default value.
+        meaning: What the parameter means, for the documentation.
+        unit: Unit of the value, or ''.
+        within: Smallest and largest legal number, if the value is a number.
+        legal: Legal words, if the value is one of several words.
+    """
     low_high = (within[0], within[1]) if within else None
     return Parameter(default, meaning, unit, low_high, legal, settable=True).field()
 

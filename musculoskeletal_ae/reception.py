@@ -163,7 +163,7 @@ class Streams:
         self._last: dict[str, float] = {}  # time of the newest message [s], by topic
 
     def begins(self, topic: str, now: float) -> bool:
-        """Note a message that arrived at `now` [s]; return whether it is the first of a stream."""
+        """Record a message that arrived at `now` [s]; return whether it begins a stream."""
         before, self._last[topic] = self._last.get(topic, -math.inf), now
         return now - before > STREAM_GAP
 
@@ -175,7 +175,7 @@ class Stamps:
         self._last: int | None = None  # [ns]
 
     def is_new(self, stamp: Any) -> bool:
-        """Note a stamp and return whether it is new.
+        """Record a stamp; return whether it is new.
 
         It is new if it is later than the previous one, or at least REORDERING earlier, because the
         clock was then set back.

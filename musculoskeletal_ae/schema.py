@@ -30,8 +30,8 @@ class Strict(Struct, frozen=True, forbid_unknown_fields=True):
 def convert(value: Any, kind: type[T], refuse: Callable[[str], Exception]) -> T:
     """Convert a value from a file to a type.
 
-    If the value does not fit, raises the exception that `refuse` returns for a text. The text names
-    the place, the problem, the value and the legal keys or words.
+    If the value does not fit, the function raises the exception that `refuse` returns for a text.
+    The text names the place, the problem, the value and the legal keys or words.
     """
     try:
         return msgspec.convert(value, kind)
@@ -72,7 +72,10 @@ def explanation(error: msgspec.ValidationError, value: Any, kind: Any) -> str:
 
 
 def _value_at(value: Any, steps: list[dict[str, str | None]]) -> Any:
-    """Return the value at a place, or the mapping that contains it if msgspec names no key."""
+    """Return the value to which the path `steps` leads from `value`.
+
+    The path ends early, at a mapping, if msgspec does not name the key of the wrong value in it.
+    """
     for step in steps:
         if step['field'] is not None:
             value = value[step['field']]

@@ -59,8 +59,8 @@ def read_muscle_states(
 
     Motor currents are converted to T_read. A temperature that is not measured is NaN. Values of
     isolated muscles are not checked: lengths and tensions that are not finite or beyond
-    ±MOST_ISOLATED are replaced by `unknown`, and such temperatures by NaN. If `source` knows no
-    tension, tensions are not checked either, and are returned as NaN.
+    ±MOST_ISOLATED are replaced by `unknown`, and such temperatures by NaN. If the modules have no
+    source of tension, tensions are not checked either, and are returned as NaN.
     """
     values = _values(message, len(QUANTITIES), muscles)
     usable = np.isfinite(values)
@@ -329,7 +329,7 @@ def read_twist(message: Any, frame: str) -> Array:
 
 
 def without_orientation(message: Any) -> bool:
-    """Return whether a PoseStamped commands a position only, which a quaternion of zeros means."""
+    """Return whether a PoseStamped commands only a position: its quaternion is then all zeros."""
     turn = message.pose.orientation
     return not any((turn.x, turn.y, turn.z, turn.w))
 

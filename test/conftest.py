@@ -35,10 +35,11 @@ settings.load_profile('repeatable')
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Collect no garbage during the collection of tests, and none among its objects later.
+    """Switch off Python's garbage collection while pytest collects the tests.
 
-    The collection creates about a million objects that remain until the end, mainly by imports.
-    Searching them for garbage would take a third of its time.
+    The collection of tests creates about a million objects that remain until the end, mainly by
+    imports. Searching them for garbage would take a third of its time. They are frozen, so that
+    later garbage collections skip them too.
     """
     gc.disable()
     try:
@@ -49,12 +50,12 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[Any]) -> None:
-    """Let each process of pytest-xdist begin with one kind of tests that take long.
+    """Sort the tests: each process of pytest-xdist begins with a different kind of slow tests.
 
-    The tests that occupy both cores, those on a ROS graph and those of the experiments wait for
-    messages, for each other or for other processes. Meanwhile, the other processes keep the cores
-    busy with the remaining tests, which are short and therefore come last. A process that has no
-    tests left takes the last ones of another process.
+    Slow tests are those that occupy both cores, those on a ROS graph and those of the experiments.
+    They often wait, for messages or for other processes. Meanwhile, the other processes use the
+    cores for the short tests, which come last. A process that has no tests left takes over some
+    from another process.
     """
     remaining = items.copy()
     shares: list[list[Any]] = []
@@ -82,13 +83,16 @@ def _alone(factory: pytest.TempPathFactory, what: str) -> Iterator[Path]:
 
 @pytest.fixture(scope='session')
 def alone(tmp_path_factory) -> Callable[[str], AbstractContextManager[Path]]:
-    """Return a context manager that admits one process at a time to a folder of the test run."""
+    """Return a function that makes a context manager: it admits one process at a time to its block.
+
+    The block receives a folder that all processes of the test run share.
+    """
     return partial(_alone, tmp_path_factory)
 
 
 @pytest.fixture(scope='session', autouse=True)
 def state_home(tmp_path_factory) -> None:
-    """Keep what nodes save out of the home directory."""
+    """Let nodes save their state in a temporary folder instead of the home directory."""
     os.environ['XDG_STATE_HOME'] = str(tmp_path_factory.mktemp('state'))
 
 

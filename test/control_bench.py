@@ -41,7 +41,10 @@ def sample(length, tension, robot=ROBOT, temperature=30.0):
 
 
 def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
-    """Return the inputs of an activity for an arm at rest."""
+    """Return the inputs of an activity of the controller for an arm at rest at θ.
+
+    `limit` is the tension limit of the muscles, and `tension` their tension [N].
+    """
     tension = robot.tension.bias if tension is None else tension
     now = sample(mae.lengths(theta, tension), tension, robot)
     return Inputs(

@@ -112,7 +112,11 @@ class ControlledArm:
         self.graph.wait(lambda: self.tension().max() < bias + 8.0, 'tensions near the bias')
 
     def state(self, node='controller'):
-        """Return the status of a node: the controller's at once, others' with their next report."""
+        """Return the status of a node.
+
+        The report of a controller in this process is read at once. For other nodes, the function
+        waits for the next report on /diagnostics.
+        """
         if node == 'controller' and node not in self.processes:
             return self.controller.report()
         return self.graph.report(node)

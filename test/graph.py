@@ -160,7 +160,10 @@ class Graph:
         node.destroy_node()
 
     def ended(self, process: Process, number: int | None = None) -> tuple[int, str]:
-        """Send a signal if one is given, wait for the end; return exit status and output."""
+        """Wait until a process has ended; return its exit status and its output.
+
+        If `number` is given, the process first receives the signal of this number.
+        """
         self.processes.remove(process)
         return process.ended() if number is None else process.end(number)
 
@@ -182,13 +185,16 @@ class Graph:
         self.networks[topic].publish(bytes_message(data))
 
     def spin(self, seconds: float) -> None:
-        """Handle messages for a while."""
+        """Process messages for a time [s]."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.executor.spin_once(LOOK)
 
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
-        """Handle messages until a condition holds; fail with the name of the condition."""
+        """Process messages until a condition holds, and return its value.
+
+        If the condition does not hold before the deadline [s], the test fails and names `what`.
+        """
         end = time.monotonic() + deadline
         while not (value := condition()):
             dead = [p for p in self.processes if not p.alive()]
@@ -255,7 +261,7 @@ class Graph:
 
 
 def no_number_of(graph: Graph, robot: Robot, muscle: str) -> Callable[[], None]:
-    """Isolate a muscle; return a function that publishes states in which its tension is NaN."""
+    """Isolate a muscle; return a function that publishes states with its tension as NaN."""
     graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=muscle))
     publisher = graph.publisher(Float64MultiArray, 'muscle_states')
     rows = np.tile([[0.0], [61.0], [25.0]], robot.muscle_count)

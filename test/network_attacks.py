@@ -66,7 +66,12 @@ def _lengths(times: float) -> Attack:
 
 
 def _shifted(quantity: int, scaled: float) -> Attack:
-    """Return an attack that adds `scaled` units to the output of the first joint or muscle."""
+    """Return an attack that adds an offset to the first element of a quantity in the output.
+
+    Args:
+        quantity: The quantity: θ (0), T (1) or l (2).
+        scaled: The offset, in the unit in which the network scales the quantity.
+    """
 
     def attack(mae: Mae) -> Mae:
         row = (0, len(mae.joints), len(mae.joints) + len(mae.muscles))[quantity]
@@ -99,7 +104,13 @@ ON_MESSAGES: Mapping[str, Attack] = {'one tension 50 N off': _shifted(1, 0.25)}
 
 
 def _other_lengths(times: float = 1.0, more: float = 0.0, part: slice = slice(None)) -> Attack:
-    """Return an attack that scales lengths by `times` and shifts them by ±`more` [m] everywhere."""
+    """Return an attack that falsifies the muscle lengths in inputs and outputs.
+
+    Args:
+        times: Factor of the lengths.
+        more: Offset of the lengths [m], with alternating signs from muscle to muscle.
+        part: The muscles to which this applies; by default all.
+    """
 
     def attack(mae: Mae) -> Mae:
         std, mean = mae.std.copy(), mae.mean.copy()

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures control of the nominal body, where all errors are those of the network.
 
-1. posture: error and ‖T‖ where the arm settles under the lengths of each method. The bound uses the
-   lengths of the true body at the least tension that holds the posture with the true G.
+1. posture: the arm settles under the lengths that each method commands. The error of the posture
+   and the norm of the tensions, ‖T‖, are compared with a lower bound: lengths computed from the
+   true body for the least tensions that hold the posture.
 2. stiffness: deflections by a push at a low and at a high stiffness (the lower and the upper
    quarter of the reported reachable range). Their ratio is compared with the predicted one.
 """
@@ -38,7 +39,11 @@ def settle(arm: EmulatedArm, length: Array) -> None:
 
 
 def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, Array]:
-    """Return for each method (error [rad], ‖T‖ [N], bound ‖T‖ [N]) of every posture, (N, 3)."""
+    """Return the results of each control method by its name, (N, 3), for N holdable postures.
+
+    A row has the error of the reached posture [rad], the norm of its tensions [N], and the norm of
+    the least tensions that hold the target [N].
+    """
     arm = nominal_arm(robot)
     rows: dict[str, list[tuple[float, float, float]]] = {}
     bias, limit = np.full(robot.muscle_count, robot.tension.bias), robot.tension.limit
@@ -87,10 +92,16 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
 def stiffness_ratios(
     robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None = None, push: float = PUSH
 ) -> Array:
-    """Return the measured and predicted ratio of the deflections at low to high stiffness, (N, 2).
+    """Return by how much more the arm yields to a push at low than at high stiffness, (N, 2).
 
-    In each of `count` postures, one joint is stiffened, in turn. The push is the wrench that comes
-    nearest to a torque `push` [N·m] on that joint alone.
+    Each row has the measured and the predicted ratio of the two deflections.
+
+    Args:
+        robot: The geometric model.
+        mae: The network.
+        count: Number of postures; in each of them, another joint is stiffened, in turn.
+        arm: The emulated arm; by default a nominal one.
+        push: The push is the wrench that comes nearest to this torque [N·m] on that joint alone.
     """
     arm = arm or nominal_arm(robot)
     ratios = []
@@ -117,7 +128,7 @@ def stiffness_ratios(
 
 
 def _pushed(arm: EmulatedArm, theta: Array, length: Array, wrench: Array) -> Array:
-    """Return half the rotation between a push and the opposite push [rad], shape (D,)."""
+    """Return half the difference between the postures under a push and its opposite [rad], (D,)."""
     arm.reset(theta)
     settle(arm, length)
     ends = []

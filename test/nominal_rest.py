@@ -35,7 +35,7 @@ NOTICEABLE = 0.05
 
 
 def random_commands(robot: Robot, count: int, seed: int) -> Array:
-    """Return l_target [m] (count, M) of random postures that can be held, at random tensions."""
+    """Return l_target [m] (count, M) of random holdable postures with random tensions."""
     rng = np.random.default_rng(seed)
     commands: list[Array] = []
     while len(commands) < count:
@@ -63,11 +63,11 @@ def settle_arm(arm: EmulatedArm, command: Array) -> tuple[Array, Array]:
 def rest_errors(
     robot: Robot, mae: Mae, preset: str, commands: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the distance of the simulator's rest from the nominal body, and its drift.
+    """Return how far the simulator's rest is from that of the nominal body, and how it drifts.
 
     Returns:
-        |Δθ| of the rest [rad] (N, D), |ΔT| of the rest [N] (N, M), and the largest departure of θ
-        [rad] and T [N] from the simulator's own rest, each (N,).
+        The differences of θ [rad] (N, D) and of T [N] (N, M) at rest, as absolute values, and the
+        largest later departures of θ [rad] and T [N] from the simulator's own rest, each (N,).
     """
     body = Individual(robot, 0, NOMINAL)
     simulated = Simulation(robot, mae, preset, len(commands))
@@ -89,7 +89,7 @@ def rest_errors(
 
 
 class Rest(NamedTuple):
-    """θ [rad] (D,), T [N] (M,), and the largest residual of the equations."""
+    """A solution of the equations of rest: θ [rad] (D,), T [N] (M,), and the largest residual."""
 
     theta: Array
     tension: Array

@@ -145,7 +145,10 @@ DRUM_ENDS = {'stays': (0.035, 0.0, -0.008), 'jumps': (0.035, 0.0, 0.0)}
 
 
 def behind_a_drum(directory: Path, end: Sequence[float]) -> Robot:
-    """Return the sound arm with a straightener that wraps around a drum and ends behind it."""
+    """Return an arm whose muscle `straightener` wraps around a cylinder and ends behind it.
+
+    `end` is the last point of the route in the frame of the link [m].
+    """
     document = read_muscles(write_robot(directory))
     route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')
     route[1:] = [DRUM, {'link': 'lower', 'xyz': list(end)}]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pauses of this process do not count as silence of the others."""
+"""Pauses of this process do not count as silence of other nodes."""
 
 import pytest
 

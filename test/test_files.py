@@ -16,7 +16,7 @@ COLUMNS = ['a', 'b']
 
 
 class Refused(Exception):  # noqa: N818
-    """The error of the caller in these tests."""
+    """The exception that the functions under test are asked to raise."""
 
 
 def refuse(file, problem):

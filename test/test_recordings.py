@@ -24,7 +24,7 @@ def link(tmp_path_factory) -> Robot:
 
 
 def rests(link, values, load, count, seed):
-    """Return rest samples of a link, computed from lengths by the statics."""
+    """Return rest samples of a link, computed from lengths by the balance of forces."""
     rng = np.random.default_rng(seed)
     bend = rng.uniform(-0.35, 0.35, (count, 2))
     length = link.routes.absolute_lengths(bend) - link.routes.length_at_zero

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which release of a ROS package is built from source; see bench/ros_sources.py."""
+"""The choice of the release from which a ROS package is built; see bench/ros_sources.py."""
 
 import subprocess
 

@@ -73,7 +73,11 @@ def fit(robot: Robot, mae: Mae, seed: int = 0) -> FittedBody:
 
 
 class _Muscle:
-    """One muscle. The vector of its parameters has δ (three for each route point), κ (3) and o."""
+    """One muscle with the vector of its parameters.
+
+    The vector contains the displacement δ of each route point (three numbers), the logarithmic
+    changes κ of the three elastic constants, and the length offset o.
+    """
 
     def __init__(self, routes: Routes, elastic: SeriesElastic) -> None:
         self._routes, self._elastic = routes, elastic
@@ -81,11 +85,11 @@ class _Muscle:
         self._spread = np.repeat([ATTACHMENT, ELASTIC, OFFSET], sizes)
 
     def shift(self, parameters: Array) -> Array:
-        """Return δ [m], (P, 3)."""
+        """Return δ, the displacements of the P route points [m], (P, 3)."""
         return parameters[:-4].reshape(-1, 3)
 
     def elastic(self, parameters: Array) -> SeriesElastic:
-        """Return the elastic constants c e^κ, as scalars."""
+        """Return the elastic constants of this muscle as scalars, changed by the factors e^κ."""
         factors = np.exp(np.clip(parameters[-4:-1], -LARGEST_LOG, LARGEST_LOG))
         nominal = vars(self._elastic).values()
         return SeriesElastic(*(value * f for value, f in zip(nominal, factors, strict=True)))

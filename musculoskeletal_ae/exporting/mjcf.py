@@ -54,8 +54,9 @@ the elastic elements, friction proportional to tension, creep, sensor errors and
 class Report(NamedTuple):
     """Differences between an exported model and the network, over the workspace.
 
-    Lengths and moment arms are compared with those of the network. The torque is compared with that
-    of the robot description, which includes the learned springs of the joints.
+    Lengths and moment arms are compared with those of the network. The joint torque that gravity
+    and springs exert is compared with that of the robot description, which includes the learned
+    springs of the joints.
     """
 
     lengths: Array  # standard deviation of each muscle's length error at T_mid [m], (M,)
@@ -168,7 +169,10 @@ def _springs(robot: Robot, elastic: SeriesElastic) -> Springs:
 
 
 def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
-    """Return the routes with their points displaced by `shift` [m] (P, 3), in joint frames."""
+    """Return the routes with their points displaced by `shift` [m] (P, 3).
+
+    Each row of `shift` is given in the frame of the joint that moves the point.
+    """
     left = iter(shift)
 
     def item(part: Any) -> Any:

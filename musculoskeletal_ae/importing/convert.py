@@ -171,7 +171,10 @@ def play(robot: Robot, file: Path) -> int:
 
 
 def length_verdict(comparison: Comparison | None) -> str:
-    """Return a text on the muscles whose lengths differ most from those of the source's engine."""
+    """Return a text about the largest length errors relative to the engine of the source format.
+
+    `comparison` is None if there is no such engine; the text then says so.
+    """
     errors = comparison.lengths if comparison else None
     if not errors:
         return 'lengths: not compared, because no engine of the source format computes lengths'
@@ -183,7 +186,10 @@ def length_verdict(comparison: Comparison | None) -> str:
 
 
 def arm_verdict(comparison: Comparison) -> str:
-    """Return a text on the moment arms that differ most from those of the source's engine."""
+    """Return a text about the largest moment arm errors relative to the engine of the source.
+
+    The text also names the muscles whose moment arm has the wrong sign in some postures.
+    """
     worst = sorted(comparison.arms.items(), key=lambda item: -item[1])[:5]
     named = ', '.join(f'{name} {1e3 * error:.2f}' for name, error in worst if error > 1e-3)
     verdict = f'largest moment arm error over {ARM_POSTURES} postures: {1e3 * worst[0][1]:.3f} mm'

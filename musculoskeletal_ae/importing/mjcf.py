@@ -7,8 +7,8 @@ of massless links, and a ball joint becomes three hinges. `equality/joint` becom
 Springs and dampers of joints, and springs of fixed tendons, become `joint_elasticity`.
 
 If a site lies on the rim of an object that its tendon wraps around, rounding decides in MuJoCo
-whether the tendon wraps. In this package, the site counts as outside (`robot/wrapping.py`). The
-radius of the object in MuJoCo is reduced by a share 2·RIM, so that MuJoCo decides alike.
+whether the tendon wraps. In this package, the site counts as outside (`robot/wrapping.py`). To make
+MuJoCo agree, the import reduces the radius of the object there by a share 2·RIM.
 """
 
 from collections import defaultdict
@@ -82,7 +82,10 @@ def open_mjcf(file: Path) -> Any:
 
 
 def resting_joints(model: Any) -> list[float]:
-    """Return the position [rad] or [m] at which `import_robot` would hold each joint of a model."""
+    """Return the position [rad or m] of each joint at which `import_robot` would hold it fixed.
+
+    These are the initial positions in the file; coupled joints follow their masters.
+    """
     reader = _Reader(model, '')
     source = reader.source
     source.couplings = resolved(source.couplings)
@@ -91,9 +94,9 @@ def resting_joints(model: Any) -> list[float]:
 
 
 def tie_rims(model: Any) -> list[tuple[int, int]]:
-    """Reduce the radius of each geom on whose rim a tendon that wraps around it has a site.
+    """Shrink the wrapping objects on whose rim a site of their own tendon lies.
 
-    The radius is reduced by a share 2·RIM.
+    The radius of each such geom is reduced by a share 2·RIM, so the site lies outside.
 
     Returns:
         Indices (tendon, geom) for each site on a rim.
@@ -418,7 +421,7 @@ class _Reader:
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)
 
     def _tie_rims(self) -> None:
-        """Call `tie_rims` on the model, and add a note for each site on a rim."""
+        """Shrink objects with a site on their rim, and add a note for each (see `tie_rims`)."""
         for tendon, geom in tie_rims(self.model):
             body = self.names['body'][self.model.geom_bodyid[geom]]
             site = (
@@ -430,7 +433,11 @@ class _Reader:
             )
 
     def _points(self) -> None:
-        """Set `source.points`: far ends of bodies first, then sites, and sites on tendons last."""
+        """Set `source.points` to the points that may become the end effector.
+
+        These are the far ends of bodies, then the sites that are on no tendon, then the other
+        sites.
+        """
         m, source, points = self.model, self.source, dict[str, tuple[str, Array]]()
         for i in range(1, m.nbody):
             if (far := far_end(m, self.start, i)) is not None:

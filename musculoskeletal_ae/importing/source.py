@@ -49,7 +49,10 @@ def refuse(file: Path, problem: str) -> SourceError:
 
 
 class Spring(NamedTuple):
-    """A spring along a weighted sum of joints, x = Σ share · q, with the torque −k (x − x_0)."""
+    """A spring along x = Σ share · q, a weighted sum of joint positions q.
+
+    The torque along x is −k (x − x_0).
+    """
 
     shares: dict[str, float]  # by joint
     stiffness: float  # k [N·m/rad]
@@ -101,10 +104,17 @@ class Source:
             self.note('renamed', f'{kind} {original} is {name} here')
 
     def limited(self, joint: str, slides: bool, low: float, high: float) -> tuple[float, float]:
-        """Return the limits of a joint whose limits in the source are `low` and `high`.
+        """Return the limits of a joint [rad, or m if it slides].
 
-        Limits of the joint in a separate file take precedence. If `low` and `high` are needed, but
-        not usable, those of UNLIMITED replace them, with a note.
+        Args:
+            joint: Name of the joint.
+            slides: Whether the joint is prismatic.
+            low: Lower limit in the source; infinite if there is none.
+            high: Upper limit in the source; infinite if there is none.
+
+        Returns:
+            The limits in the separate file of limits, if that file has the joint. Otherwise `low`
+            and `high`; the default limits UNLIMITED, with a note, if these are unusable.
         """
         if joint in self.given_limits:
             return self.given_limits[joint]
@@ -158,7 +168,7 @@ class Source:
         return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
 
     def settle(self) -> None:
-        """Set the rest positions of coupled joints from those of their masters."""
+        """Set the rest position of each coupled joint from the rest position of its master."""
         for slave, c in self.couplings.items():
             self.rest[slave] = float(c.value(self.rest.get(c.master, 0.0)))
 
@@ -278,10 +288,10 @@ def cut(
     base: str = '',
     end: str = '',
 ) -> None:
-    """Reduce the source in place to the links that descend from the base, and to some joints.
+    """Reduce the source in place to the links that descend from the base, and fix unwanted joints.
 
-    All other joints are held fixed, with a note. All other links are removed, with their muscles.
-    Muscles that move no joint are removed as well.
+    All other links are removed, with their muscles. Joints that do not stay movable are held fixed,
+    with a note. Muscles that move no joint are removed as well.
 
     Args:
         source: The source.
@@ -365,7 +375,10 @@ def cut(
 
 
 def _choose_end(source: Source) -> None:
-    """Choose the far end of the longest chain (`tip`) as the end effector; note other choices."""
+    """Choose the far end of the longest chain (`tip`) as the end effector.
+
+    A note in the report lists the other points that `--end` could choose.
+    """
     link = tip(source)
     leaves = [name for name in source.links if name not in source.above.values()]
     others = [name for each in leaves for name in (tip_name(each), each)]

@@ -278,7 +278,10 @@ def _finding(
     time: float,
     dt: float,
 ) -> Finding | None:
-    """Return the fault that a message reveals, or None; implausible messages reveal none."""
+    """Return the fault that the health monitor finds in a message; None if it finds none.
+
+    An implausible message is skipped, with None as the result.
+    """
     try:
         sample = stream.take_states(states, time)
     except RejectionError:
@@ -299,5 +302,8 @@ def error(mae: Mae, recording: Pairs) -> float:
 
 
 def _isolated(row: Ints, default: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the muscles isolated in a row of `Pairs.isolated`, or `default` if not recorded."""
+    """Return the indices of the isolated muscles; `default` if they were not recorded.
+
+    `row` is a row of `Pairs.isolated`: 1 for an isolated muscle, 0 for others, negative if unknown.
+    """
     return default if (row < 0).any() else tuple(map(int, np.flatnonzero(row)))

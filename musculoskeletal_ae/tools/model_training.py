@@ -101,10 +101,11 @@ def train_on_model(robot: Robot, args: Namespace) -> Trained:
 
 
 def table(errors: list[PairError], title: str) -> str:
-    """Return a table of the errors of θ, T and l with each of the three masks.
+    """Return a table of the errors of joint angles θ, tensions T and lengths l.
 
-    Each cell has the mean norm of the error vector and, in parentheses, the mean absolute error of
-    an element.
+    The table has a row for each pair of quantities from which the network computes all three. Each
+    cell has the mean norm of the error vector and, in parentheses, the mean absolute error of an
+    element.
     """
     heads = [f'{SYMBOLS[output]} [{unit}] norm (each)' for output, unit, _ in OUTPUTS]
     lines = ['', title, f'{"entered by":<12}' + ''.join(head.rjust(26) for head in heads)]
@@ -123,7 +124,7 @@ def model_error(errors: list[PairError], unit: str) -> str:
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:
-    """Return a table of the mean absolute error of each joint angle when ② estimates θ."""
+    """Return a table of the mean absolute error of each joint angle, estimated from T and l."""
     estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
     rows = zip(robot.joints, estimates['theta'], robot.units)

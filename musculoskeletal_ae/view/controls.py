@@ -3,9 +3,17 @@
 
 Requests of visitors call `act` in viser's threads, with the name of the request and its value:
 
-    targets {joint: rad} · hand xyz [m] · reset · push xyz [N] · rupture name · repair name
-    payload kg · position s · end exploring · refused text
-    or the name of a service without a value
+    targets          target angles by joint [rad]
+    hand             target position of the hand [m]
+    push             force on the hand [N]
+    rupture, repair  name of the muscle
+    payload          mass in the hand [kg]
+    position         position in the replay [s]
+    refused          text for the visitor
+    reset            no value
+    end exploring    no value
+
+Any other name is that of a service, which is called without a value.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -92,7 +100,10 @@ class Controls:
         register(on_event)
 
     def request(self, what: str, *value: Any) -> None:
-        """Pass on the request of a visitor, other than that of a slider."""
+        """Call `act` with a request that does not come from a slider.
+
+        A command to the arm discards the values that a visitor has not finished entering.
+        """
         if what in COMMANDS:
             self._entries.discard()
         if what == 'hand':
@@ -238,9 +249,9 @@ class Controls:
             self._set(('position', POSITION), round(min(played), 1))
 
     def end_visit(self) -> None:
-        """Forget values that are being entered, and end a push: their visitor may have left.
+        """Discard the values that are being entered, and end a push: a visitor may have left.
 
-        The next event of a drag resumes the push.
+        If the visitor is still there, the next event of the drag resumes the push.
         """
         self._entries.discard()
         if self._is_pushing:
@@ -252,7 +263,11 @@ class Controls:
         self._scene.pick(muscle)
 
     def push(self, event: Any) -> Array:
-        """Draw the force of a drag, and return the force [N], (3,)."""
+        """Draw the force that a visitor exerts by dragging; return the force [N], (3,).
+
+        The force is proportional to the length of the drag, up to MOST_PUSH; it is 0 when the drag
+        ends.
+        """
         ends = np.array([event.start_position, event.end_position])
         force = PUSH_STIFFNESS * (ends[1] - ends[0])
         self._is_pushing = self._force.visible = event.phase != 'end'

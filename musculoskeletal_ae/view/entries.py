@@ -26,13 +26,13 @@ class Entries:
         self._values: dict[Key, float] = {}  # values that have not been taken
 
     def change(self, key: Key, value: float, now: float) -> None:
-        """Note that a visitor has changed a value at the time `now` [s]."""
+        """Record that a visitor has changed a value at the time `now` [s]."""
         with self._lock:
             self._changes.setdefault(key, deque(maxlen=DRAG_CHANGES)).append(now)
             self._values[key] = value
 
     def take(self, now: float) -> dict[Key, float]:
-        """Return the values that are complete at the time `now` [s], each only once."""
+        """Return the values that are complete at the time `now` [s], each in one call only."""
         with self._lock:
             complete = {key: self._values[key] for key in self._values if self._ended(key, now)}
             for key in complete:
@@ -45,7 +45,7 @@ class Entries:
         return is_dragged or now - times[-1] >= SETTLE_TIME
 
     def discard(self) -> None:
-        """Forget the values that have not been taken."""
+        """Discard the values that `take` has not returned yet."""
         with self._lock:
             self._values.clear()
 

@@ -134,7 +134,8 @@ class Page:
             alarm: Text of the alarm box; '': no box.
             states: T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
             now: Time of `values` [s].
-            values: Error [rad], A, d and its limit, for the curves; NaN where unknown.
+            values: Values of the curves: estimation error [rad], the measures A and d that detect
+                an anomaly, and the threshold of d; NaN where unknown.
             is_urgent: Whether the alarm box is red.
         """
         self._history.add(now, values)

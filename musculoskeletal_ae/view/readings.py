@@ -66,10 +66,11 @@ class History:
             self._rows.popleft()
 
     def curve(self, values: Sequence[int]) -> tuple[Array, ...]:
-        """Return time relative to now [s], and the values since the last gap.
+        """Return the curves since the last gap: times relative to now [s], then the values.
 
-        Rows in which the first value is unknown are left out. Other values that are unknown are
-        replaced by the first value of their row, so that the first line hides them.
+        `values` are the indices of the values to return. Rows in which the first of them is unknown
+        are left out. Others that are unknown are replaced by the first value of their row, so that
+        the first line hides them.
         """
         table = np.array(self._rows)
         if not len(table):

@@ -27,7 +27,7 @@ LOCAL = ('localhost', '127.0.0.1', '::1')
 
 
 class Visit(server.ServerConnection):
-    """A connection that drops messages which change more of a control than its value."""
+    """A connection that drops messages which would change anything of a control but its value."""
 
     async def recv(self, *arguments: Any, **options: Any) -> Any:
         """Return the next legal message of the browser."""
@@ -82,7 +82,9 @@ def is_foreign(host: str, request: Request) -> bool:
 
 @contextmanager
 def checked_visits(host: str, title: str) -> Iterator[None]:
-    """Within the context, let websockets check the visits to every page that it begins to serve.
+    """Check all visits to the pages that websockets begins to serve within a `with` block.
+
+    Requests from other sites are refused, and messages that change more than values are dropped.
 
     Args:
         host: Address of the page.

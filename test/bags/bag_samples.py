@@ -90,9 +90,9 @@ def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
 def write_ours(
     path: Path, content: list[Sample], compression: str = 'zstd', finish: bool = True
 ) -> None:
-    """Write a bag with our writer, in chunks of ten messages.
+    """Write a bag with the writer of this package, in chunks of ten messages.
 
-    Without `finish`, it is left as a recorder that is killed by SIGKILL leaves it.
+    Without `finish`, the bag stays incomplete, as after the recorder was killed by SIGKILL.
     """
     writer = BagWriter(path, compression)
     for i, sample in enumerate(content):
@@ -112,7 +112,7 @@ def write_ours(
 def write_mcap(
     path: Path, content: list[Sample], with_definitions: bool = True, **options: Any
 ) -> None:
-    """Write a bare file with the mcap library, as other recorders do."""
+    """Write an mcap file without a bag directory by the mcap library, as other recorders do."""
     with path.open('wb') as file:
         writer = Writer(file, **({'chunk_size': 2000, 'enable_data_crcs': True} | options))
         writer.start(profile='ros2')

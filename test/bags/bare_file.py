@@ -14,7 +14,7 @@ ONE = b'\x00\x01\x00\x00' + struct.pack('<d', 1.0)
 def write(
     path, schema=FLOAT, text=None, topic='/anomaly', data=ONE, profile='ros2', file=(), **channel
 ):
-    """Write a bare file with one message."""
+    """Write an mcap file with one message, by default a valid one on /anomaly; return its path."""
     with path.open('wb') as stream:
         writer = Writer(stream, **({'enable_data_crcs': True} | dict(file)))
         writer.start(profile=profile)

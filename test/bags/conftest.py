@@ -77,6 +77,6 @@ def tool():
 
 @pytest.fixture(autouse=True, scope='session')
 def private_graph():
-    """Keep the ROS graph on this machine if test.sh has not set the variables that do so."""
+    """Restrict the ROS graph to this machine, unless test.sh has already done so."""
     os.environ.setdefault('ROS_DOMAIN_ID', '67')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -89,7 +89,13 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
 
 
 def motion(tmp_path, times, first=()):
-    """Return the motion taught by a bag: sampled at `times` [s], other joints at `first` [s]."""
+    """Return the motion that a recorded demonstration contains.
+
+    Args:
+        tmp_path: Folder of the bag.
+        times: Times at which the bag contains positions of the robot's joints [s].
+        first: Times of messages that contain only an unknown joint [s].
+    """
     arm = Arm(Robot.load('arm26'), count=1)
     for at in first:
         arm.add(f'/{TAUGHT_TOPIC}', JOINTS, at, joints(['other'], [0.1]))

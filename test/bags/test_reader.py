@@ -63,7 +63,7 @@ def test_a_sqlite3_file_that_was_not_closed_is_reported(tmp_path, content):
 
 
 def test_records_that_a_reader_must_skip_are_skipped(tmp_path, content):
-    """The specification reserves opcodes from 0x80 for private records."""
+    """Records with the opcodes from 0x80 are private; the specification lets readers skip them."""
     samples.write_mcap(tmp_path / 'a.mcap', content, enable_data_crcs=False)
     data = (tmp_path / 'a.mcap').read_bytes()
     # length of the magic (8 bytes) and of the header record (opcode, length, content)

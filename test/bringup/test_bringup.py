@@ -62,7 +62,10 @@ def bringup(environment, trained_file):
 
 @pytest.fixture
 def join():
-    """Return a function that joins a namespace; processes that the graphs own are ended."""
+    """Return a function that joins the ROS graph of a namespace.
+
+    At the end of the test, the processes that the function's graphs have started are ended.
+    """
     graphs = []
 
     def graph_in(namespace=''):
@@ -87,7 +90,7 @@ def pids(run):
 
 
 def explore_fast(graph, controller):
-    """Let the controller explore by short movements, and tolerate messages up to 5 s old."""
+    """Let the controller explore by short movements, and accept messages up to 5 s old."""
     for name, value in ('max_age', 5.0), ('first_duration', 2.0):
         assert graph.set_parameter(controller, name, value)[0]
 
@@ -104,9 +107,10 @@ def left_behind(run):
 
 
 def ports_in_shared_memory(run):
-    """Return the threads that wait for messages in shared memory.
+    """Return the names of threads that receive messages in shared memory.
 
-    A successor of a killed node may receive no messages there."""
+    There should be none: a node that replaces a killed one may receive no messages there.
+    """
     tasks = [Path(f'/proc/{pid}/task') for pid in pids(run)]
     names = [file.read_text() for task in tasks for file in task.glob('*/comm')]
     assert any(name.startswith('dds.udp.') for name in names)
@@ -224,11 +228,11 @@ def test_of_two_arms_one_learns_and_the_other_detects_a_rupture_and_names_a_dead
 
 
 def has_learned(output):
-    """Return whether the error has fallen by 30 % in the mean of five status lines in a row.
+    """Return whether the mean error of the last five status lines is 30 % below the initial one.
 
-    Measured over seeds and runs: an error of 0.05 to 0.13 rad falls to between a tenth and a third
-    of that within 20 s. While there are few samples, it may rise again for some seconds where the
-    arm has not been before.
+    In several runs with different seeds, an error of 0.05 to 0.13 rad fell to between a tenth and a
+    third of its initial value within 20 s. With few samples, the error may rise again for some
+    seconds where the arm has not been before.
     """
     before, after = errors(output, INITIAL), errors(output, LEARNED)[-5:]
     return len(after) == 5 and np.mean(after) < 0.7 * np.mean(before)

@@ -43,7 +43,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(explores=st.booleans())
     def restart(self, explores):
-        """Kill the controller, and start a new one, which receives the network and body state."""
+        """Replace the controller by a new one, which receives the network and the body state."""
         self.core = Controller(ROBOT)
         self.core.use(MAE)
         self.core.use_body(self.core.stream.body.with_offsets(self.offsets))
@@ -169,7 +169,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule(seconds=st.floats(0.01, 2.0))
     def sleeps(self, seconds):
-        """Suspend the controller for a time [s], while the arm goes on."""
+        """Suspend the controller for a time [s], during which the arm continues to move."""
         self.arm.step(seconds)
         self.now += seconds
 

@@ -80,7 +80,11 @@ class Loop:
                 self.controller.anomaly(True)
 
     def mend(self):
-        """Repair the arm and call the services that a user would call."""
+        """Repair the arm, and call the services that a user would call.
+
+        Returns:
+            The stop cause because of which the controller refuses the reset; None if it resumes.
+        """
         self.arm.faults.set([])
         self.arm.reset(self.arm.theta)
         self.run(3.0)

@@ -27,17 +27,17 @@ class Loop:
         self.begin_calibration()
 
     def begin_calibration(self):
-        """Let the controller know that a length calibration begins."""
+        """Inform the controller that a length calibration has begun, so its offsets are unknown."""
         offsets = LengthOffsets.unknown(len(self.offset))
         self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def know(self, offset):
-        """Tell the controller the length offsets [m], (M,)."""
+        """Give the controller the length offsets [m], (M,), as at the end of a calibration."""
         offsets = LengthOffsets(offset, np.zeros(len(offset)))
         self.core.use_body(self.core.stream.body.with_offsets(offsets))
 
     def sent(self, command):
-        """Return the true length [m] that a command makes the modules go to, (M,)."""
+        """Return the true muscle lengths [m], (M,), that the modules reach with a command."""
         return command.value + self.core.stream.body.offsets.offset - self.offset
 
     def run(self, seconds):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of an action's goal: reached, off its path, late at its end, replaced, stopped."""
+"""The result of an action's goal: reached, off the path, late at the end, replaced or stopped."""
 
 from types import SimpleNamespace
 

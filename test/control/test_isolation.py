@@ -37,7 +37,10 @@ ROBOT_WITHOUT = ROBOT.without([LOST])
 
 
 def held(theta, torque=0.0):
-    """Return whether the muscles other than LOST hold a posture, with an additional torque."""
+    """Return whether the muscles can hold a posture without muscle LOST.
+
+    `torque` is added to the torque that the weight requires [N·m].
+    """
     limits, weight = ROBOT.tension, ROBOT.kinematics.holding_torque(theta) + torque
     slope = ExactMae(ROBOT).muscle_jacobian(theta, limits.bias)
     try:
@@ -232,7 +235,10 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
     settings = Settings(rate_limit=SPEED_LIMIT)
 
     def lack(trajectory):
-        """Return the largest torque that the muscles lack [N·m], with friction and module lag."""
+        """Return the largest torque that the muscles cannot exert in a motion [N·m].
+
+        Tendon friction and the lag of the muscle modules are taken into account.
+        """
         lacks = []
         for at in zip(*trajectory.sample(np.linspace(0.0, trajectory.duration, 40))):
             jacobian = mae.muscle_jacobian(at[0], limits.bias)
@@ -278,7 +284,11 @@ def test_an_arm_without_a_muscle_that_falls_on_the_way_starts_again_before_the_e
 
 @pytest.fixture(scope='module')
 def sliding(tmp_path_factory):
-    """Return an arm whose last joint slides and has no muscles, postures, and the joint's load."""
+    """Return an arm whose last joint is prismatic and has no muscles.
+
+    Returns:
+        The robot, random postures, and the force that the last joint carries in each of them [N].
+    """
     robot = Robot.load(write_robot(tmp_path_factory.mktemp('slider'), slider=True))
     robot = robot.without(robot.muscle_indices(['slider_in', 'slider_out']))
     postures = robot.random_postures(100, np.random.default_rng(0))

@@ -30,7 +30,7 @@ def robot(request):
 
 
 def holdable(robot, seed):
-    """Return a random posture, its holding torque and the least tension."""
+    """Return a random posture, the torque that holds it, and the least tensions for this torque."""
     postures = robot.random_postures(100, np.random.default_rng(seed))
     ((theta, least),) = holdable_postures(robot, postures, 1)
     return theta, robot.kinematics.holding_torque(theta), least

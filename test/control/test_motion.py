@@ -35,7 +35,7 @@ def points(goal, duration=1.0):
 
 
 def moved(bench, count):
-    """Run `count` steps in which the arm follows the setpoint; return all commands."""
+    """Run `count` steps in which the arm reaches each setpoint exactly; return all commands."""
     sent = []
     for _ in range(count):
         sent += bench.step()
@@ -212,7 +212,7 @@ def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effor
 
 @pytest.mark.parametrize(('dt', 'late'), [(DT, 0.0), (0.002, 0.0), (DT, 0.8 * DT)])
 def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(dt, late):
-    """Every third message is `late` [s]."""
+    """Every third message arrives `late` seconds after the time at which it is due."""
     rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
     length = np.zeros(ROBOT.muscle_count)
     for n in range(round(3.0 / dt)):

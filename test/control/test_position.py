@@ -181,7 +181,10 @@ class WithJointSensors(ClosedLoop):
 
 @pytest.fixture(scope='module')
 def loops():
-    """Return the loop of each method after 5 s, in which it moved to its target if it has one."""
+    """Return a loop of each control method after 5 s.
+
+    In this time, the arm moved to its target, unless the method has no target.
+    """
     result = {}
     for method in METHODS:
         arm = EmulatedArm(ROBOT, 0, Individual(ROBOT, 0, NOMINAL))

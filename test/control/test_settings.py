@@ -21,7 +21,7 @@ def test_joint_stiffness_needs_one_number_of_at_least_0_for_each_joint(stiffness
 
 
 def test_the_limit_of_joint_stiffness_of_a_prismatic_joint_is_that_of_a_pinion():
-    """The limit is 1000 N·m/rad divided by the square of the pinion's radius."""
+    """A pinion moves a rack: the limit of 1000 N·m/rad is divided by the square of its radius."""
     parameter, radian = parameters_of(Settings)['joint_stiffness'], (1.0, RACK)
     stiffness = parameter.checked([1000.0, 1000.0 / RACK**2])
     assert Settings(joint_stiffness=stiffness).desired_stiffness(radian) == stiffness

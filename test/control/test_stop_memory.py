@@ -19,7 +19,7 @@ def killed(directory):
 
 
 def found(directory):
-    """Return the cause with which the next controller begins, or None."""
+    """Return the stop cause with which the next controller begins, or None without a stop."""
     memory = StopMemory(directory)
     memory.close()
     return memory.found and memory.found.cause

@@ -16,7 +16,7 @@ DT = 0.01
 
 
 def stopped(last, settings, now, steps, is_fresh=True):
-    """Return the commands (N, M) of a stop that follows the command `last`."""
+    """Return the commands (N, M) of the `steps` steps of a stop that follows the command `last`."""
     limiter = CommandLimiter(ROBOT, settings)
     limiter.command = last
     stop, sent = SafeStop(ROBOT, settings, limiter), []

@@ -99,7 +99,7 @@ def test_torque_beyond_the_muscles_is_reported():
 
 
 def carried(control, theta):
-    """Return the torque besides gravity compensation [N·m] that the arm exerts at θ."""
+    """Return the torque that the arm exerts at θ in addition to gravity compensation [N·m]."""
     tension = settled(control, target=theta, theta=theta)
     pulled = -MAE.muscle_jacobian(theta, tension).T @ tension
     return pulled - ROBOT.kinematics.holding_torque(theta)

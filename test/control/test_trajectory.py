@@ -27,7 +27,10 @@ rows = st.lists(
 
 
 def made(rows, order):
-    """Return points within the joint limits with `order` derivatives, and a trajectory by them."""
+    """Return the points of a trajectory within the joint limits, and the trajectory through them.
+
+    The points state positions and `order` derivatives: none, velocities, or accelerations as well.
+    """
     table = np.array(rows)
     position = MIDDLE + REACH * table[:, 1:3]
     given_values = [0.3 * table[:, 3:5], table[:, 5:7]][:order] + [None] * (2 - order)

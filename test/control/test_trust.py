@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No message makes the controller do harm: glitches, false or late data, heat, overload, clocks."""
+"""No message makes the controller move the arm dangerously, for example false or late data."""
 
 from dataclasses import replace
 
@@ -40,14 +40,18 @@ class DistortingBench(Bench):
         self.step(100)
 
     def pull(self, tension):
-        """Change the tensions as fast as motors can."""
+        """Raise or lower the tensions from their bias to `tension` [N] as fast as motors can."""
         before = np.full(ROBOT.muscle_count, ROBOT.tension.bias)
         for share in np.linspace(0.0, 1.0, 20):
             self.tension = before + share * (tension - before)
             self.step()
 
     def lies(self, count=1, **rows):
-        """Run `count` steps in which functions falsify rows of the message; return the commands."""
+        """Run `count` steps with falsified messages; return the commands.
+
+        `rows` has a function by the name of a quantity, which falsifies the values of that
+        quantity.
+        """
 
         def lie(read):
             return np.array([rows.get(name, np.array)(row) for name, row in zip(QUANTITIES, read)])
@@ -261,7 +265,7 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
 
 @pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
 def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(pause):
-    """The pause must not make messages that are read before the next step count as newer."""
+    """Messages that are read between the pause and the next step must not count as newer."""
     bench = DistortingBench(max_age=0.2, hold_time=0.5)
     bench.step()
     bench.now += pause

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm without tension sensors: tensions count as unknown, not as zero, and limit the methods."""
+"""An arm without tension sensors: its tensions count as unknown, and some methods are excluded."""
 
 from dataclasses import replace
 

@@ -67,7 +67,14 @@ class Driver:
     def listen(
         self, seconds: float = 3.0, moved: bool = False, joints: bool = True, zeroed: bool = True
     ) -> Verdict:
-        """Return the verdict of `Listening` after some seconds; `moved` pushes the hand."""
+        """Return the verdict of `Listening` after some seconds of messages.
+
+        Args:
+            seconds: Duration of listening [s].
+            moved: Whether a force on the hand moves the arm.
+            joints: Whether joint sensors publish.
+            zeroed: Whether the lengths are stated to have no offsets.
+        """
         listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)
         for k in range(round(seconds / PERIOD)):
             if moved:
@@ -83,9 +90,14 @@ class Driver:
     def wind(
         self, muscles: tuple[int, ...] = (), highest: float | None = None, heard: Any = None
     ) -> Verdict:
-        """Return the verdict of `Winding` or `Positioning`, begun with the verdict `heard`.
+        """Return the verdict of check_driver's motion test, which winds in the muscles in turn.
 
-        As with check_driver, nothing moves if `heard` does not allow it.
+        Nothing moves if `heard`, the verdict of listening, does not allow motion.
+
+        Args:
+            muscles: Indices of the muscles to test; by default all.
+            highest: Largest tension that the test may cause [N]; None: that of check_driver.
+            heard: Verdict of listening; None: no faults so far.
         """
         if heard and not heard.allows_motion:
             return heard

@@ -229,7 +229,10 @@ def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
 
 
 def ros2_control(**wrong):
-    """Return a driver with messages of ros2_control; the settings in `wrong` misread them."""
+    """Return a driver with messages of ros2_control, which check_driver reads by settings.
+
+    The settings are right, except those in `wrong`.
+    """
     right = MotorSettings(
         motor_state_topic='joint_states', spool_radius=(0.012,), motor_direction=(-1.0,)
     )
@@ -350,7 +353,11 @@ class Messages:
         self.ticks = []  # times at which `Listening` learns that this process is running [s]
 
     def bring(self, count, sent, came, lost=()):
-        """Pass `count` messages; `sent` and `came` compute times [s] from a message's number."""
+        """Let `count` messages arrive, except those whose numbers are in `lost`.
+
+        `sent` and `came` compute the times of sending and of arrival [s] from the number of a
+        message.
+        """
         for n in range(count):
             self.number += 1
             while self.ticks and self.ticks[0] <= came(n):
@@ -538,7 +545,7 @@ def test_a_test_that_moved_a_joint_too_little_names_the_tension_to_repeat_it_wit
 
 
 def inverted_law(driver, order):
-    """Let the modules evaluate the law with inverted lengths, in another order of muscles."""
+    """Let the driver confuse lengths: their sign is wrong, and the order of muscles is `order`."""
     home, back = driver.arm.sense().length, np.argsort(order)
     # The lengths are mirrored about the initial ones, so that listening finds no fault.
     driver.publish = lambda rows: np.stack([2.0 * home - rows[0], *rows[1:]])[:, order]
@@ -598,7 +605,7 @@ def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
 
 
 def stiff_and_strong(stiffness):
-    """Return the robot with the gain K = `stiffness` [N/m] and muscles of some kilonewtons."""
+    """Return the robot with strong muscles (up to 3 kN) and the gain K = `stiffness` [N/m]."""
     tension = TensionRange(*np.outer([100.0, 2000.0, 3000.0], np.ones(M)))
     # The elastic element must be stiffer than K, because the module would oscillate otherwise.
     units = np.outer([2000.0, 60.0, 1e-6], np.ones(M))
@@ -608,7 +615,10 @@ def stiff_and_strong(stiffness):
 
 
 def wound_in_stiff(stiffness, seed=0, of_law=None):
-    """Return the verdict of winding on a stiff robot, whose driver evaluates the control law."""
+    """Return the verdict of the motion test on a stiff robot, whose modules regulate tension.
+
+    `of_law` replaces constants of the control law in the driver, so that the law is wrong.
+    """
     robot = stiff_and_strong(stiffness)
     driver = Driver(robot, seed)
     driver.in_tension = law(

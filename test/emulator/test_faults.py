@@ -19,7 +19,7 @@ def arm(robot):
 
 
 def numbered(robot, i):
-    """Return readings whose values encode their index."""
+    """Return sensor readings of a robot in which every value of a muscle is `i`."""
     return Readings(np.zeros(robot.joint_count), *np.full((3, robot.muscle_count), float(i)))
 
 

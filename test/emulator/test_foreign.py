@@ -26,7 +26,7 @@ EFFECTS = {field.name: getattr(Effects(), field.name) or 1.0 for field in fields
 
 @pytest.fixture(scope='module')
 def coupled(tmp_path_factory):
-    """Return an arm with a coupled joint and a described wrap."""
+    """Return an arm with a coupled joint and with a muscle that wraps around an object."""
     directory = write_robot(tmp_path_factory.mktemp('coupled'), finger=True)
     document = read_muscles(directory)
     document['couplings'] = [{'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}]

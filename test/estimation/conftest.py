@@ -31,7 +31,7 @@ def mae(trained) -> Mae:
 
 @pytest.fixture(scope='session')
 def calibrated(mae) -> Mae:
-    """Return the network with a detector that counts as calibrated; the threshold of d is 8."""
+    """Return the network with a calibrated detector of faults, whose threshold of d is 8."""
     statistics = replace(mae.anomaly, calibrated=True, thresholds={DISTANCE: 8.0})
     return replace(mae, anomaly=statistics)
 

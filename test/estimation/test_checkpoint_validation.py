@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network takes over only if it explains the arm; `network_attacks` defines bad networks."""
+"""Checkpoint validation accepts a network only if it explains the arm.
+
+The module `network_attacks` defines the bad networks.
+"""
 
 import re
 from collections import deque
@@ -33,7 +36,10 @@ ROBOT = Robot.load('arm26')
 
 
 def body(count=60, seed=0):
-    """Return messages (T, l) of an arm whose lengths are 3 mm off."""
+    """Return tensions and lengths of random postures of an arm.
+
+    Every length is 3 mm longer than that of the geometric model.
+    """
     rng = np.random.default_rng(seed)
     theta = ROBOT.random_postures(count, rng)
     tension = rng.uniform(30.0, 150.0, (count, ROBOT.muscle_count))
@@ -41,7 +47,7 @@ def body(count=60, seed=0):
 
 
 def send_healthy_messages(gate, start=0.0):
-    """Give a gate six seconds of messages of a healthy arm; return the time at their end [s]."""
+    """Validate six seconds of messages of a healthy arm; return the time at their end [s]."""
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
         gate.message(tension, length, start + 0.1 * k)
     return start + 6.0
@@ -76,7 +82,11 @@ def test_a_bad_network_is_refused_without_any_message_and_the_error_names_figure
 
 
 class RestoringAll:
-    """A network that restores every state; its elongations are `softness` times the model's."""
+    """A network that reproduces every state exactly, with wrong muscle lengths.
+
+    The series elastic elements stretch `softness` times as far as those of the model, and every
+    length has the offset `offset` [m].
+    """
 
     def __init__(self, softness, offset=0.0):
         self.softness, self.offset = softness, offset
@@ -234,7 +244,10 @@ def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
 
 
 def send_messages_of_the_model(gate, measures):
-    """Give a gate messages of an arm that equals its model, with joint sensors or without."""
+    """Send messages of an arm that equals its model to a validator; return θ, T and l.
+
+    With `measures`, the messages contain the angles of joint sensors.
+    """
     rng = np.random.default_rng(0)
     theta = ROBOT.random_postures(60, rng)
     tension = rng.uniform(30.0, 150.0, (60, ROBOT.muscle_count))
@@ -311,7 +324,7 @@ def test_the_inherited_detector_ignores_only_the_repaired_muscle(trained):
 
 
 def _turned(mae, angle):
-    """Return a network that reads every joint too high by an angle [rad]."""
+    """Return a network whose estimate of every joint is too high by an angle [rad]."""
     mean = mae.mean.copy()
     mean[: len(mae.joints)] += angle
     return replace(mae, mean=mean)

@@ -31,7 +31,7 @@ class MonitorBench:
         return observation.estimate.anomaly, self.health.residual.reading, finding
 
     def findings(self, message, times=1):
-        """Repeat a message, and return all findings."""
+        """Process a message `times` times, and return all findings."""
         return [self.step(message)[2] for _ in range(times)]
 
 

@@ -32,7 +32,7 @@ class EstimatorBench:
         self.core.use(mae)
 
     def step(self, message, times=1, dt=DT):
-        """Repeat a message, and return its estimates."""
+        """Process a message `times` times, `dt` seconds apart; return the estimates."""
         estimates = []
         for _ in range(times):
             self.now += dt
@@ -40,7 +40,7 @@ class EstimatorBench:
         return estimates
 
     def move(self, message):
-        """Change the lengths to those of a message, as fast as a muscle can."""
+        """Change the lengths gradually to those of a message, as fast as a muscle can."""
         before = self.core.sample.length_read
         for share in np.linspace(0.0, 1.0, 21):
             length = before + share * (message.length - before)
@@ -134,7 +134,7 @@ def test_an_old_command_makes_no_muscle_a_suspect(robot, mae, slack):
 def test_messages_before_a_pause_are_no_evidence_of_a_muscle_without_tension(
     robot, mae, slack, pause
 ):
-    """If the computer stands still for a while, the modules may not have received the commands."""
+    """If the computer pauses, the modules may not have received the commands in time."""
     stepped = EstimatorBench(robot, mae)
     for _ in range(10):
         stepped.core.commanded(stepped.now + pause, length=slack.length - 0.003)

@@ -17,9 +17,12 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (400, 2)) * [1.0, 1e-4]
 
 
 def verdict(tension, length, likely=0.0):
-    """Return the outcome of a verification that winds in by 3 mm after 1.5 s.
+    """Return the outcome of a verification that winds in the suspect by 3 mm after 1.5 s.
 
-    `tension` computes T from the demanded T and noise, `length` l from the row's number and noise.
+    Args:
+        tension: Computes the measured tension from the demanded tension [N] and noise.
+        length: Computes the measured length [m] from the number of the message and noise.
+        likely: Length that the other muscles predict for the suspect [m].
     """
     watched = Verification(0, ModuleLaw(BIAS, STIFFNESS))
     for n, (shake, stir) in enumerate(NOISE):
@@ -78,7 +81,7 @@ class Loop:
         self.rng, self.length = np.random.default_rng(0), healthy.length
 
     def step(self, message, times=1):
-        """Repeat a message; its lengths are approached as fast as is plausible."""
+        """Process a message `times` times; the lengths approach it as fast as is plausible."""
         for _ in range(times):
             self.now += DT
             self.core.commanded(self.now, length=self.command)
@@ -98,7 +101,7 @@ def loop(robot, calibrated, healthy):
 
 @pytest.fixture
 def cut(slack):
-    """Return a message in which muscle 2 has ruptured and its winch has wound in the rest."""
+    """Return a message in which muscle 2 has ruptured, after its module has wound in 20 cm."""
     return slack._replace(length=slack.length - 0.2 * (np.arange(6) == 2))
 
 

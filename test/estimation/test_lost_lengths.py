@@ -140,7 +140,7 @@ def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae
 def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arrive(
     robot, mae, muscle
 ):
-    """The module winds in the ruptured tendon; only this muscle needs a repair."""
+    """The module winds in the ruptured tendon, and the finding names only this muscle."""
     arm = MovingArm(robot, mae)
     arm.go(8.0)
     ruptured = np.eye(6)[muscle]
@@ -218,7 +218,7 @@ def test_a_repair_with_another_zero_revokes_the_offsets_at_the_latest_on_reset(r
 
 @pytest.mark.parametrize('ruptured', [True], indirect=True)
 def test_joint_sensors_find_a_wrong_zero_after_a_reset_right_after_the_repair(ruptured):
-    """The reset comes before joint sensors were read, and the error is too small without them."""
+    """Only the joint sensors reveal the error, and the reset comes before they have been read."""
     ruptured.off, ruptured.tense = 0.07 * np.eye(6)[2], np.ones(6)
     while not ruptured.core.suspects.has_suspect_jumped:
         ruptured.go(DT)

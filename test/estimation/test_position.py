@@ -22,7 +22,10 @@ NOISE = np.random.default_rng(0).normal(0.0, 1.0, (600, 2)) * [1.0, 1e-4]
 
 
 def readings(mae, shorter=0.0):
-    """Return l and T; one muscle has no tension, and is `shorter` [m] than a slack tendon."""
+    """Return lengths and tensions of an arm with one muscle without tension.
+
+    The length of this muscle is that of a slack tendon, minus `shorter` [m].
+    """
     length, tension = rest_readings(ROBOT, THETA, np.full(ROBOT.muscle_count, 60.0))
     tension = tension.copy()
     tension[MUSCLE] = 0.0
@@ -48,14 +51,15 @@ LENGTHS_WRONG = 0.02 * np.array([1, -1, 1, -1, 1, -1])  # errors of the network'
 
 
 def findings_after_tension(mae, before, after, spread=0.0):
-    """Return what the detector finds in a second without tension, after a second with tension.
+    """Return what the detector finds when muscle MUSCLE loses its tension.
 
-    Every length of the arm differs from that of the network by 20 mm.
+    The muscle has tension for a second, and none in the next. Every length of the arm differs from
+    that of the network by 20 mm.
 
     Args:
         mae: The network, which has not learned the arm.
-        before: T of MUSCLE before the loss of tension [N].
-        after: By how much MUSCLE is longer after it [m].
+        before: Tension of MUSCLE in the first second [N].
+        after: Additional length of MUSCLE in the next second [m].
         spread: Standard deviation of the tensions [N].
     """
     detector = StretchedTendon(ROBOT, Detection())
@@ -129,10 +133,12 @@ def elongation(tension):
 
 
 def verdict(tension, length, slack):
-    """Return the outcome of a verification that winds in by up to 28 mm after 1.5 s.
+    """Return the outcome of a verification that winds in the suspect by up to 28 mm after 1.5 s.
 
-    `tension` and `length` compute T and l from the wound length and noise. At first the tendon is
-    longer by `slack` [m] than a taut tendon.
+    Args:
+        tension: Computes the measured tension [N] from the wound length [m] and noise.
+        length: Computes the measured length [m] from the commanded length [m] and noise.
+        slack: Additional length of the tendon at first, relative to a taut one [m].
     """
     watched = Verification(MUSCLE, PositionLaw(BIAS[MUSCLE], elongation))
     for n, (shake, stir) in enumerate(NOISE):

@@ -19,10 +19,20 @@ MUSCLE = 2
 
 @pytest.fixture
 def noticed(robot, mae, slack):
-    """Return a function that returns the time [s] until a muscle without tension is reported."""
+    """Return a function that measures how long it takes until a slack muscle is reported."""
 
     def run(speed, until, longest=20.0, settings=None):
-        """Wind in `until` [m] at `speed` [m/s], then stop; return the time of the finding [s]."""
+        """Wind in muscle MUSCLE without tension, and return the time of the finding [s].
+
+        Args:
+            speed: Speed of winding in [m/s].
+            until: Length after which the winding stops [m].
+            longest: Time after which the test ends [s].
+            settings: Settings of detection; None for the default.
+
+        Returns:
+            The time, or infinity if there is no finding.
+        """
         health, rng = HealthMonitor(robot, settings=settings), np.random.default_rng(0)
         health.use(mae)
         state = mae.estimate(*slack)
@@ -89,7 +99,7 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
 def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
     robot, calibrated, speed, commanded
 ):
-    """This holds for a detector that is not calibrated yet, and before the first command, too."""
+    """This also holds before the detector is calibrated, and before the first command."""
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     arm.step(3.0)
     estimator, hold = Estimator(robot), arm.sense().length

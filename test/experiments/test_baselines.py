@@ -58,7 +58,7 @@ def test_baselines_that_learn_improve_on_a_body_with_other_lengths(robot, motion
     rng = np.random.default_rng(0)
 
     def other(theta, tension):
-        """Return lengths of a body in which the first joint changes them by 20 % more."""
+        """Return lengths of a body whose first joint has 20 % larger moment arms than the model."""
         lengths = robot.muscle_lengths(theta, tension)
         middle = np.repeat(theta[:, :1], robot.joint_count, axis=1)
         middle[:, 1:] = 0.5 * (robot.lower + robot.upper)[1:]

@@ -26,7 +26,7 @@ def test_proposed_is_nearer_than_first_and_needs_about_the_bound(ended):
 
 
 def test_a_posture_at_the_target_needs_the_bound(ended):
-    """Near the target θ_eval, the least tension that holds the arm is that for θ_eval."""
+    """If the reached posture is near the target, both need about the same least tension."""
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 

@@ -22,7 +22,7 @@ from musculoskeletal_ae.experiments.recording import record
 
 
 class Fake:
-    """Records the actions of a script on an arm with equal tensions."""
+    """A stand-in for an arm with equal tensions: records when a script changes it, and how."""
 
     def __init__(self, robot, tension):
         self.time, self.done, self.off = 0.0, [], []

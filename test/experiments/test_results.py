@@ -181,7 +181,10 @@ def test_a_failed_part_is_reported_everywhere_and_the_others_continue(
 
 
 def is_killed(name, study, seed):
-    """Kill the process that measures individual 0; the first time, 1 is still being measured."""
+    """Kill the process that measures individual 0.
+
+    At the first attempt, this happens while another process is measuring individual 1.
+    """
     if name == 'body_change':
         begun = study.folder / f'{seed}'
         first = not begun.exists()
@@ -209,7 +212,10 @@ def test_after_the_kill_of_a_worker_only_a_part_whose_worker_is_killed_again_fai
 
 
 def reached_by_ctrl_c(_name, _study, _seed):
-    """Return how many of this process and its parent, the fork server, do not block SIGINT."""
+    """Return how many of two processes would receive SIGINT: this one and its parent.
+
+    The parent is the fork server of the experiments. A process that blocks SIGINT does not count.
+    """
     reached = 0
     for process in (os.getpid(), os.getppid()):
         status = Path(f'/proc/{process}/status').read_text('utf-8')

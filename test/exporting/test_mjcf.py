@@ -43,7 +43,10 @@ def learned(tmp_path_factory):
 
 
 def differences(one, other):
-    """Return the difference of Jacobians (N, M, D) of each muscle, as a root mean square (M,)."""
+    """Return the difference between two muscle Jacobians (N, M, D) of each muscle.
+
+    It is the root mean square over N postures of the norm over the joints, (M,).
+    """
     return np.sqrt(((one - other) ** 2).sum(axis=2).mean(axis=0))
 
 

@@ -332,7 +332,7 @@ def test_a_model_without_routes_is_refused_with_the_dropped_muscles(tmp_path):
 
 
 def wires_and_weight(tmp_path, name, text):
-    """Return the muscle lengths of an SDF (N, M), and the torque of its weight (N, D)."""
+    """Return the muscle lengths of an imported SDF (N, M), and its holding torques (N, D)."""
     put(tmp_path, 'model.sdf', text)
     robot = import_robot(tmp_path / 'cardsflow.xml', tmp_path / name).robot
     theta = np.linspace(-1.0, 1.0, 5)[:, None]

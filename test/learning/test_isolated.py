@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning without isolated muscles: nothing is learned of them, and everything else works."""
+"""Learning without isolated muscles: it uses no data of these muscles, and otherwise succeeds."""
 
 import numpy as np
 

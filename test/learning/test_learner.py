@@ -60,7 +60,7 @@ def accept(learner, stage, count):
 
 
 def between(start, end, count):
-    """Yield `count` samples on the way from the rest `start` to the rest `end`."""
+    """Yield `count` samples at equal distances on the way from rest `start` to rest `end`."""
     for share in np.linspace(0.0, 1.0, count + 2)[1:-1]:
         yield end._replace(length=(1.0 - share) * start.length + share * end.length)
 

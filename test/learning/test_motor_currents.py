@@ -29,7 +29,12 @@ LIMIT = ROBOT.tension.limit
 
 
 def rests(count, seed):
-    """Return noisy rest samples of an individual, the true T_end, and the true transmission."""
+    """Return rest samples of an individual with motor currents instead of tension sensors.
+
+    Returns:
+        The samples with noise, the true bone-side tensions, and the true transmission, which
+        converts between currents and tensions.
+    """
     rng, true = np.random.default_rng(seed), Individual(ROBOT, seed)
     drive = np.array(
         [

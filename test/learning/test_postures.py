@@ -64,7 +64,7 @@ def blind(observed: Observations) -> Observations:
 
 
 def errors(arm26, observed, truth) -> tuple[float, float]:
-    """Return the mean errors [rad] of guessed postures, and of the postures after the fit."""
+    """Return the mean errors of postures [rad]: of random guesses, and after the fit."""
     rng = np.random.default_rng(1)
     guess = truth + rng.normal(0.0, 0.15, truth.shape)
     fitted = fit_body(CalibratedBody(arm26), observed, guess=guess).theta

@@ -35,7 +35,12 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
 
 
 def each_some(t, still=True):
-    """Return θ with one joint measured, as if two nodes published one joint each, in turn."""
+    """Return joint readings of which only one is not NaN, in turn, as of two publishing nodes.
+
+    Args:
+        t: Time [s].
+        still: Whether both joints stand still.
+    """
     angles = np.array([0.3, 0.3 if still else 0.3 + 0.05 * t])
     angles[round(t / 0.01) % 2] = np.nan
     return angles
@@ -186,7 +191,11 @@ class Messages:
         return [] if paired is None else self.collector.collect(paired)
 
     def rest(self, theta, seconds, tension=60.0, dt=DT):
-        """Let the arm rest for some seconds, after a pause `dt` [s]; return the new samples."""
+        """Send messages of an arm that rests for some seconds, the first one after `dt` seconds.
+
+        Returns:
+            The new samples.
+        """
         pull = np.full(6, tension)
         length = self.robot.muscle_lengths(theta, pull)
         samples = self.send(theta, pull, length, dt)

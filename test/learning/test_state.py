@@ -44,7 +44,10 @@ def written(directory, robot, stage, count, network=None):
 
 
 def read(directory, robot):
-    """Return samples, network, and the files that were not used."""
+    """Return samples and network that a learner reads, and why an older state was not used.
+
+    The reason is '' if the newest state was used.
+    """
     store = SampleStore()
     with closing(StateStore(directory, robot)) as state:
         mae = state.load(store)

@@ -93,7 +93,10 @@ def test_the_decoders_pullback_is_that_of_autograd_in_double_precision(mae, stat
 
 
 def exact_jacobian(mae, states):
-    """Return ∂l/∂θ through ① by autograd in double precision, shape (12, 6, 2)."""
+    """Return the exact derivatives ∂l/∂θ of the network's lengths, shape (12, 6, 2).
+
+    Autograd computes them in double precision, through the pass from θ and T to l.
+    """
     theta = torch.tensor(states.theta, requires_grad=True)
     rest = torch.tensor(states.scaled()[:, 2:])
     mask = torch.full((12,), list(Mask).index(Mask.THETA_TENSION))

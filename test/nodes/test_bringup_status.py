@@ -68,7 +68,10 @@ def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
 
 
 def found(kind, **more):
-    """Return the report of a finding of this kind, or of none, by the estimator in /left."""
+    """Return a report on /diagnostics of the estimator in /left, with a finding of this kind.
+
+    None means a report without a finding; `more` has further values of the report.
+    """
     values = {'finding': 'none'}
     if kind is not None:
         steps = Finding(0, kind, '').remedy
@@ -77,7 +80,14 @@ def found(kind, **more):
 
 
 def stopped(cause, mode='stopped', also=(), explored=False):
-    """Return the report of a stop by the controller in /left."""
+    """Return a report on /diagnostics of the controller in /left, which has stopped.
+
+    Args:
+        cause: The first stop cause.
+        mode: The mode of the controller.
+        also: Further stop causes.
+        explored: Whether the arm explored before the stop.
+    """
     steps = remedy_of([cause, *also], explored)
     values = {
         'mode': mode,
@@ -216,7 +226,7 @@ REPAIR_STEPS = ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore
 
 
 def with_silent_estimates(report):
-    """Return a report of a controller that also receives no usable estimates."""
+    """Change the report of a controller: it also states that usable estimates are missing."""
     status = report.status[0]
     steps = next(value for value in status.values if value.key == 'remedy steps')
     steps.value += ', check_estimator'

@@ -22,7 +22,7 @@ def start_driver(graph, **parameters):
 
 
 def ended(graph, process):
-    """Let the driver run until check_driver has ended; return its exit status and output."""
+    """Let the driver run until check_driver has ended; return check_driver's status and output."""
     graph.wait(lambda: not process.alive(), 'the end of check_driver', PATIENCE)
     return process.ended()
 

@@ -20,7 +20,10 @@ def rights(node: str, kind: str, action: str) -> set[str]:
 
 
 def of_actions(node: str, *parts: str) -> set[str]:
-    """Return the topics or services that a node's actions consist of, if they are installed."""
+    """Return the topics or services that the actions of a node consist of.
+
+    The set is empty if control_msgs, the package of the actions, is not installed.
+    """
     if importlib.util.find_spec('control_msgs') is None:
         return set()
     actions = rights(node, 'actions', 'execute')

@@ -18,7 +18,7 @@ from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 @pytest.fixture
 def now(monkeypatch):
-    """Replace the system clock; return a list whose element is the time [ns]."""
+    """Replace the system clock; return a list with the time [ns], which tests change."""
     now = [1_000_000_000_000]
     monkeypatch.setattr(stop_recording.time, 'time_ns', lambda: now[0])
     return now

@@ -18,7 +18,7 @@ def test_preset_paper_moves_towards_forced_joint_angles(trained):
 
 
 def test_preset_paper_moves_towards_the_commanded_lengths_without_stiffness_control(trained):
-    """Without an external force, the loss is dominated by its term of l, with the weight w₅."""
+    """Without an external force, the term of the muscle lengths (weight w₅) dominates the loss."""
     robot = Robot.load('arm26')
     arms = Simulation(robot, trained['paper'], 'paper')
     resting = arms.step(0.2).length[0]

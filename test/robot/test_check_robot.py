@@ -29,7 +29,10 @@ def change(directory, edit):
 
 
 def mirror(muscle):
-    """Move a muscle to the other side of every joint axis that is parallel to y."""
+    """Return an edit of muscles.yaml that mirrors the route of a muscle, x becoming −x.
+
+    The muscle then lies on the other side of every joint axis that is parallel to y.
+    """
 
     def edit(document):
         (entry,) = (m for m in document['muscles'] if m['name'] == muscle)
@@ -445,7 +448,7 @@ def test_an_object_that_no_tendon_touches_is_reported(change, tmp_path):
 
 
 def remedies_of(directory, kind, postures=60):
-    """Return the suggested remedies for a fault, and the check that detected it."""
+    """Return the remedies that check_robot suggests for a kind of fault, and the whole check."""
     check = check_robot(Robot.load(directory), postures)
     (fault,) = (fault for fault in check.faults if fault.kind == kind)
     return remedies(check, fault), check

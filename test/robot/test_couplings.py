@@ -61,7 +61,7 @@ def test_quantities_of_coupled_joints_are_derivatives_with_respect_to_theta(robo
 
 
 def test_no_postures_have_no_moment_arms(robot):
-    """Learning computes moment arms of changed postures only, and possibly none has changed."""
+    """Learning computes moment arms only of changed postures, and perhaps none has changed."""
     nothing = np.zeros((0, 3))
     assert robot.routes.muscle_jacobian(nothing).shape == (0, 8, 3)
     assert muscle_hessian(robot.routes.muscle_jacobian, nothing).shape == (0, 8, 3, 3)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""IK(P_marker, θ_est): the pose determines θ; undetermined joints keep the estimate."""
+"""Inverse kinematics of a marker pose: it determines θ as far as it can.
+
+Joints that the pose does not determine stay at their estimates.
+"""
 
 import numpy as np
 
@@ -27,7 +30,7 @@ def test_an_estimate_that_agrees_with_the_pose_is_not_changed():
 
 
 def test_noise_of_the_camera_turns_joints_by_less_than_0_2_rad():
-    """The search ends where camera noise hides a better θ; otherwise θ would move by 0.41 rad."""
+    """The search ends when camera noise exceeds its gain; otherwise, θ could change by 0.41 rad."""
     rng = np.random.default_rng(1)
     theta = ARM.random_postures(400, rng)
     observed = [camera_reading(ARM.kinematics.end_effector_pose(each), rng) for each in theta]

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tendons that slip over an object: they are reported, and no emulated individual has one."""
+"""Tendons that may slip over an object, so that their length jumps.
+
+`check_robot` reports them, and no emulated individual has one.
+"""
 
 import re
 

@@ -15,7 +15,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 
 
 class GeometricBody:
-    """The lengths of the geometric model, with the interface of a network."""
+    """A body with the lengths of the geometric model and the interface of a network."""
 
     friction = np.zeros(8)
     elasticity = None

@@ -12,7 +12,10 @@ def nominal(robot, theta, tension, stiffness):
 
 
 def test_joint_stiffness_is_the_slope_of_restoring_torque_with_the_motors_held(robot):
-    """K_θ = −∂τ/∂θ of τ = −Gᵀ T; T(θ) follows from MSC and the elastic element in series."""
+    """K_θ = −∂τ/∂θ of the torque τ = −Gᵀ T.
+
+    T(θ) follows from muscle stiffness control and the series elastic element, one after the other.
+    """
     rng = np.random.default_rng(0)
     theta = robot.random_postures(1, rng)[0]
     tension = rng.uniform(50.0, 150.0, robot.muscle_count)

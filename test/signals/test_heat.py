@@ -56,7 +56,7 @@ class Motors:
         return np.abs(self.errors[-round(seconds) :])
 
     def hand_on(self):
-        """Pass the readings of one second to the thermal model."""
+        """Advance the thermal model by one second with the present readings."""
         self.heat.step(self.pulled, self.read, 1.0)
 
 

@@ -26,7 +26,12 @@ JOINTS = [(name, j) for name, robot in ROBOTS.items() for j in range(robot.joint
 
 @cache
 def motion(name):
-    """Return θ, l and T while `check_driver` winds in muscles, and the muscle of each row."""
+    """Return readings of a robot while the motion test of check_driver winds in muscles.
+
+    Returns:
+        θ, l and T in rows, and the number of the segment to which each row belongs; one muscle is
+        wound in during a segment.
+    """
     driver = Driver(ROBOTS[name], 1)
     driver.listen(2.0)
     winding = Winding(Verdict(ROBOTS[name]))

@@ -37,7 +37,7 @@ LENGTH, TENSION = [-0.02, 0.02, -0.01], [40.0, 100.0, 30.0]
 
 
 def joint_state(names=('m1', 'elbow', 'm0', 'gripper', 'm2'), stamp=1, **changes):
-    """Return a message of joint_state_broadcaster: all joints, NaN where there is no interface."""
+    """Return a message of joint_state_broadcaster, with NaN for states that a joint lacks."""
     nan = [math.nan] * len(names)
     fields = {
         'position': [POSITION.get(name, math.nan) for name in names],

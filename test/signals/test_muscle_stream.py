@@ -28,7 +28,10 @@ def message(states):
 
 
 def resting(**changes):
-    """Return plausible l, T and temperature with single values changed: length=(muscle, value)."""
+    """Return plausible lengths, tensions and temperatures of resting muscles, (3, M).
+
+    Each argument changes one value, such as length=(muscle, value).
+    """
     states = np.stack([np.zeros(M), ROBOT.tension.bias, np.full(M, 30.0)])
     for row, quantity in enumerate(('length', 'tension', 'temperature')):
         if quantity in changes:
@@ -167,7 +170,7 @@ def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
 
 
 def taken(stream, deliveries):
-    """Return which messages a stream accepts.
+    """Return for each message of muscle 1 whether a stream accepts it.
 
     Args:
         stream: The stream.

@@ -34,7 +34,15 @@ def test_a_clock_that_jumps_back_restarts_the_pairing():
 
 
 def paired_live(joints, muscles, period):
-    """Return the index of θ for each muscle message, or None, paired in the order of arrival."""
+    """Return the index of the joint message that is paired with each muscle message, or None.
+
+    The messages are paired in the order in which they arrive.
+
+    Args:
+        joints: Times of the joint messages [s].
+        muscles: Times of the muscle messages [s].
+        period: Period of the muscle messages [s].
+    """
     pairing = Pairing(period)
     given_out = []
     for time, kind, number in sorted(
@@ -49,7 +57,12 @@ def paired_live(joints, muscles, period):
 
 
 def paired_by_definition(joints, muscles, period):
-    """Return what `paired_live` returns, computed by the definition: each takes its nearest θ."""
+    """Return what `paired_live` should return, computed by the definition of pairing.
+
+    A joint message belongs to the muscle message nearest to it in time. A muscle message is paired
+    with the nearest of its joint messages that is at most half a period away; None if there is
+    none.
+    """
     owners = [min(muscles, key=lambda m: abs(m - time), default=None) for time in joints]
     return [
         min(

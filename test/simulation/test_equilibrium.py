@@ -9,7 +9,7 @@ from musculoskeletal_ae.simulation.equilibrium import Slopes, add_slopes, arms_l
 
 
 class Cubic:
-    """A body whose lengths are cubic in θ, so that the fit can be exact."""
+    """A body whose lengths are polynomials of degree 3 in θ, which the simulator fits exactly."""
 
     def lengths(self, theta, tension):  # noqa: ARG002
         a, b = theta.T
@@ -17,7 +17,11 @@ class Cubic:
 
 
 def evaluated(slopes, theta, tension):
-    """Return G (N, M, D) and Σ T_i ∂²l_i/∂θ² (N, D, D)."""
+    """Return the derivatives that `add_slopes` computes from fitted slopes.
+
+    Returns:
+        The muscle Jacobian G [m/rad] (N, M, D), and Σ T_i ∂²l_i/∂θ² [N·m/rad] (N, D, D).
+    """
     theta, tension = arms_last(theta), arms_last(tension)
     jacobian, curvature = (np.zeros((len(part), *theta.shape)) for part in (tension, theta))
     add_slopes(slopes.limbs, theta, tension, jacobian, curvature)

@@ -22,7 +22,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation, on_all_cores
 
 
 class GeometricBody:
-    """The lengths of the geometric model, with the interface of a network."""
+    """A body with the lengths of the geometric model and the interface of a network."""
 
     def __init__(self, robot, friction=0.0):
         self.robot, self.friction = robot, np.full(robot.muscle_count, friction)
