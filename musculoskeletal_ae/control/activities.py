@@ -13,7 +13,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class Inputs(NamedTuple):
-    """Inputs of an activity at one step; none of them is ever missing."""
+    """Inputs of an activity at one step of control; all of them are always available."""
 
     mae: Mae
     sample: MuscleSample  # the newest muscle states

@@ -11,7 +11,11 @@ FRICTION = 0.05  # μ if none was learned: a typical value of hand-built arms
 
 
 def tendon_friction(robot: Robot, mae: Mae) -> Array:
-    """Return μ of each muscle, (M,): the learned value, or FRICTION if none was learned."""
+    """Return the friction coefficient μ of each muscle, (M,).
+
+    The values are those that the network has learned. A network without learned friction gets
+    `FRICTION`, a typical value of hand-built arms, for all muscles.
+    """
     touch = getattr(mae, 'touch', None)
     friction: Array = np.full(robot.muscle_count, FRICTION) if touch is None else touch.friction
     return friction

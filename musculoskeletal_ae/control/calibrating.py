@@ -30,13 +30,16 @@ def gentle_limit(robot: Robot) -> Array:
 
 
 class Calibrating(ActivityControl):
-    """The activity of moving gently, in small slow steps relative to the present lengths.
+    """The activity that moves the arm gently while its length offsets are unknown.
 
         l_target = l + ①(θ_goal, T_goal) − ①(θ_est, T) + l_comp(T_goal)
 
-    Only differences of lengths are used, so that the length offsets cancel. θ_est and G may be
-    wrong; muscle stiffness control turns these errors into tension errors, which are limited.
-    Each step leads a short way towards a random goal in the joint range. At the end of the step,
+    ① is the network's prediction of the muscle lengths from a posture and tensions. The command
+    uses only the difference of two predictions, so that unknown length offsets cancel. The
+    estimated posture θ_est and the muscle Jacobian G may be wrong. Muscle stiffness control turns
+    these errors into tension errors, which are limited.
+
+    Each small, slow step leads towards a random goal in the joint range. At the end of the step,
     the arm rests for a moment with random tensions. The calibration needs varied postures and
     tensions, because it infers the posture from the torques that the tensions exert through G.
     """
@@ -73,10 +76,10 @@ class Calibrating(ActivityControl):
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:
-        """Return the length command [m], (M,), with which a step towards a random goal ends.
+        """Return the length command [m], (M,), for the end of a step towards a random goal.
 
-        The step leads towards the first of GOALS random goals for which it ends in a holdable
-        posture. If there is no such goal, it leads towards the goal with the least missing torque.
+        Up to GOALS random goals are tried, until a step towards one of them ends in a holdable
+        posture. If none does, the step whose end misses the least holding torque is chosen.
         """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
         tension = inputs.sample.model_tension * inputs.sample.usable

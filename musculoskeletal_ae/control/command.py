@@ -28,7 +28,10 @@ class Command(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """Tensions [N] of the muscles, (M,) each; 0 for isolated muscles."""
+    """Present tensions [N] of the muscles at both ends of the tendon, (M,) each.
+
+    Isolated muscles have tension 0.
+    """
 
     motor: Array  # motor-side tension T: measured, or where that is impossible, assumed
     bone: Array  # bone-side tension T_end, after tendon friction

@@ -77,8 +77,9 @@ class Target:
         effort: Torque in addition to gravity compensation [N·m], (D,).
         clamped: Joints whose target was changed, because it was beyond the joint limits or because
             the posture was not holdable.
-        unreachable_reason: Why the arm goes to another posture than requested, or ''.
-        approaches_left: Number of further attempts to reach the target if the arm falls.
+        unreachable_reason: Why the arm moves to a posture other than the requested one, or ''.
+        approaches_left: Number of times that an arm with isolated muscles may still start towards
+            the target again after it has fallen away from its trajectory.
     """
 
     effort: Array
@@ -138,7 +139,7 @@ class Activities:
         self.entered = None
 
     def step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        """Switch to an activity if it is not active yet, and return its command."""
+        """Switch to the activity `control` if another one was active, and return its command."""
         if control is not self.entered:
             if self.entered is not None:
                 self.entered.leave()
@@ -216,7 +217,10 @@ class Controller:
     # -- settings and messages ------------------------------------------------------------------
 
     def configure(self, settings: Settings) -> None:
-        """Apply new settings; another method or preset starts from the present tensions.
+        """Apply new settings.
+
+        If the method or the preset changes while the arm has a target, the arm moves to this
+        target anew, starting from the present tensions.
 
         Raises:
             MusculoskeletalError: If the joint stiffness or the method does not fit the robot.
@@ -247,7 +251,7 @@ class Controller:
             self.activities.ramps.solve_again()
 
     def take(self, message: Any, now: float, delay: float = 0.0) -> None:
-        """Process a message of muscle_states: check it, filter it and use it from now on.
+        """Check and filter a message of muscle_states, and use its values from now on.
 
         Args:
             message: The message.
@@ -271,9 +275,10 @@ class Controller:
 
     @contextmanager
     def _relieving(self, now: float, delay: float = 0.0) -> Iterator[None]:
-        """Keep the tensions of a message that is rejected within this context.
+        """A context in which a `RejectionError` still makes its tensions available.
 
-        The limiter and the watchdog then still react to a tension that is too high.
+        The limiter and the watchdog can thus react to a tension that is too high, even though the
+        message was rejected. The error leaves the context unchanged.
         """
         try:
             yield
@@ -352,7 +357,8 @@ class Controller:
     def anomaly(self, detected: bool) -> None:
         """Record whether an anomaly is present.
 
-        The arm may resume if a verification has ended the anomaly.
+        A detected anomaly stops the arm. When the anomaly has ended, the arm resumes unless
+        another stop cause needs a reset.
         """
         if detected and not self.watchdog.has_anomaly:
             self._suspicion.note_anomaly(self.watchdog.age.stepped_at)
@@ -371,9 +377,10 @@ class Controller:
             self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
-        """Note that the messages' clock has jumped back.
+        """Adapt to a backward jump of the messages' clock.
 
-        The comparison of the clocks and the stream of muscle states begin again.
+        The comparison of this clock with the steady clock starts again, and earlier muscle states
+        are discarded, because their time stamps now lie in the future.
         """
         self.watchdog.age.clock_jumped_back()
         self.stream.reset()
@@ -576,10 +583,10 @@ class Controller:
         return limited or self.limiter.command
 
     def _desired(self, dt: float) -> Command | None:
-        """Return the activity's command, or None if it has none.
+        """Return the command of the present activity, or None if there is none.
 
-        If the activity raises an exception, the arm stops. Only an exploration for which too few
-        postures are holdable ends without a stop.
+        If the activity raises an exception, the arm stops. There is one exception to this rule: an
+        exploration that finds too few holdable postures ends without a stop.
         """
         if self.estimate is None:  # wait for the next estimate, which a length calibration provides
             self.activities.leave()
@@ -605,7 +612,11 @@ class Controller:
         self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
 
     def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
-        """Step an activity; update the target and the supervisor from its properties."""
+        """Return the command of an activity, and act on the properties of the activity.
+
+        Depending on these properties, a trajectory starts, the target is replaced, or the
+        supervisor learns that the motion has ended.
+        """
         if control.needs_trajectory:
             self._approach_again()
         command = self.activities.step(control, inputs)
@@ -619,8 +630,8 @@ class Controller:
     def _approach_again(self) -> None:
         """Start a trajectory from the present posture to the target, if there is a target.
 
-        This is needed after a stop, after a change of method, and if the arm has fallen. After a
-        fall, the number of attempts is limited.
+        This is needed after a stop, after a change of method, and if an arm with isolated muscles
+        has fallen away from its trajectory. After a fall, the number of attempts is limited.
         """
         state, follower = self.target_state, self.activities.follower
         if follower.progress.trajectory is None and state.theta is not None:
@@ -647,7 +658,7 @@ class Controller:
         )
 
     def _slack(self, command: Command | None) -> Command | None:
-        """Return the command with isolated muscles commanded to be slack."""
+        """Replace the values of isolated muscles by values that keep their tendons slack."""
         if command is None or not self.robot.isolated:
             return command
         released = self.limiter.slack_length if command.kind == LENGTH else 0.0

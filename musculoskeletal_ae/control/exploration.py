@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exploration: random motion that collects training data.
 
-The preset draws the steps (`Preset.exploration`). Preset `default` puts the targets of some joints
-at their limits, because the learner identifies joint-sensor offsets from joints at their stops
-(`learning.joint_stops`). Of several random T_const, this preset uses the one that presses these
-joints most strongly against their stops.
+Each preset of settings has its own random steps (`Preset.exploration`). Preset `default` puts the
+targets of some joints at their limits, because the learner identifies joint-sensor offsets from
+joints at their stops (`learning.joint_stops`). For each posture, this preset draws several random
+sets of tensions and uses the one that presses these joints most strongly against their stops.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 class Exploration:
-    """An endless sequence of steps, which is the same for the same seed.
+    """An endless random sequence of exploration steps, reproducible by its seed.
 
     A new iterator does not repeat the sequence: it continues the sequence at a new posture.
     """
@@ -49,7 +49,7 @@ class Exploring(ActivityControl):
         self._theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Start with a new posture, or continue after a pause, from the present tensions."""
+        """Start the exploration, or continue it after a pause, from the present tensions."""
         self.ramps.start_from(inputs.length)
         self._steps = self._steps or iter(self.stream)
 

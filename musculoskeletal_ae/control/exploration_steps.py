@@ -41,7 +41,8 @@ def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_
 def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Array:
     """Return random tensions that press the joints at their limits strongly against the stops.
 
-    They are the best of PRESSES draws. If no joint is at a limit, there is only one draw.
+    PRESSES random sets of tensions are compared, and the one that presses most strongly is
+    returned. If no joint is at a limit, only one set is drawn.
 
     Args:
         robot: The robot.

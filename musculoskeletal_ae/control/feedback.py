@@ -43,7 +43,7 @@ def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
 
 
 class RestFeedback:
-    """Integrates the estimated error and the needless tension slowly while the arm rests.
+    """Slowly corrects the posture and reduces needless tension while the arm rests.
 
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
         dr/dt = gain (T − T*)/K_stiff,           |r| ≤ R             where T > T*
@@ -52,17 +52,22 @@ class RestFeedback:
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
         l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
 
-    Friction and network errors leave the arm away from its target; the estimate contains most of
-    this error (arXiv 2405.11808). Errors below DEADBAND count as 0. Friction and network errors
-    also cause antagonistic muscles to pull against each other, because a length error causes a
-    tension error of K_stiff times the length error. T* exerts the same joint torque as T_end, so
-    that the relief moves no joint. A tendon that was wound in is paid out until friction no longer
-    retains tension in it. A tendon that was paid out is not paid out further, because friction
-    already supports the arm there.
+    T is the measured motor-side tension, T_end the bone-side tension, and T_planned the tension of
+    the plan. ①(θ, T) is the network's prediction of the muscle lengths, G their derivative ∂l/∂θ.
 
-    Position-controlled modules do not hold T_bias. For them K_stiff is the stiffness of the
-    series elastic element, and T may be below T_bias. R is larger, so that slack tendons are wound
-    in.
+    Correction c: because of friction and network errors, the arm comes to rest beside its target.
+    The estimated posture shows most of this error (arXiv 2405.11808). Errors below DEADBAND count
+    as 0.
+
+    Relief r: friction and network errors also make antagonistic muscles pull against each other,
+    because a length error causes a tension error of K_stiff times the length error. T* exerts the
+    same joint torque as T_end, so that the relief moves no joint. If a tendon has more tension than
+    T* at the motor, it is paid out. If it has less than T* at the bone, it is wound in. A tendon
+    between these two cases remains as it is, because friction supports the arm there.
+
+    Position-controlled modules do not hold T_bias. For them, K_stiff is the stiffness of the
+    series elastic element, and T may be below T_bias. Their R is larger, so that slack tendons can
+    be wound in.
 
     Attributes:
         correction: c [rad], (D,).
@@ -131,10 +136,11 @@ class RestFeedback:
 
 
 class MotionFeedback:
-    """Shifts the posture along a trajectory by k_p e + c, with dc/dt = k_i e.
+    """Corrects the estimated posture error e while the arm moves along a trajectory and settles.
 
-    c is the correction of the rest feedback. It is thus kept from one motion to the next. No entry
-    of c grows while `is_held_back`, so that c does not wind up.
+    The desired posture is shifted by k_p e + c, with dc/dt = k_i e. The integral c is stored in the
+    rest feedback (`RestFeedback.correction`) and therefore persists from one motion to the next.
+    While the limiter holds a muscle back, no entry of c grows, so that c does not wind up.
     """
 
     def __init__(self, rest: RestFeedback) -> None:
@@ -161,5 +167,5 @@ class MotionFeedback:
         return self._shift
 
     def continue_at_rest(self) -> None:
-        """Let the rest feedback continue from the present shift."""
+        """Use the present shift as the correction from which the rest feedback continues."""
         self._rest.correction = self._shift

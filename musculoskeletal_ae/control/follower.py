@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The follower: computes muscle lengths along a trajectory, and holds its end.
 
-At each message, for the desired θ, θ̇, θ̈ (`trajectory`),
+At each message, for the desired θ, θ̇, θ̈ (`trajectory`) and with the network's prediction ① of the
+muscle lengths,
 
     τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
     T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,         bone-side tension
@@ -57,7 +58,7 @@ HELD_BACK = 1e-4
 
 
 class HeldPosture(NamedTuple):
-    """The end of a trajectory, for which the plan is computed only once."""
+    """The plan for the end of a trajectory, which is computed once and then held."""
 
     length: Array  # l_target without feedback [m], (M,)
     jacobian: Array  # G [m/rad], (M, D)
@@ -118,7 +119,8 @@ class Follower(ActivityControl):
     def plan_anew(self) -> None:
         """Plan again, with a smooth transition from the last command to the new plan.
 
-        An arm at rest settles again.
+        If the arm was at rest, the feedback of the motion is active again until the arm has
+        settled.
         """
         if self._held is not None and self.progress.trajectory is not None:
             self.progress.return_to_end()
@@ -131,7 +133,10 @@ class Follower(ActivityControl):
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether there is no trajectory, for example after a stop, or the arm has fallen."""
+        """Whether there is no trajectory, or the arm has fallen away from its trajectory.
+
+        A stop discards the trajectory. Only an arm with isolated muscles counts as fallen.
+        """
         return self.progress.trajectory is None or self.progress.has_lost_path
 
     @property
@@ -141,13 +146,16 @@ class Follower(ActivityControl):
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque [N·m], (D,), that no tensions within their limits provide."""
+        """Torque [N·m], (D,), that is missing because the tensions are limited.
+
+        None without a trajectory.
+        """
         return None if self.progress.trajectory is None else self.plan.tension.missing_torque
 
     # -- the activity ---------------------------------------------------------------------------
 
     def enter(self, _: Inputs) -> None:
-        """Start, or continue after a pause, from the present tensions."""
+        """Start following, or continue after a pause, from the present tensions."""
         self._held = self._blend = self._desired = None
         self.progress.return_to_end()  # plan the tensions of the held posture again
         self.plan.reset()
@@ -196,8 +204,9 @@ class Follower(ActivityControl):
     def _is_held_back(self, inputs: Inputs) -> bool:
         """Return whether the limiter did not let a muscle wind in as far as desired.
 
-        With isolated muscles, the result is False. Some of the other muscles are then often at
-        their limit, but c has to grow nevertheless, because the arm would otherwise sag.
+        The result makes `MotionFeedback` stop integrating. With isolated muscles, the result is
+        always False: some of the remaining muscles are then often at their limit, but without the
+        integration, the arm would sag.
         """
         if self._desired is None or not self._robot.used.all():
             return False

@@ -36,7 +36,7 @@ def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
 
 
 class FollowedGoal:
-    """Monitors the latest trajectory of a controller, which is the goal of an action."""
+    """Monitors how the controller follows the trajectory that is the goal of an action."""
 
     def __init__(
         self, core: Controller, joints: Sequence[str], path: Array, goal: Array, patience: float
@@ -55,7 +55,7 @@ class FollowedGoal:
         self._joints, self._path, self._goal, self._patience = joints, path, goal, patience
 
     def outcome(self) -> tuple[int, str] | None:
-        """Return an error code and its reason, or None while the goal is active."""
+        """Return an error code (0 for success) and its reason, or None while the goal is active."""
         core, trajectory = self._core, self._trajectory
         progress, condition = core.activities.follower.progress, core.supervisor.condition
         if condition is not None:

@@ -9,7 +9,8 @@ posture is not holdable, the arm stops on the straight path to it (`reach.neares
 
 The hand moves to a single pose at `hand_speed` or more slowly. Poses in quick succession form a
 path, which the hand follows at the speed at which they arrive. A pose is reached when the next pose
-is due, and the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT.
+is due, and the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT
+seconds.
 """
 
 import numpy as np
@@ -127,7 +128,7 @@ class Hand:
             self._last = now, *self._last[1:]
 
     def moved(self, mae: Mae, start: Setpoint, twist: Array) -> Trajectory:
-        """Return the trajectory that moves the hand by a twist for TWIST_TIMEOUT.
+        """Return the trajectory that moves the hand by a twist for TWIST_TIMEOUT seconds.
 
         Args:
             mae: The network in use.

@@ -4,7 +4,8 @@
     desired ─► rate limit ─► tension limit ─► finite check ─► published
 
 Muscle stiffness control exerts T_bias + K_stiff (l − l_target). Therefore the tension limit of a
-muscle limits its commanded length:
+muscle limits its commanded length. With the measured length l and tension T, the lag λ of the
+muscle module and a tension feedback r:
 
     l_target ≥ l + l_comp(T_limit) + r − λ max(0, −dl/dt),   l_comp(T) = −(T − T_bias) / K_stiff
     dr/dt = RELIEF (T − T_limit)/K_stiff,   0 ≤ r ≤ −l_comp(T_limit)
@@ -33,8 +34,9 @@ shortens slowly, because tendon friction and the age of T would otherwise make a
 oscillate (`recovered`). These modules receive length commands only: a desired tension becomes the
 length that corrects the fraction `ADMITTANCE` of the tension error.
 
-A tension that is computed from a motor current is uncertain (`signals.friction.Transmission`). The
-limit of this tension is lower by CONFIDENCE σ_T, so that the true tension does not exceed T_limit.
+A tension that is computed from a motor current is uncertain (`signals.friction.Transmission`). With
+the standard deviation σ_T of this tension, its limit is lowered by CONFIDENCE σ_T, so that the true
+tension does not exceed T_limit.
 
 T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
 (`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
@@ -45,9 +47,8 @@ tension commands are compared by the tension that they demand of a module:
     T_target = T_bias + max(0, K_stiff (l − l_target))
 
 All commanded lengths above l demand T_bias. Of these lengths, the one nearest to the last published
-length is used.
-The first command keeps the present tensions, because a restarted controller does not know the
-earlier commands.
+length is used. The first command keeps the present tensions, because a restarted controller does
+not know the earlier commands.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class CommandLimiter:
     Attributes:
         command: The last published command, or None.
         slack_length: Commanded length at which each muscle is slack in any posture [m], (M,).
-        offsets_known: Whether the length offsets are known; `longest` is infinite otherwise.
+        offsets_known: Whether the length offsets are known.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -113,7 +114,10 @@ class CommandLimiter:
         return self.slack_length if self.offsets_known else np.full_like(self.slack_length, np.inf)
 
     def shift(self, offset: Array) -> None:
-        """Adapt the last commands after the length offsets have grown by `offset` [m], (M,)."""
+        """Convert the last commands to new length offsets, which are larger by `offset` [m], (M,).
+
+        Corrected lengths are shorter by the same amount, and so are the stored length commands.
+        """
         self._exceeded = self._exceeded - offset
         if self._last_length is not None:
             self._last_length = self._last_length[0] - offset, self._last_length[1]
@@ -121,9 +125,9 @@ class CommandLimiter:
             self.command = Command(LENGTH, self.command.value - offset)
 
     def last(self, kind: str, sample: MuscleSample) -> Command:
-        """Return the last command, converted to this kind if necessary.
+        """Return the last command, converted to the given kind (`LENGTH` or `TENSION`).
 
-        Before the first command, return one that keeps the present tensions.
+        Before the first command, return a command that keeps the present tensions.
         """
         if self.command is None:
             command = unchanging(self._robot, kind, sample)
@@ -176,8 +180,8 @@ class CommandLimiter:
         Args:
             desired: The desired command.
             sample: The newest muscle states.
-            tension_limit: Another limit of each tension [N], (M,); the lower one of this and
-                `tension.limit` applies.
+            tension_limit: Momentary limit of each tension [N], (M,); the lower one of this and
+                the robot's `tension.limit` applies.
             dt: Time since the last command [s].
             lead: λ max(0, −dl/dt) of each muscle [m], (M,).
             rejected: l [m] and T [N], (2, M), as in `RejectionError.pull`, if the newest message
@@ -229,11 +233,11 @@ class CommandLimiter:
         return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
-        """Return the shortest length commands [m], (M,), that the rejected messages allow.
+        """Return lower bounds of l_target [m], (M,), that follow from the rejected messages.
 
         A module compares l_target with its own reading of l. If this reading jumps, the module
-        winds in, and the tension rises beyond the limit. Therefore l_target follows the jump of a
-        muscle whose tension is too high. For all other muscles, −∞ is returned.
+        may wind in until the tension is beyond the limit. Therefore l_target of a muscle whose
+        tension is too high has to follow the jump. For all other muscles, the bound is −∞.
 
         Args:
             rejected: l [m] and T [N], (2, M); −∞ where they are implausible.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks which control methods are legal for a robot, and tells how a method reaches a target."""
+"""Determines whether a robot can use a control method, and which code implements the method."""
 
 from collections.abc import Mapping
 

@@ -4,10 +4,11 @@
     proposed   l_target = ①(θ_target, T) + l_comp(T)
                T = argmin ‖T‖²  subject to  τ_target + Gᵀ T = 0,  T_bias ≤ T ≤ T_limit
 
-This searches the network's latent space on the manifold z = ①(θ_target, T), on which θ_target is
-kept by construction. Torque balance and tension limits are constraints and therefore take priority
-over the least tension. In a weighted sum of norms, ‖T‖ could outweigh the torque balance, and the
-arm would sag. G depends on T, so the quadratic programme is solved a few times.
+①(θ, T) is the network's prediction of the muscle lengths. The method varies only T and evaluates
+the network at θ_target, so that no solution deviates from the target posture. Torque balance and
+tension limits are constraints and therefore take priority over the least tension. In a weighted sum
+of norms, ‖T‖ could outweigh the torque balance, and the arm would sag. The muscle Jacobian G
+depends on T, so the quadratic programme is solved a few times.
 
 Muscle stiffness control exerts T = T_bias + max(0, K_stiff (l − l_target)). Therefore l_target lies
 below the length by |l_comp|. `stiffness` chooses T for a joint stiffness (`stiffness_command`).
@@ -94,9 +95,9 @@ class LengthMethod(NamedTuple):
 
     Attributes:
         command: Computes the command.
-        takes_tension: Whether the command realises the tension that is passed to it; this tension
-            is then limited.
-        follows_first: Whether the method `first` runs before this method.
+        takes_tension: Whether the command leads to the tension that is passed to it. If so, the
+            tension is limited before it is passed.
+        follows_first: Whether the method `first` moves the arm before this method does.
     """
 
     command: LengthCommand
@@ -197,13 +198,15 @@ def stiffness_command(
     limit: Array | float,
     near: Array | None = None,
 ) -> Solution:
-    """Return the command of `stiffness`, with the joint stiffness nearest to the desired stiffness.
+    """Return the command whose joint stiffness is nearest to the desired one (method `stiffness`).
 
         min Σ_j (K_jj(T) − K_desired,j)²   subject to   −Gᵀ T = τ_target,   T_low ≤ T ≤ T_limit
 
-    `robot/stiffness.py` defines K_θ; here K_θ includes the springs of the joints. G, ∂²l/∂θ² and
-    L_e(T) = −l(θ, T) + const in K_θ come from ① of the network (paper, §III-E, variable
-    stiffness control).
+    K_θ, with the diagonal entries K_jj, is defined in `robot/stiffness.py` and here includes the
+    springs of the joints. It depends on G, ∂²l/∂θ² and the elongation L_e(T) = −l(θ, T) + const.
+    These three come from the network's prediction l(θ, T) of the muscle lengths (paper, §III-E,
+    variable stiffness control).
+
     Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. T_low lies
     above T_bias by the largest of MARGINS with which the torque is possible, because a muscle that
     muscle stiffness control (MSC) holds at T_bias is stiff in one direction only. K is nearly
@@ -217,8 +220,8 @@ def stiffness_command(
         desired: Desired diagonal entries of K_θ [N·m/rad], (D,). 0 leaves an entry unconstrained;
             values beyond the reachable range of a joint are clipped to it.
         limit: Highest tension that may be planned [N], scalar or (M,).
-        near: Tension of a nearby solution [N], (M,), from which a single round suffices; None if no
-            such solution is known.
+        near: Tension of a nearby solution [N], (M,); the search then starts there and needs only
+            one round. None if no such solution is known.
     """
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))

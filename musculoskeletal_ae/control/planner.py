@@ -2,10 +2,10 @@
 """Plans trajectories that the arm can follow, from target postures, poses and twists.
 
 The methods that plan return a `Plan`, or raise a MessageError with the reason. All plans except
-`to_rest` are slowed to the speed of the muscle modules, and stay within the joint limits (up to
-`trajectory.BEYOND`). `to_pose` and `by_twist` plan motions that end in a holdable posture. So does
-`through`, for an arm with isolated muscles. The caller of `to_posture` checks the target with
-`reachable`.
+those of `to_rest` are slowed to the speed of the muscle modules. They stay within the joint limits,
+with the tolerance `trajectory.BEYOND`. Plans of `to_pose` and `by_twist` end in a holdable posture.
+Plans of `through` are checked for this only if a muscle is isolated. `to_posture` does not check
+the target: its caller does so with `reachable`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Planner:
     ) -> Plan:
         """Plan a motion to rest at θ [rad], (D,).
 
-        With isolated muscles, the motion follows the cheapest path (`reach.way`).
+        With isolated muscles, the motion avoids postures that are not holdable (`reach.way`).
 
         Args:
             mae: The network in use.
@@ -213,7 +213,8 @@ class Planner:
     def _within_limits(self, mae: Mae, planned: Trajectory) -> Trajectory:
         """Return the planned trajectory, slowed and within the joint limits.
 
-        The arm first comes to rest if the slowed trajectory would leave the joint limits.
+        If the slowed trajectory would leave the joint limits, the returned trajectory first brings
+        the arm to rest and then plans the motion from there.
         """
         try:
             return self._slowed(mae, planned)

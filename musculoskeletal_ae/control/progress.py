@@ -21,7 +21,7 @@ LOST = 0.4
 
 
 class Progress:
-    """Follows the time along a trajectory, and compares the arm with it.
+    """Tracks how far the arm is along a trajectory, and how far it is away from the setpoint.
 
     Attributes:
         trajectory: The present or last trajectory; None before the first trajectory and after a
@@ -30,7 +30,7 @@ class Progress:
             no other trajectory is due.
         time: Time since the start of the trajectory [s].
         over: Time since the end of the trajectory [s]; 0 before its end.
-        lost_time: Time [s] for which the largest error of a joint has exceeded LOST.
+        lost_time: Time [s] for which the error of some joint has been larger than LOST.
         desired: The present setpoint.
         error: Desired − estimated θ [rad], (D,).
     """
@@ -57,7 +57,11 @@ class Progress:
         self.trajectory = self.next = None
 
     def return_to_end(self) -> None:
-        """Set the time back to the end of the trajectory, so that the arm settles again."""
+        """Set the time back to the end of the trajectory, as if it had only just ended.
+
+        The follower then repeats the time of settling before the arm counts as resting. A
+        trajectory that has not ended is not affected.
+        """
         if self.trajectory is not None:
             self.time = min(self.time, self.trajectory.duration)
 
@@ -97,13 +101,20 @@ class Progress:
 
     @property
     def has_fallen(self) -> bool:
-        """Whether an arm with isolated muscles is far from the target after its trajectory."""
+        """Whether an arm with isolated muscles has not stayed at the end of its trajectory.
+
+        This is the case if, FALLING seconds after the end, the error of a joint exceeds FALLEN.
+        """
         is_at_rest = self.trajectory is not None and self.next is None and self.over > FALLING
         return is_at_rest and not self._robot.used.all() and self._largest_error > FALLEN
 
     @property
     def has_lost_path(self) -> bool:
-        """Whether an arm with isolated muscles has fallen, at the end or on the way."""
+        """Whether an arm with isolated muscles has fallen away from its trajectory.
+
+        This is the case during the motion if the error of a joint has exceeded LOST for FALLING
+        seconds, and after the motion if `has_fallen` is true.
+        """
         is_lost = self.lost_time > FALLING and not self._robot.used.all()
         return self.has_fallen or (is_lost and self.next is None)
 

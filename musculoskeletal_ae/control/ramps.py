@@ -2,14 +2,15 @@
 """Ramps of muscle lengths, by which exploration and some control methods reach a posture.
 
 These methods have one length command for each posture; the preset lists them
-(`Preset.length_methods`). A target becomes one goal, or two goals with the method `second`, which
-is preceded by `first`. Each goal is approached by a ramp and then held. A ramp starts from the
-present command, so that the command does not jump:
+(`Preset.length_methods`). A target becomes one goal. With the method `second`, it becomes two goals
+at the same posture: the first one is reached by the method `first`. Each goal is approached by a
+ramp and then held. A ramp starts from the present command, so that the command does not jump:
 
     c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
 
-A ramp starts and ends at rest, and all muscles arrive together. T_current is measured only at the
-start of a method: with repeated measurements, `second` would raise the tension without bound.
+A ramp starts and ends at rest, and all muscles arrive together. The present tension T_current, on
+which the command of `second` depends, is measured only at the start of the goal: with repeated
+measurements, `second` would raise the tension without bound.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class LengthRamps:
         return None if self.solution is None else self.solution.missing_torque
 
     def is_over_after(self, dt: float) -> bool:
-        """Return whether the time of the last goal will have passed dt [s] from now."""
+        """Return whether the duration of the last goal will be over dt [s] from now."""
         return self._remaining - dt <= 0.0 and not self._goals
 
     def start_from(self, command: Array) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Holdability: whether a posture is holdable, the nearest holdable posture, and a holdable path.
+"""Finds out whether a posture is holdable, and finds holdable postures and paths.
 
 All functions use the learned G and the least tensions within the limits. An arm with isolated
 muscles falls where the remaining muscles cannot hold it, until a joint's stop supports it. From
@@ -63,8 +63,9 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
     """Return a holdable posture on the straight path from `start` to θ [rad], (D,).
 
-    This is θ, or the end of a holdable part of the path, found by bisection. If no holdable posture
-    is found, it is `start`, which is not checked.
+    If θ is not holdable, a bisection between `start` and θ looks for the last holdable posture
+    before θ. The bisection does not check `start` itself, and returns it if it finds no holdable
+    posture.
 
     Returns:
         The posture, and a text on the missing torque at θ, or '' if θ is holdable.
@@ -81,7 +82,13 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
-    """Return the path from `start` to θ as postures [rad], (K, D), without `start` itself."""
+    """Return a path from `start` to θ on which the muscles hold the arm as well as possible.
+
+    The path is straight if no muscle is isolated, or if the whole straight path is holdable.
+
+    Returns:
+        The postures [rad], (K, D), that straight lines connect, without `start` itself.
+    """
     if robot.used.all():
         return theta[None]
     cost = PathCost(robot, mae)
@@ -180,7 +187,10 @@ class PathCost:
         return np.where(m > NOTABLE, m, 0.0)
 
     def _stops(self, theta: Array) -> Array:
-        """Return G of the stops at which joints rest, each modelled as a muscle, (stops, D)."""
+        """Return muscle Jacobians (S, D) that model the S joint stops at which joints rest.
+
+        A stop is modelled as a muscle that pulls the joint away from the stop.
+        """
         robot, joints = self._robot, np.eye(self._robot.joint_count)
         at_stop = AT_STOP * self._radian
         is_low, is_high = theta < robot.lower + at_stop, theta > robot.upper - at_stop
@@ -266,7 +276,7 @@ def _random_postures(robot: Robot, start: Array) -> Array:
 
 
 def _shortened(path: Array, cost: PathCost) -> Array:
-    """Return a path [rad], (K, D), without the postures that do not make it cheaper."""
+    """Return a path [rad], (K, D), after removing postures whose removal does not cost more."""
     k = 1
     while k < len(path) - 1:
         around = cost.of_edge(path[k - 1], path[k]) + cost.of_edge(path[k], path[k + 1])

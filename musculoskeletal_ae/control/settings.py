@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of control: one table for the core and for the node's parameters."""
+"""Settings of control, from which the parameters of the controller node are generated, too."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -36,9 +36,11 @@ MOST_EXERTIONS = 500
 def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings) -> float:
     """Return the factor by which to slow a trajectory so that the muscle modules can follow it.
 
-    Only the lengths at T_bias count. Changes of the tensions are ignored, because they are sudden,
-    at any speed, near postures that are hard to hold; `SHARE` reserves speed for them. A trajectory
-    that starts in motion keeps its initial speed. It may therefore need a larger factor.
+    The factor is computed from the lengths of the muscles at T_bias. Changes of tension also change
+    the lengths, but are not considered: near postures that are hard to hold, they are sudden,
+    however slow the arm moves. `SHARE` leaves a part of the speed for them. A trajectory that
+    starts in motion keeps its initial speed. It may therefore need a larger factor than the
+    returned one.
     """
     # Skip moments of very long trajectories, which would otherwise delay a command by 0.1 s.
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
@@ -55,10 +57,11 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
     The factor s is the smallest of `SLOWER` for which the missing torque, at every moment of the
-    motion, is at most `reach.NOTABLE` above that of a very slow motion; if there is none, it is the
-    largest of `SLOWER`. Where no tension is known, s is 1. An arm without isolated muscles may use
-    all tensions up to T_limit. With isolated muscles, the factors are `SLOWER_ISOLATED`, and
-    tensions are limited as on a path. `reach.Limits` defines loss.
+    motion, is at most `reach.NOTABLE` above that of a very slow motion. If no factor suffices, s is
+    the largest of `SLOWER`. If the muscle modules provide no tensions, s is 1. An arm without
+    isolated muscles may use all tensions up to T_limit. For an arm with isolated muscles, the
+    factors are those of `SLOWER_ISOLATED`, and the highest tension is that of `reach.Limits`, which
+    keeps a reserve. `loss` is defined there, too.
 
     Args:
         robot: The robot; isolated muscles have no tension.

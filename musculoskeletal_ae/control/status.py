@@ -178,9 +178,10 @@ def slowed(follower: Follower) -> str:
 
 
 def _fallen(core: Controller, estimate: Array) -> str:
-    """Return a text on a fallen arm: its distance from the target, and the missing torque.
+    """Return a text for users about an arm that could not stay at its target.
 
-    `estimate` is θ [rad], (D,).
+    The text states the joint that is farthest from its target, the distance, and the torque that
+    the muscles lack in the estimated posture `estimate` [rad], (D,).
     """
     mae, robot = core.mae, core.robot
     error = core.activities.follower.progress.error

@@ -79,9 +79,13 @@ class StopMemory:
             self.found = Condition(self._written, BEFORE)
 
     def note(self, stop: Condition | None) -> None:
-        """Keep the present latched stop; `stop` is None while no stop is latched.
+        """Write the present latched stop to the file.
 
-        If writing fails, `problem` says so, and a later call tries again.
+        If writing fails, `problem` states the reason, and a later call tries again.
+
+        Args:
+            stop: The latched stop. If it is None, no stop is latched, and the file names the cause
+                `restarted`.
         """
         self._is_latched = stop is not None
         cause = StopCause.RESTARTED if stop is None else stop.cause

@@ -5,15 +5,15 @@ The last command is held for `hold_time`, except after an overload. Then lengths
 rate limit until muscle stiffness control demands only T_bias. Tension commands fall to T_bias at
 K_stiff times the rate limit.
 
-Position-controlled modules hold no tension of their own. Each tendon is paid out until its measured
-tension is T_bias, and then stays: a tendon that no weight loads is not paid out further, and an arm
-that its muscles carry is let down slowly. A muscle whose tension is not known is paid out by
-`Actuation.release`, counted from the start of the release.
+Position-controlled modules hold no tension of their own. Each tendon is therefore paid out only
+while its measured tension is above T_bias. Unloaded tendons thus do not become slack, and muscles
+that carry the arm lower it slowly. If a tension is not known, the muscle is paid out by the length
+`Actuation.release` after the start of the release.
 
 After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
 once the other muscles are paid out. Winding ends when the measured tension of the suspect, or the
-tension that muscle stiffness control demands, has risen by `LARGEST_RISE`. Independently of the
-sensors, winding also ends when the length command has fallen by `Actuation.winding_depth`.
+tension that muscle stiffness control demands, has risen by `LARGEST_RISE`. Whatever the sensors
+read, winding also ends when the length command has decreased by `Actuation.winding_depth`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class SafeStop:
 
     @property
     def is_releasing(self) -> bool:
-        """Whether the last command is no longer held."""
+        """Whether the hold time is over, so that the muscles are being paid out."""
         return self._held > self._settings.hold_time
 
     def step(
@@ -123,7 +123,16 @@ class SafeStop:
         return Command(LENGTH, value)
 
     def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:
-        """Return the suspect's next length command [m]; `command` is its last command [m]."""
+        """Return the next length command [m] of a suspect muscle, which is wound in slowly.
+
+        If the suspect has been wound in far enough, the last command is returned unchanged.
+
+        Args:
+            muscle: Index of the suspect.
+            command: Its last length command [m].
+            sample: The newest muscle states.
+            dt: Time since the last command [s].
+        """
         if self._wound_from is None:
             self._wound_from = command
         length, tension, _ = sample.newest[:, muscle]

@@ -52,7 +52,7 @@ LAST = Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY
 
 
 class StopCause(Enum):
-    """All stop causes; the value contains the stable identifier.
+    """All stop causes, each with an identifier for programs and its declaration.
 
     If several causes begin together, the one that is declared first is reported.
     """
@@ -242,16 +242,18 @@ def remedy_of(
     of_finding: Iterable[Step] = REPAIR,
     has_anomaly: bool = False,
 ) -> list[Step]:
-    """Return the steps of the remedies of all causes, each step once.
+    """Return the steps by which a user ends all the given stop causes, each step once.
 
     The reset comes after the other steps; only an exploration comes after the reset.
 
     Args:
-        causes: The causes, in whose order the steps are returned.
-        explored: Whether the arm explored when it stopped, so that it may explore again.
-        of_finding: Remedy of the estimator's finding, which is part of the remedy of an anomaly.
-        has_anomaly: Whether an anomaly is present that explains `CONSEQUENCES`, so that these
-            causes need nothing but the reset.
+        causes: The causes; the steps are returned in the order of the causes.
+        explored: Whether to add a step that starts the exploration again, because the arm was
+            exploring when it stopped.
+        of_finding: Steps that remedy the faults which the estimator has found. They are the
+            remedy of the cause `ANOMALY`, before the reset.
+        has_anomaly: Whether an anomaly is present. If so, the causes in `CONSEQUENCES` need only a
+            reset, because the anomaly has caused them.
     """
     special: dict[StopCause, tuple[Step, ...]] = {
         StopCause.ANOMALY: (*of_finding, Step.RESET_CONTROLLER)
@@ -264,7 +266,11 @@ def remedy_of(
 
 
 def parse(value: str) -> list[StopCause]:
-    """Return the causes in a value `stop causes`; unknown identifiers are left out."""
+    """Return the causes that a comma-separated list of identifiers names.
+
+    The value `stop causes` of the controller's status is such a list. Unknown identifiers are
+    ignored.
+    """
     causes = {cause.identifier: cause for cause in StopCause}
     return [causes[name] for name in value.split(', ') if name in causes]
 

@@ -30,7 +30,7 @@ class Activity(Enum):
 
 
 class StopState(Enum):
-    """Whether the arm may move; the values are part of the interface."""
+    """Whether the arm may move; the values appear as modes in the public interface."""
 
     RUNNING = 'running'
     PAUSED = 'paused'  # stopped by an auto-recoverable cause
@@ -40,7 +40,7 @@ class StopState(Enum):
 
 
 class Event(Enum):
-    """Events that change the stop state; the values label the diagram."""
+    """Events that change the stop state; their values are the labels in `diagram`."""
 
     CLEARING_CAUSE = 'an auto-recoverable cause'
     LATCHING_CAUSE = 'any other cause'
@@ -87,10 +87,10 @@ class Supervisor:
 
     Attributes:
         activity: What the arm does, or will do after a stop.
-        explored: Whether the arm explored when the latched stop began, and no request has replaced
-            the exploration since.
-        awaits_exploration: Whether the arm does not explore although it should: a latched stop has
-            ended an exploration, or one could not begin, and no request has replaced it since.
+        explored: Whether a latched stop has interrupted an exploration that will resume if a
+            verification ends the stop. A request or a reset sets this to False.
+        awaits_exploration: Whether an exploration is still to be started, because a latched stop
+            has ended it or because it was refused at the start. A request sets this to False.
         state: The stop state.
         condition: The reported stop cause; None while running.
     """
@@ -120,7 +120,7 @@ class Supervisor:
 
     @property
     def may_wind_suspect(self) -> bool:
-        """Whether a suspect muscle may be wound in; not during an operator's stop."""
+        """Whether a suspect muscle may be wound in; False if an operator has stopped the arm."""
         return self.state is StopState.VERIFYING and StopCause.OPERATOR not in self._causes
 
     @property
@@ -139,9 +139,10 @@ class Supervisor:
     def on_request(self, activity: Activity) -> None:
         """Change the activity; during a stop, the change takes effect after the stop.
 
-        During a latched stop, `AFTER_A_STOP` replaces activities that must not begin by themselves:
-        after the stop, the arm goes to its last target and holds it, but does not explore. A
-        request during a stop also prevents an interrupted exploration from resuming.
+        After a latched stop, the arm may move to its last target and hold it, but must not start
+        an exploration or a trajectory by itself. Requests for these activities during such a stop
+        are therefore replaced according to `AFTER_A_STOP`. A request during a stop also prevents
+        an interrupted exploration from resuming.
         """
         if self.is_latched:
             activity = AFTER_A_STOP.get(activity, activity)
@@ -192,10 +193,13 @@ class Supervisor:
             self._fire(Event.RELEASED)
 
     def on_suspect(self, is_isolated: bool) -> None:
-        """Start the verification of an isolated suspect, or abandon it.
+        """Start or abandon the verification of a suspect muscle.
 
-        It is abandoned (`is_isolated` false) when estimates are missing, because an estimator that
-        has restarted no longer has a suspect. `on_verified` ends a complete verification.
+        `on_verified` ends a verification that is complete.
+
+        Args:
+            is_isolated: True if the estimator has isolated a suspect. False if estimates are
+                missing: the estimator may then have restarted, and would no longer have a suspect.
         """
         self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
 

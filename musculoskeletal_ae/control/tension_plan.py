@@ -29,9 +29,10 @@ AHEAD = 0.2  # T_K is computed at this interval, for a setpoint that is the same
 
 
 class Stiffening:
-    """Computes T_K, the tensions with the desired joint stiffness, for the method `stiffness`.
+    """Computes the tensions T_K that give the desired joint stiffness (method `stiffness`).
 
-    T_K approaches the solution for a setpoint that is AHEAD seconds ahead.
+    Every AHEAD seconds, the tensions for the setpoint AHEAD seconds later are computed. T_K
+    changes towards them at a limited rate.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -43,7 +44,7 @@ class Stiffening:
         self._robot, self._settings = robot, settings
 
     def reset(self) -> None:
-        """Discard the present solution."""
+        """Discard the present solution; the next step computes a new one."""
         self.solution: Solution | None = None  # the solution that T_K approaches
         self._near: Array = self._robot.tension.bias  # T_K [N], (M,)
         self._solved = 0.0  # age of the solution [s]
@@ -51,10 +52,10 @@ class Stiffening:
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
     ) -> Array:
-        """Return T_K [N], (M,).
+        """Advance by dt [s] and return T_K [N], (M,).
 
-        The change of T_K per step is limited: the lengths of trajectories may use the fraction
-        SHARE of the rate limit, and T_K may use half of the remaining fraction.
+        The rate of T_K is limited. Trajectories may use the fraction SHARE of the rate limit of the
+        lengths, and T_K may use half of the remaining fraction.
         """
         robot, settings, solution = self._robot, self._settings, self.solution
         self._solved += dt

@@ -107,10 +107,13 @@ class GravityCompensation(TorqueControl):
         τ = g(θ) + HOLD (θ_held − θ) − DAMPING dθ/dt + WALL (clip(θ) − θ)
         θ_held ← clip(θ_held, θ − BAND, θ + BAND)
 
-    A spring holds the arm at θ_held. Once the spring is stretched by BAND, θ_held follows the arm.
-    The spring thus acts like joint friction, so that errors of the gravity model do not make the
-    arm creep. Near the joint limits, a wall pushes the arm back; clip(θ) limits θ to WALL_AT inside
-    the joint limits. θ_held stays within the joint limits as well.
+    A virtual spring of stiffness HOLD holds the arm at θ_held. Once the spring is stretched by
+    BAND, θ_held follows the arm. The spring thus acts like joint friction, so that errors of the
+    gravity model do not make the arm creep.
+
+    A second virtual spring, of stiffness WALL, pushes the arm away from the joint limits. It begins
+    at the distance WALL_AT from them: clip(θ) is θ, limited to this smaller range. θ_held stays
+    within the joint limits.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:

@@ -60,7 +60,7 @@ class Setpoint(NamedTuple):
 
     @classmethod
     def resting(cls, theta: Array) -> Setpoint:
-        """Return a posture θ (D,) at rest."""
+        """Return the setpoint of an arm that rests at the posture θ [rad], (D,)."""
         return cls(theta, np.zeros_like(theta), np.zeros_like(theta))
 
 
@@ -187,7 +187,7 @@ class Trajectory:
 
     @property
     def path(self) -> tuple[Array, Array]:
-        """Times [s], (N,), that cover every piece, and θ [rad], (N, D), at these times."""
+        """The curve at N moments, several in each piece: times [s], (N,), and θ [rad], (N, D)."""
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
         inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
         theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)

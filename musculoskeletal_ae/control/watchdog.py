@@ -4,8 +4,8 @@
 `now` is the time of a steady clock [s], by which ages are measured. `time` is the time of the
 messages' clock [s], by whose steps commands advance. If the messages' clock runs at a fraction of
 real time, as in a slow simulator, the allowed age is divided by this fraction, but by no less than
-`SLOWEST`. A fast clock does not shorten the allowed age.
-Pauses of the controller itself do not count as age (`AwakeClock`).
+`SLOWEST`. A fast clock does not shorten the allowed age. Pauses of the controller itself do not
+count as age (`AwakeClock`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMAT
 
 
 class Step(NamedTuple):
-    """Duration of one step of control by both clocks, at most LONGEST_STEP each."""
+    """Time between two steps of control; each duration is at most LONGEST_STEP."""
 
     #: duration on the messages' clock [s]; of a stopped arm, it is that on the steady clock if the
     #: pace of the messages' clock is below SLOWEST
@@ -123,9 +123,10 @@ class DataAge:
 class Overload:
     """Detects muscles with tensions above OVERLOAD times `tension.limit`.
 
-    The duration of an overload is the time between the sendings of its messages, plus the age of
-    the newest message, up to LONGEST_STEP. Hence neither a late message nor a pause of the
-    controller turns a short peak into an overload.
+    An overload lasts from the time at which its first message was sent to the time at which its
+    last message was sent. The time since the last message was received is added, but at most
+    LONGEST_STEP. Hence neither a late message nor a pause of the controller turns a short peak into
+    an overload.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -137,7 +138,7 @@ class Overload:
         self._received_at = self._sent_at = -math.inf  # times of the newest message [s]
 
     def take(self, tension: Array, now: float, delay: float) -> None:
-        """Record which filtered tensions exceed the level.
+        """Record which filtered tensions of a message exceed the permitted level.
 
         Args:
             tension: T [N], (M,). Where it is not finite, nothing changes.
@@ -151,7 +152,7 @@ class Overload:
 
     @property
     def tense(self) -> list[str]:
-        """Texts, each with the name of a muscle with too much tension and the level exceeded."""
+        """Names of the muscles with too much tension, each with the level that is exceeded."""
         each = zip(self._robot.muscles, self._level, self._since, strict=True)
         return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
 
@@ -204,8 +205,8 @@ class HeatLimit:
     def conditions(self, robot: Robot, highest: float) -> list[Condition]:
         """Return the stop condition of overheating, if windings are overheated.
 
-        Overheating ends when no winding is above `highest` [°C], and at least one muscle may be
-        planned with more than T_bias.
+        Overheating ends when no winding is above `highest` [°C] and plans may give at least one
+        muscle more tension than T_bias. The list is empty without overheating.
         """
         winding = np.fmax(self.heat.core, -np.inf)  # a temperature that is unknown is NaN
         m = int(winding.argmax())

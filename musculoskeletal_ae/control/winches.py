@@ -18,11 +18,12 @@ SPAN = 0.0095  # shortest time over which a speed is computed, so that noise is 
 class Winches:
     """Measures the lag λ [s] of the modules while the arm moves.
 
-        l − l_target − (T − T_bias)/K_stiff = −λ dl/dt     wherever MSC demands more than T_bias
+        l − l_target − (T − T_bias)/K_stiff = −λ dl/dt
 
-    Position-controlled modules have K_stiff = ∞, and the equation always holds for them. The fit
-    is by least squares over all muscles for which the equation holds and whose speed exceeds
-    WINDING. Isolated muscles are left out.
+    Here l is the measured length, T the measured tension and l_target the length command. The
+    equation holds for muscles of which muscle stiffness control demands more tension than T_bias,
+    and always for position-controlled modules, whose K_stiff is ∞. λ is fitted by least squares to
+    all muscles for which the equation holds and whose speed exceeds WINDING, except isolated ones.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -50,7 +51,7 @@ class Winches:
     def step(
         self, length: Array, tension: Array, command: Array, dt: float, delay: float = 0.0
     ) -> None:
-        """Update the fit.
+        """Update λ and the speeds of the muscles.
 
         Args:
             length: l [m], (M,).
