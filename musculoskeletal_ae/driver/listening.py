@@ -87,7 +87,7 @@ class Listening:
         zeroed: bool = True,
         motors: MotorInterface | None = None,
     ) -> None:
-        """Expect messages of a driver.
+        """Prepare to check the messages of a driver.
 
         Args:
             robot: The geometric model.
@@ -225,7 +225,14 @@ class Listening:
                 verdict.failed('stuck', *np.flatnonzero(stuck).tolist())
 
     def _judge_values(self, verdict: Verdict, states: Array) -> bool:
-        """Check rows and units by the range of possible values; return whether they are right."""
+        """Check from the ranges of possible values that rows, units and signs are right.
+
+        Return False if they are wrong; the fault is then in the verdict.
+
+        Args:
+            verdict: Receives the results.
+            states: Medians of the published l, T and temperatures, (3, M).
+        """
         for what, texts, meant in _readings(states):
             possible = (meant >= self._low) & (meant <= self._high)
             possible[2] |= np.isnan(meant[2])
@@ -310,9 +317,11 @@ class Listening:
         verdict.add(lengths_verdict)
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return one note that names each joint whose reversed sign alone would explain all l.
+        """Return a note on joints of which a reversed sign would explain all wrong lengths.
 
-        Without such a joint, the list is empty. `theta` is θ [rad], (N, D).
+        Returns:
+            A list with one text, which names every joint whose sign alone would suffice. The list
+            is empty if there is no such joint.
         """
         names = []
         for j, name in enumerate(self._robot.joints):
@@ -330,11 +339,18 @@ class Listening:
         return [note]
 
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
-        """Yield possible corrections of θ (N, D), each with its fault and joints.
+        """Yield the postures that would be right if the joint sensors had a certain fault.
 
-        No correction reverses the sign of a single joint that did not move, or exchanges such a
-        joint with another one, because too many corrections would fit an arm at rest. If several
-        joints moved, one correction reverses the signs of all joints.
+        The faults are degrees instead of radians, the reversed sign of one joint or of all joints,
+        and two exchanged joints. Reversed and exchanged joints are considered only if the joints
+        moved, because too many of these faults could explain the lengths of an arm at rest.
+
+        Args:
+            theta: The published θ, (N, D).
+
+        Yields:
+            The name of the fault, the names of the affected joints, and the corrected θ [rad],
+            (N, D).
         """
         robot, radian = self._robot, self._robot.kinematics.radian
         joints = range(robot.joint_count)
@@ -356,10 +372,16 @@ class Listening:
             yield 'joint order', [robot.joints[j], robot.joints[k]], exchanged
 
     def _are_turned(self, length: Array, model: Array, moved: Bools) -> bool:
-        """Return whether l (N, M) of all muscles fit the model, (N, M), with the opposite sign.
+        """Return whether the driver publishes the lengths of all muscles with the wrong sign.
 
-        On a moved arm, l of those that `moved` must change in the opposite direction. On an arm at
-        rest, all l must fit with the opposite sign, and several must not fit as they are.
+        If the arm was moved, this is the case if all lengths that should have changed have changed
+        in the opposite direction. At rest, it is the case if all lengths fit the model with the
+        opposite sign, and several do not fit as they are.
+
+        Args:
+            length: Published l [m], (N, M).
+            model: Lengths of the geometric model [m], (N, M).
+            moved: Which muscles should have changed their lengths noticeably, (M,).
         """
         if moved.any():
             slopes = [np.polyfit(model[:, m], length[:, m], 1)[0] for m in np.flatnonzero(moved)]
@@ -380,8 +402,9 @@ class Listening:
             tension: T [N], (N, M).
 
         Returns:
-            The sum over muscles of the misfit [m] that remains after the best exchange of columns
-            or reversal of signs of l; ∞ if θ is beyond the joint limits.
+            The differences between l and the model [m], summed over the muscles, after exchanging
+            the columns of l or reversing their signs such that they fit best. ∞ if θ is beyond the
+            joint limits.
         """
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)
@@ -456,10 +479,15 @@ class Listening:
 
 
 def _readings(states: Array) -> Iterator[tuple[str, dict[str, str], Array]]:
-    """Yield interpretations of l, T, temperature (3, M), from the literal one to the least likely.
+    """Yield interpretations of a message's values, from the literal one to the least likely.
 
-    Each comes with its fault ('' for none) and the values for the texts of the fault. The literal
-    interpretation comes again at the end, so that impossible values are reported as published.
+    Each interpretation is a tuple: the name of the driver fault that would explain it ('' for
+    none), the values for the texts about this fault, and the values of l, T and temperature,
+    (3, M), that the driver should have published. If no interpretation gives possible values, the
+    last one is the literal one again, so that the values are reported as they were published.
+
+    Args:
+        states: The published values, (3, M).
     """
     yield '', {}, states
     yield 'kelvin', {}, states - np.array([[0.0], [0.0], [273.15]])

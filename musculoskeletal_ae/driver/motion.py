@@ -37,7 +37,7 @@ class RunAwayError(Exception):
     """A muscle runs away and must be released."""
 
     def __init__(self, muscle: int, fault: str, **values: object) -> None:
-        """Take the arguments of `Verdict.failed` that describe the fault."""
+        """Store the arguments for `Verdict.failed`: the muscle, the fault, and its values."""
         super().__init__(fault)
         self.muscle, self.fault, self.values = muscle, fault, values
 
@@ -71,7 +71,9 @@ class MotionTest(ABC):
         return 'hold' if self._tested is None else self._robot.muscles[self._tested]
 
     def step(self, states: Array, now: float, theta: Array | None = None) -> Array | None:
-        """Take the newest readings; return l_target [m] (M,), or None for no command.
+        """Continue the test with the newest readings, and return the next command.
+
+        The command is l_target [m], (M,), or None if nothing is to be published.
 
         Args:
             states: l [m], T [N] and temperature [°C], (3, M).
@@ -92,7 +94,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _command(self, length: Array) -> Array:
-        """Return the command [m] (M,) for the present targets at l [m], both (M,)."""
+        """Return the command [m], (M,), for the present targets at the measured l [m], (M,)."""
 
     @abstractmethod
     def _hold(self) -> Wait:
@@ -113,7 +115,10 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _release(self, m: int) -> Wait:
-        """Pay out muscle m, which has run away, for RELEASE or less; or all muscles instead."""
+        """Pay out muscle m, which has run away, within RELEASE seconds.
+
+        A test may pay out all muscles instead.
+        """
 
     # -- common parts ---------------------------------------------------------------------------
 
@@ -181,7 +186,7 @@ class MotionTest(ABC):
         return int(is_wild.argmax()) if is_wild.any() else None
 
     def _readings(self) -> Array:
-        """Return l [m], T [N] and temperature [°C] of the messages of the last MEAN, (N, 3, M)."""
+        """Return l [m], T [N] and temperature [°C] of the last MEAN seconds, (N, 3, M)."""
         return np.array([states for _, states in self._recent])
 
     def _noise(self) -> Array:
@@ -189,7 +194,10 @@ class MotionTest(ABC):
         return np.std(self._readings()[:, 1], axis=0)
 
     def _go(self, m: int, goal: float) -> Wait:
-        """Move the target of muscle m to `goal` [m] at RELEASE_SPEED, and wait for RELEASE."""
+        """Move the target of muscle m to `goal` [m], then wait until the muscle has settled.
+
+        The speed is RELEASE_SPEED, and the wait takes RELEASE seconds.
+        """
         last = self._now
         while self._target[m] != goal:
             yield from self._wait(1e-9)

@@ -35,7 +35,7 @@ class Pace:
     """Collects the times of one driver's messages and checks its rate."""
 
     def __init__(self, rate: float) -> None:
-        """Expect messages at a rate [Hz]."""
+        """Prepare to check that messages arrive at a rate [Hz]."""
         self._rate = rate
         self._messages: list[_Message] = []
         self._awake = AwakeClock(LONGEST_TICK)

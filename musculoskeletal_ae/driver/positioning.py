@@ -54,8 +54,8 @@ class Positioning(MotionTest):
         Args:
             verdict: Receives the results.
             muscles: Indices of the muscles to test. Without any, all muscles are tested.
-            highest: Tension at which a muscle is wound in no further [N]; None: ABOVE_BIAS above
-                T_bias, but at most tension.limit.
+            highest: Tension at which winding in a muscle ends [N]. None for a tension of ABOVE_BIAS
+                above T_bias, but at most tension.limit.
 
         Raises:
             MusculoskeletalError: If `highest` is above a muscle's tension.limit.

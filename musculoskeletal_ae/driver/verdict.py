@@ -86,24 +86,25 @@ class Verdict:
 
     @property
     def allows_motion(self) -> bool:
-        """Whether the motion test may begin: not after any fault.
+        """Whether the motion test may begin, which requires that no fault was found.
 
-        One fault can hide behind another one. For example, lengths of wrong sign can look like
-        lengths with wrong zeros.
+        Even a harmless fault forbids motion, because it may be mistaken for a dangerous one. For
+        example, lengths of wrong sign can look like lengths with wrong zeros.
         """
         return not self.faults
 
     @property
     def wrong(self) -> set[str]:
-        """Those of CHECKS that found a fault."""
+        """Names of the checks that found a fault; a subset of CHECKS."""
         return {fault.check for fault in self.faults}
 
     @property
     def conclusion(self) -> str:
         """The last line of the report.
 
-        Only if each check was possible for every muscle, it says that the driver keeps its
-        contract. Otherwise it names the checks that were not possible.
+        If faults were found, it says that the check has failed. If every check was possible for
+        every muscle, it says that the driver keeps its contract. Otherwise it names the checks
+        that were not possible.
         """
         if self.faults:
             return 'driver check FAILED: fix the faults above'

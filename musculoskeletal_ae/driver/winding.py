@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the response of a driver to commands by winding in each muscle a little, one at a time.
 
-At first every l_target is the current l, which must give T_bias. Then, for each muscle, the target
-steps inwards until the MSC law
+The modules must obey the law of muscle stiffness control (MSC), with the stiffness K. At first,
+every l_target is the current l, at which T must be T_bias. Then, for each muscle, the target steps
+inwards until the law
 
     T = min(T_max, T_bias + max(0, K (l − l_target)))
 
 demands a low tension at the measured l. The target then returns, and moves beyond l, where T must
 stay at T_bias.
 
-Signs and order of commands are unknown before the test. Until a muscle has passed it, the muscle
+Signs and order of commands are unknown before the test. Until a muscle has passed the test, it
 never gets a target for which the law would demand more than the highest test tension at the
-measured l. While the arm is held, before the first muscle is tested, the law demands only a part of
-this tension (HELD), and all muscles are released as soon as one measures more than a larger part
-(ALARM).
+measured l. Before the first muscle is tested, the arm is held. In this phase, the law demands at
+most the fraction HELD of the test tension, and all muscles are released as soon as a tension
+exceeds the fraction ALARM. Both fractions refer to the range from T_bias to the highest test
+tension.
 
-The law multiplies an error of l (LENGTH_ERROR) by K. If K exceeds 50 kN/m, the resulting error of T
-exceeds TENSION_TOLERANCE. This error then replaces the tolerance, and the detection thresholds and
-the default of the demanded tensions grow in proportion to it.
+An error of l (LENGTH_ERROR) becomes an error of T, which is K times as large. If K exceeds 50 kN/m,
+this error of T exceeds TENSION_TOLERANCE and replaces the tolerance. The detection thresholds and
+the default of the demanded tensions then grow in the same proportion.
 """
 
 from collections.abc import Generator, Sequence
@@ -69,12 +71,12 @@ MOST_BEYOND = 0.3  # highest demand beyond tension.max, relative to tension.max
 
 
 class _Reading(NamedTuple):
-    """Mean values over MEAN, each (M,), and the demand of the law."""
+    """Values that are averaged over MEAN seconds, (M,) each."""
 
     length: Array
     tension: Array
     third: Array  # third row of the message, the temperatures
-    demand: Array
+    demand: Array  # tension that the law demands, at most tension.max
 
 
 class Winding(MotionTest):
@@ -88,10 +90,11 @@ class Winding(MotionTest):
         Args:
             verdict: Receives the results.
             muscles: Indices of the muscles to test. Without any, all muscles are tested.
-            highest: Highest demanded tension [N]; None: ABOVE_BIAS above T_bias (more if K is
-                large), but at most tension.max. If more than T_bias is demanded before the test of
-                a muscle, the highest demand is larger by the excess. If `highest` reaches
-                tension.max, a last step demands more, to check that T stays at tension.max.
+            highest: Highest tension that is demanded of a muscle that starts at T_bias [N]. If the
+                muscle carries more tension at the start, its highest demand is larger by the
+                difference. If `highest` is at least tension.max, a last step demands more, to check
+                that T stays at tension.max. None for ABOVE_BIAS above T_bias (more if K is large),
+                but at most tension.max.
 
         Raises:
             MusculoskeletalError: If the response to `highest` could not be distinguished from
@@ -195,7 +198,7 @@ class Winding(MotionTest):
             yield
 
     def _ceiling(self) -> Array:
-        """Return the highest tension [N] (M,) that may be demanded of a muscle not yet tested."""
+        """Return the highest tension [N], (M,), to demand of muscles that are not yet verified."""
         highest = self._most
         if self._tested is None:
             highest = self._bias + HELD * (self._highest - self._bias)
@@ -203,7 +206,10 @@ class Winding(MotionTest):
         return highest + 2.0 * LENGTH_ERROR * self._robot.stiffness
 
     def _command(self, length: Array) -> Array:
-        """Return the targets, but none that demands too much of a muscle not yet tested."""
+        """Return the targets, limited for muscles that have not passed the test yet.
+
+        At the measured l, `length` [m], (M,), no target then demands more than `_ceiling`.
+        """
         nearest = length - (self._ceiling() - self._bias) / self._robot.stiffness
         most_inwards = np.where(self._is_verified | self._is_searched, -np.inf, nearest)
         self._sent = np.maximum(self._target, most_inwards)
@@ -359,13 +365,13 @@ class Winding(MotionTest):
         return None
 
     def _ask_outwards(self, m: int, home: _Reading, pulled: Array, wound: Array) -> Wait:
-        """Find out why a muscle did not respond, and record the fault.
+        """Find out why a muscle did not respond to winding in, and record the fault.
 
         Args:
             m: The muscle.
             home: The reading before the test.
-            pulled: Rise of T of all muscles [N], (M,).
-            wound: Fall of l of all muscles [m], (M,).
+            pulled: Increase of T of all muscles when muscle m was wound in [N], (M,).
+            wound: Decrease of l of all muscles when muscle m was wound in [m], (M,).
         """
         other = int(np.where(wound > RESPONSE[1], pulled, -np.inf).argmax())
         yield from self._go(m, home.length[m])
