@@ -110,9 +110,9 @@ class Frames:
 
 
 class Arm(Shell):
-    """A node that takes the place of an arm.
+    """Base class of nodes that replace a real arm: they obey its commands and publish its state.
 
-    Like real muscle modules, it follows commands even while several nodes publish them.
+    Like real muscle modules, such a node obeys commands even while several nodes publish them.
     """
 
     accepted_from_all = COMMANDS
@@ -177,7 +177,7 @@ class Arm(Shell):
         Args:
             theta: θ [rad], (D,).
             length: l [m], (M,).
-            tension: T_read [N], (M,).
+            tension: Tensions as the sensors of the muscle modules read them [N], (M,).
             temperature: Temperatures of the muscle modules [°C], (M,).
         """
         tension = self.robot.tension_source.to_message(tension)

@@ -56,10 +56,13 @@ class Candidates:
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def on_anomaly(self, detected: bool) -> None:
-        """Handle the beginning or the end of an anomaly.
+        """Discard waiting candidates when an anomaly begins, and replace a doubtful network.
 
-        A network that was accepted shortly before the anomaly may be its cause, and is replaced by
+        A network that was accepted shortly before the anomaly may be its cause. It is replaced by
         the newest network that was in use long enough without an anomaly.
+
+        Args:
+            detected: Whether an anomaly has begun; False if one has ended.
         """
         if detected and self.validator.mae is not None:
             self.queue.give_up()

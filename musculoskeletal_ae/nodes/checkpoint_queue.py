@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handles checkpoints from a topic in small steps, between which the node publishes on time."""
+"""Processes the checkpoints of a topic in small steps, so that they do not block the node."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -19,7 +19,10 @@ LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical checkpoint
 
 
 class CheckpointQueue:
-    """Handles one checkpoint at a time, then the newest of those that have arrived meanwhile."""
+    """Processes one checkpoint after the other, in small steps.
+
+    Of the checkpoints that arrive meanwhile, only the newest one is processed.
+    """
 
     def __init__(
         self,
@@ -35,10 +38,11 @@ class CheckpointQueue:
             node: Node whose timer runs the steps.
             reception: Counts the checkpoints that were used and rejected.
             topic: Topic of the checkpoints.
-            handle: Returns an iterator over the steps of handling one checkpoint. A step raises a
+            handle: Returns an iterator over the steps of processing one checkpoint. A step raises a
                 MusculoskeletalError to reject the checkpoint; the last step puts it to use.
-            unfit: Called with the reason if a checkpoint is unusable (CheckpointError). A network
-                that does not explain the arm (GateError) is only rejected.
+            unfit: Called with the reason if a checkpoint is rejected because it cannot be used at
+                all (CheckpointError). It is not called for a usable network that has failed the
+                validation (GateError).
         """
         self._reception, self._topic = reception, topic
         self._handle, self._unfit = handle, unfit
@@ -50,13 +54,13 @@ class CheckpointQueue:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a checkpoint is being handled or waits."""
+        """Whether a checkpoint is being processed or waits to be processed."""
         return self._steps is not None or self._next is not None
 
     def propose(self, message: UInt8MultiArray) -> None:
-        """Keep a checkpoint until the present one has been handled, then handle it.
+        """Process a checkpoint as soon as the present one has been processed.
 
-        A checkpoint that was still waiting is dropped.
+        An earlier checkpoint that was still waiting is discarded.
 
         Raises:
             CheckpointError: If the message is too large to be a network.
@@ -69,7 +73,7 @@ class CheckpointQueue:
             self._timer.reset()
 
     def give_up(self) -> None:
-        """Drop the checkpoint that is being handled, and the one that waits."""
+        """Discard the checkpoint that is being processed, and the one that waits."""
         self._steps = self._next = None
         self._timer.cancel()
 

@@ -237,7 +237,11 @@ class Controller(Shell):
             self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
 
     def _state(self) -> JointTrajectory:
-        """Return the desired state, the estimated posture and the error, as three points."""
+        """Return the message of `controller_state`.
+
+        It has three points: the desired state, the estimated posture, and the difference of the
+        two.
+        """
         progress = self.core.activities.follower.progress
         desired, names = progress.desired, ('positions', 'velocities', 'accelerations')
         parts = {name: part.tolist() for name, part in zip(names, desired, strict=True)}

@@ -64,9 +64,10 @@ class _Group(NamedTuple):
 class LeanExecutor(SingleThreadedExecutor):
     """Runs the callbacks of timers, subscriptions, services and clients with little overhead.
 
-    rclpy handles everything else in a *full round*. Changes of entities, unfinished asynchronous
-    callbacks, other tasks and actions trigger a full round immediately. QoS events are handled in
-    the next full round, which begins at most a second later.
+    All other work is left to the slower code of rclpy, which runs from time to time in a *full
+    round*. Changes of entities, unfinished asynchronous callbacks, other tasks and actions trigger
+    a full round immediately. QoS events wait for the next full round, which begins at most a second
+    later.
     """
 
     def __init__(self, *, context: Context | None = None) -> None:
@@ -103,7 +104,10 @@ class LeanExecutor(SingleThreadedExecutor):
         return super().create_task(callback, *args, **kwargs)
 
     def spin(self) -> None:
-        """Run callbacks until shutdown, with this class's `spin_once` in every version of rclpy."""
+        """Run callbacks until shutdown.
+
+        Some versions of rclpy would not call this class's `spin_once` for this.
+        """
         while self.context.ok() and not self._is_shutdown:
             self.spin_once()
 

@@ -15,10 +15,11 @@ NAME = 'follow_joint_trajectory'
 
 
 class LateServer(ActionServer):
-    """An action server that runs no task while a goal is active.
+    """An action server whose goals are active without a running callback.
 
-    rclpy's server runs `execute_callback` from the start of a goal to its end. This server starts a
-    goal without a callback; a later call of `notify_execute` with a callback ends the goal.
+    rclpy's server runs `execute_callback` from the start of a goal to its end, which occupies the
+    executor. This server runs nothing when a goal starts. To end the goal, its owner later calls
+    `notify_execute` with a callback.
     """
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:

@@ -85,8 +85,8 @@ class Learner(Shell):
 
         With `fresh`, the saved state is first discarded; a backup of it is kept.
 
-        `relearn_muscles` is checked but not obeyed: a parameter file that sets it would otherwise
-        cause the muscles to be relearned at every start.
+        The names in `relearn_muscles` are checked, but no muscle is relearned at the start. A
+        parameter file that sets `relearn_muscles` would otherwise cause this at every start.
         """
         if self.parameter('fresh'):
             self.core.replace(None)
@@ -100,7 +100,11 @@ class Learner(Shell):
             self.robot.muscle_indices(self.parameter('relearn_muscles'))
 
     def _afresh(self, value: bool) -> Mae | None:
-        """Return the network from which to start again; None if the value is false."""
+        """Prepare a new value of the parameter `fresh`.
+
+        If it is true, return the network of the parameter `checkpoint`, from which learning starts
+        again. If it is false, return None: nothing is to be done.
+        """
         if not value:
             return None
         path = self.parameter('checkpoint')
@@ -160,7 +164,7 @@ class Learner(Shell):
         self.core.reset()
 
     def on_intruders(self, _: str) -> None:
-        """Check the publishers of `imu`."""
+        """Check, ten times a second, whether too many nodes publish `imu`."""
         publishers = publishers_of(self, self.full_name(IMU))
         self.accelerometers.look(publishers, time.monotonic())
 

@@ -65,17 +65,19 @@ class NodeParameters:
     ) -> None:
         """Call `setter` with the value of a parameter now, and whenever the parameter is set.
 
-        If one parameter of a request is refused, the setters that were already called for this
-        request are called again with the previous values. A setter whose effect cannot be undone in
-        this way needs `prepare`. Setters with `prepare` are called after all setters without it, in
-        the order of registration. Of these, a setter that several parameters share is called only
-        once. Only the first of the setters with `prepare` may raise an error.
+        A request may set several parameters. If one of them is refused, the setters that were
+        already called for this request are called again with the previous values.
+
+        A setter whose effect cannot be undone in this way needs a function `prepare`, which checks
+        the value beforehand. Such setters are called last, in the order of registration. Only the
+        first one of them may still raise an error. If several parameters of a request share such a
+        setter, it is called once, with the value of the last of these parameters.
 
         Args:
             name: Name of the parameter.
             setter: Uses the value it is called with, or raises a MusculoskeletalError to refuse it.
-            prepare: Converts the value for `setter`, or returns None if there is nothing to do;
-                raises a MusculoskeletalError to refuse it.
+            prepare: Converts the value for `setter`, or raises a MusculoskeletalError to refuse it.
+                If it returns None, `setter` is not called.
         """
         self.on_change(name, setter, prepare)
         self._take({name: self._held(name)})

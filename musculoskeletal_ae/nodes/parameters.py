@@ -202,15 +202,15 @@ OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
 
 def check_names(names: Iterable[str], node: str = '') -> None:
-    """Check that some node has a parameter of each name.
+    """Check that parameters with the given names exist.
 
     Args:
         names: Names of parameters.
         node: Node or executable to which the parameters are passed; '' for all nodes, as in a file.
 
     Raises:
-        MusculoskeletalError: If no node has a parameter of a name, or if only one node has it, and
-            this is not `node`.
+        MusculoskeletalError: If no node has a parameter of some name. Also if exactly one node has
+            it, and this node is not the one to which it is passed.
     """
     own = COMBINED.get(node, (node,) if node else ())
     every = [*OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]

@@ -85,7 +85,7 @@ class ProgressWatch:
         self._thread.start()
 
     def note(self) -> None:
-        """Note that there is progress."""
+        """Record that the main thread makes progress."""
         self._quiet = 0.0
 
     def stop(self) -> None:
@@ -116,7 +116,10 @@ class ProgressWatch:
 
 
 def _is_patient() -> bool:
-    """Return whether the main thread is in one of SLOW_MODULES."""
+    """Return whether the main thread runs a debugger or compiler, which may take long.
+
+    These are the modules in SLOW_MODULES.
+    """
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:
         if frame.f_globals.get('__name__', '').partition('.')[0] in SLOW_MODULES:

@@ -78,7 +78,11 @@ class Record(Node):
         self._incompatible[name] = event.last_policy_kind
 
     def _look_after(self) -> None:
-        """Write to disk; resubscribe with the QoS of publishers that offer less than requested."""
+        """Write received messages to disk, count lost messages, and repair subscriptions.
+
+        If a publisher offers a weaker QoS than the subscription requests, the subscription receives
+        none of its messages. It is then replaced by a subscription with the weaker QoS.
+        """
         self.writer.flush()
         self.count_losses()
         incompatible, self._incompatible = self._incompatible, {}
@@ -111,7 +115,10 @@ class Record(Node):
         )
 
     def missing(self) -> list[str]:
-        """Return a text for each topic without messages, which says whether it has a publisher."""
+        """Return one text for each topic on which no message has been recorded.
+
+        The text says whether the topic has a publisher.
+        """
         silent = [
             each.topic_name
             for each in self._subscriptions_of.values()
@@ -144,8 +151,8 @@ class Record(Node):
     def _offered(self, name: str, topic: Topic) -> list[Qos]:
         """Return the durability and reliability that the publishers of a topic offer.
 
-        If the graph shows no publisher, the QoS of the interface is returned. The graph does not
-        show queue depths, so each of them is a default.
+        If the ROS graph shows no publisher, the QoS is the one that the interface of this package
+        prescribes for the topic. The graph does not show queue depths, so they have a default.
         """
         offered = [
             offered_qos(

@@ -123,7 +123,7 @@ class Replay(Node):
                 self._publisher[message.topic].publish(message.data)
 
     def acknowledge(self) -> None:
-        """Report the end; wait until reliable readers have acknowledged the last messages."""
+        """Report the end, and wait until reliable subscribers have received the last messages."""
         values = {'position': self._position(), 'state': END_OF_RECORDING}
         self._diagnostics.tell(Report('ok', 'end of the recording', values), {})
         end = time.monotonic() + ACKNOWLEDGE_TIME

@@ -396,7 +396,8 @@ class Shell(Node):
 
         Args:
             kind: Message type.
-            topic: Name of the topic; `full_name` returns where its messages come from.
+            topic: Name of the topic in the interface of this package. On a ros2_control robot, the
+                messages may come from another topic (`full_name`).
             callback: Uses the message it is called with, or raises a MusculoskeletalError to
                 refuse it.
             qos: Quality of service; LATCHED topics can be resubscribed to.
@@ -491,12 +492,15 @@ class Shell(Node):
         self.listen(kind, STATES, take, SENSOR)
 
     def follow_offsets(self, changed: Callable[[], object]) -> None:
-        """Keep the estimator's length offsets in `body`; call `changed` when they change.
+        """Update `body` with the estimator's length offsets; call `changed` after each update.
 
-        If the estimator publishes known offsets and then other known offsets, it has restarted and
-        has lost the result of its last calibration. The offsets in `body` then count as unknown
-        until the estimator has calibrated again. The same offsets count as a change only if a
-        standard deviation has grown, because the estimator has then checked them after a repair.
+        Offsets that the estimator has determined are *known*. A calibration makes them unknown
+        before it changes them. If known offsets change to other known offsets at once, the
+        estimator has restarted and has lost the result of its last calibration. The offsets in
+        `body` are then unknown until the estimator has calibrated again.
+
+        If known offsets are published again without a change, nothing happens, unless a standard
+        deviation has grown: the estimator has then checked the offsets after a repair.
         """
         previous = LengthOffsets.unknown(self.robot.muscle_count)
 
@@ -521,7 +525,7 @@ class Shell(Node):
         self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
 
     def follow_isolated(self, changed: Callable[[], object]) -> None:
-        """Keep the estimator's isolated muscles in `body`; call `changed` after each message."""
+        """Update `body` with the estimator's isolated muscles; call `changed` after each update."""
 
         def take(message: String) -> None:
             muscles = self.robot.muscle_indices(read_names(message))

@@ -101,7 +101,7 @@ class Sim(Arm):
         return draw_arm(self.robot, self.arm.state.theta[0], self.arm.state.tension[0])
 
     def clock_jumped_back(self) -> None:
-        """Count the elapsed time from now on; the simulated arm keeps its state."""
+        """Continue the simulation from the new time, with an unchanged state of the arm."""
         self.ticked = self.get_clock().now()
 
     def report(self) -> Report:

@@ -57,12 +57,14 @@ STANDING_STILL = Activity.IDLE, Activity.HOLDING, Activity.MOVING, Activity.TORQ
 
 
 def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
-    """Return the estimation error and A as text; for NaN, the text names the missing topic.
+    """Return the estimation error and the anomaly measure A as text.
+
+    For an unknown value, the text names the topic on which messages are missing.
 
     Args:
-        measured: Whether θ is measured.
-        error: Estimation error [`unit`]; NaN where it is unknown.
-        anomaly: A; NaN where it is unknown.
+        measured: Whether joint sensors measure θ.
+        error: Estimation error in the unit `unit`; NaN if it is unknown.
+        anomaly: A; NaN if it is unknown.
         unit: Unit of the error.
     """
     joints = 'estimated_joint_states' if measured else 'joint_states'
@@ -234,11 +236,11 @@ class Situation:
 
     @property
     def _has_consequences(self) -> bool:
-        """Whether a present anomaly explains `stops.CONSEQUENCES`, which then need no steps.
+        """Whether other stop causes, those in `stops.CONSEQUENCES`, are caused by an anomaly.
 
-        If an anomaly has already ended during this stop, the present one shows that its remedy has
-        not helped. The steps of all causes are advised then, because the anomaly may itself be the
-        consequence of another cause.
+        Users then need no steps against these other causes. The result is False if an earlier
+        anomaly has already ended during this stop: its remedy has not helped, and the anomaly may
+        itself be the consequence of another cause.
         """
         return (
             self.detected
@@ -338,8 +340,9 @@ class Situation:
     def _body(self) -> list[Trouble]:
         """Return the parts of the status line about isolated muscles and length offsets.
 
-        A restarted estimator starts from the offsets of its first start, which may be wrong. The
-        controller then treats them as unknown, although the estimator reports none as unknown.
+        Length offsets are unknown if the estimator or the controller reports them as unknown. Only
+        the controller does so after a restart of the estimator: the estimator then uses the offsets
+        with which it starts every time, and these may be wrong.
         """
         values, troubles = self._values('estimator'), []
         if isolated := self._isolated():
@@ -366,8 +369,8 @@ class Situation:
     def _isolated(self) -> str:
         """Return a text on the isolated muscles, or ''.
 
-        It states how to use them again. These steps are not part of `steps`, because the arm goes
-        on without the muscles. The text leaves out a suspect that is being verified.
+        The text states how to use these muscles again. These steps are not part of `steps`, because
+        the arm also works without the muscles. A suspect that is being verified is not mentioned.
         """
         values = self._values('estimator')
         names = values.get('isolated muscles', '')
@@ -387,9 +390,10 @@ class Situation:
 
     @property
     def _stands_still(self) -> bool:
-        """Whether the controller is neither stopped nor exploring.
+        """Whether the arm does not move as long as length offsets are unknown.
 
-        In these modes, even in `moving`, the arm stands still while length offsets are unknown.
+        This is so in those modes of the controller in which the arm is neither stopped nor
+        exploring, nor guided by hand. Even in the mode `moving`, it then waits for the offsets.
         """
         mode = self._values('controller').get('mode')
         return mode in [activity.value for activity in STANDING_STILL]

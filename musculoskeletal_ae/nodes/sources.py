@@ -80,9 +80,9 @@ class Authorship:
 
     Attributes:
         intruders: The publishing nodes if there are several, as `/a and /b`; else ''.
-        is_certain: False while the graph does not know the node of one of several publishers, which
-            it discovered less than NAMING ago. Meanwhile, latched messages are rejected, and are
-            requested again later.
+        is_certain: False while the topic has several publishers, and one of them was discovered
+            less than NAMING seconds ago without the name of its node. Until the name is known,
+            latched messages are rejected, and are requested again later.
     """
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class Authorship:
         self._turns: deque[int] = deque([0], maxlen=LOOKS)
 
     def look(self, publishers: Iterable[Publisher], turns: int, now: float) -> None:
-        """Process a check of the graph.
+        """Update `intruders` and `is_certain` from the publishers that the ROS graph shows.
 
         Args:
             publishers: Publishers of the topic.
@@ -150,18 +150,19 @@ class Twins:
             self._heard_at = now
 
     def is_alone(self, now: float) -> bool:
-        """Whether no other node has reported under this name for TWIN_SILENCE."""
+        """Whether no other node has reported under this name in the last TWIN_SILENCE seconds."""
         return now - self._heard_at > TWIN_SILENCE
 
 
 class LinkSensors:
-    """Detects two publishers that publish the sensor of one link.
+    """Detects that two nodes publish the sensor readings of the same link.
 
-    Each link may have one sensor, and each sensor a publisher of its own, so a topic may have as
-    many publishers as there are links whose messages arrive.
+    All sensors of this kind share a topic, and each message names its link. Each link may have one
+    sensor, and each sensor may have its own publisher. The topic must therefore not have more
+    publishers than there are links of which messages arrive.
 
     Attributes:
-        problem: The publishers if there are more of them than links; else ''.
+        problem: A text about the publishers if there are too many of them, else ''.
     """
 
     def __init__(self) -> None:
@@ -170,11 +171,11 @@ class LinkSensors:
         self._too_many_since = math.inf  # [s]
 
     def take(self, link: str, now: float) -> None:
-        """Note a message of a link that arrived at `now` [s]."""
+        """Record that a message about a link arrived at `now` [s]."""
         self._heard_at[link] = now
 
     def look(self, publishers: Iterable[Publisher], now: float) -> None:
-        """Process a check of the graph at `now` [s]."""
+        """Update `problem` from the publishers that the ROS graph shows at `now` [s]."""
         nodes = sorted(each.node for each in publishers)
         links = sorted(link for link, at in self._heard_at.items() if now - at <= LINK_SILENCE)
         self.problem = ''

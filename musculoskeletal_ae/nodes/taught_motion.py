@@ -77,7 +77,7 @@ class _Answers:
                 self.reports.append({value.key: value.value for value in status.values})
 
     def begin(self) -> None:
-        """Forget the reports so far, and ignore the refusals that they count from now on."""
+        """Discard the reports so far; from now on, only refusals that follow are counted."""
         self._refused_before = self._refused
         self.reports.clear()
 

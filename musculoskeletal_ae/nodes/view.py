@@ -300,7 +300,7 @@ class View(Node):
             self._ask('controller/reset', then=note_reset, quiet=True)
 
     def _look(self) -> None:
-        """Offer the controls of running nodes, and request the state of the emulator."""
+        """Show the page's controls of those nodes that run, and request the emulator's state."""
         running = {node for node, name in SIGNS.items() if self.clients_of[name].service_is_ready()}
         if any(push.get_subscription_count() for push in self.pushes):
             running.add('pushed')
@@ -344,7 +344,12 @@ class View(Node):
             self.pending.append((time.monotonic(), future, answered))
 
     def _do(self, what: str, value: Any = None) -> None:
-        """Handle a request of a visitor."""
+        """Carry out a request of a visitor.
+
+        Args:
+            what: Name of the request, such as 'targets', 'push' or 'reset'.
+            value: What the visitor has entered, depending on the request.
+        """
         match what:
             case 'targets':
                 stamp, theta = self.get_clock().now().to_msg(), np.array([*value.values()])
