@@ -52,7 +52,11 @@ class LengthOffsets:
         return bool((self.deviation >= SUSPECT).any())
 
     def confirmed(self, muscle: int) -> LengthOffsets:
-        """Return the same offsets after a check of one muscle, whose offset is less certain now."""
+        """Return the same offsets after the offset of one muscle was confirmed.
+
+        The standard deviation of this offset grows, because the repair may have changed the offset
+        slightly.
+        """
         deviation = self.deviation.copy()
         deviation[muscle] = min(np.hypot(deviation[muscle], CONFIRMED), 0.9 * KNOWN)
         return LengthOffsets(self.offset, deviation)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tendon friction (Dahl's model), which depends on the direction in which each tendon slid last.
+"""Tendon friction by Dahl's model: the last sliding direction of a tendon changes its tension.
 
     T = T_end e^{μ s},   s ← w + (s − w) e^{−|Δl|/b},   w = −sign Δl
 
 T is the motor-side tension and T_end the bone-side tension. s is 1 after winding in, when T is
-higher than T_end, and −1 after paying out. When a tendon slides by Δl, s approaches w over the
-distance b (REVERSAL), so that friction reverses gradually. The network models the body without
-friction, so its tension is T_end. `Transmission` converts measured values of T to T_end.
+higher than T_end, and −1 after paying out. When a tendon slides by Δl, s approaches the direction w
+over the distance b (REVERSAL), so that friction reverses gradually. The network models the body
+without friction, so its tension is T_end. `Transmission` converts measured values of T to T_end.
 """
 
 from __future__ import annotations
@@ -48,10 +48,13 @@ class Transmission:
 
         T = max(0, e^γ T_read − b − F s),   T_end = T e^{−μ s}
 
+    T is the motor-side tension and T_end the bone-side tension. s is the direction in which the
+    tendon slid last: 1 after winding in, −1 after paying out.
+
     A tension sensor reads T itself. A motor current, converted to T_read [N] by
     `robot.tension_source`, has a scale error γ and an offset b. Part of the current overcomes the
-    friction F of motor and gear, which opposes the motion (s: module docstring). The converted
-    current can be negative, but T cannot, because a tendon does not push.
+    friction F of motor and gear, which opposes the motion. The converted current can be negative,
+    but T cannot, because a tendon does not push.
 
     γ, b and F are uncertain. While the friction reverses (|s| < 1), its direction is uncertain as
     well. The standard deviation σ_T of T follows from both:
@@ -72,7 +75,8 @@ class Transmission:
     def unknown(cls, limit: Array) -> Transmission:
         """Return the transmission of motor currents before anything is learned.
 
-        F is assumed to be 0. The prior mean of F therefore contributes to the uncertainty of F.
+        The conversion uses a friction F of 0, although a larger value is expected. This expected
+        value is therefore part of the uncertainty of F.
 
         Args:
             limit: T_limit [N], (M,).
@@ -119,11 +123,16 @@ class FrictionDirection:
 
         L ← L + g e,   g = (a + k) / (1 + k),   k = (ē / NOISE)⁴,   e = l − L
 
-    L is an adaptive average of l, ē the running mean of e, and a = LATEST. While a tendon rests,
-    the gain g is low and noise is averaged. While it slides, g rises, and L follows without the
-    delay of a low-pass filter. A tendon counts as sliding only when L leaves a dead band of
-    ±NOISE √(g / (2 − g)), because the remaining noise of L would otherwise add up. Readings are
-    limited to SPIKE outside the range of the last two, which reduces the effect of outliers.
+    L is a smoothed length, which follows the measured length l. ē is the running mean of the
+    deviations e, in which the newest deviation has the weight a = LATEST. While a tendon rests, the
+    gain g is low, and noise is averaged. While it slides, g rises, and L follows l without the
+    delay of a low-pass filter.
+
+    The remaining noise of L must not count as sliding. A tendon therefore counts as sliding only
+    when L leaves a dead band of ±NOISE √(g / (2 − g)) [m], which then moves with L.
+
+    Outliers have little effect, because each reading is limited to the range of the two readings
+    before it, extended by SPIKE on both sides.
     """
 
     def __init__(self) -> None:

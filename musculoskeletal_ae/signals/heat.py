@@ -99,9 +99,10 @@ class Heat:
         return np.where(self._known, self._state[0] + self._state[1], np.nan)
 
     def accept(self, *muscles: int) -> None:
-        """Accept the changed κ and τ₂ of these muscles' modules as the new reference.
+        """Accept the changed thermal constants of some modules as the new reference.
 
-        Modules that are not in `changed` keep their reference.
+        Args:
+            muscles: Indices of the muscles. Those that are not in `changed` keep their reference.
         """
         for m in self.changed.keys() & muscles:
             self._reference[:, m] = self._state[[2, 4], m]
@@ -117,8 +118,8 @@ class Heat:
             highest: The temperature limit of the windings [°C].
 
         Returns:
-            The tensions [N] that can be held for HELD, and the tensions [N] that can be held for
-            MOMENT, (M,) each.
+            The tensions [N] that can be held for HELD seconds, and the tensions [N] that can be
+            held for MOMENT seconds, (M,) each.
         """
         if highest in self._limits:
             return self._limits[highest]
@@ -203,11 +204,11 @@ class Heat:
         }
 
     def _look_ahead(self) -> list[tuple[Array, Array]]:
-        """Predict the winding temperatures after HELD and after MOMENT.
+        """Predict the winding temperatures after HELD and after MOMENT seconds.
 
         Returns:
-            Two pairs, for HELD and for MOMENT: c₁ without tension [°C], and the increase of c₁ per
-            T² [K/N²], (M,) each.
+            Two pairs, for HELD and for MOMENT: the winding temperature without tension [°C], and
+            its increase per squared tension [K/N²], (M,) each.
         """
         squares = np.array([0.0, 1.0])[:, None] * self._tension.limit**2
         state = np.repeat(self._state[:, None], 2, axis=1)

@@ -156,14 +156,14 @@ def stuck_sensors(
 
 
 class _Hypothesis(NamedTuple):
-    """An interpretation of the measured angles."""
+    """An assumption about a fault of the joint sensors, and the angles that follow from it."""
 
     fault: JointFault | None  # the fault that is assumed; None if the angles are taken as they are
     theta: Array  # θ [rad], (N, D), corrected for this fault
 
 
 class _Signs(NamedTuple):
-    """Signs of the joints, each (D,)."""
+    """Signs that the measured angles should have according to the muscle lengths, (D,) each."""
 
     sign: Array  # factor by which θ must be multiplied, 1 or −1
     is_known: Bools  # whether the lengths show the sign
@@ -190,9 +190,10 @@ class _Lengths:
         return centred
 
     def misfit(self, theta: Array) -> float:
-        """Return the root mean square of l − l̂(θ) [m], or ∞ if θ is beyond the joint limits.
+        """Return the root mean square of measured minus modelled lengths [m] at θ (N, D).
 
-        The mean of the differences in each segment is subtracted first.
+        The mean of the differences in each segment is subtracted first. The result is ∞ if θ is
+        beyond the joint limits.
         """
         robot = self.robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta)
@@ -207,7 +208,7 @@ class _Lengths:
         return is_enough
 
     def signs(self, theta: Array) -> _Signs:
-        """Return the signs of θ (N, D) with which the lengths agree."""
+        """Return the signs that θ (N, D) must have to agree with the muscle lengths."""
         sign, known = np.ones(theta.shape[1]), np.zeros(theta.shape[1], dtype=bool)
         for _ in range(theta.shape[1]):
             scale, error = self._scales(theta * sign)
@@ -221,7 +222,11 @@ class _Lengths:
         return _Signs(sign, known & (scale > 0.0))
 
     def _scales(self, theta: Array) -> tuple[Array, Array]:
-        """Return a_j of all joints and their standard errors, both (D,); 0 and ∞ if unknown."""
+        """Return the factors a_j of the module docstring, and their standard errors, (D,) each.
+
+        a_j is about 1 if the angle of joint j agrees with the muscle lengths, and about −1 if its
+        sign is wrong. If it cannot be determined, it is 0 with the standard error ∞.
+        """
         scale, deviation = np.zeros(theta.shape[1]), np.full(theta.shape[1], np.inf)
         moved = np.flatnonzero(self.moved(theta))
         muscles = int(self._used.sum())
@@ -258,7 +263,10 @@ def _solve(products: Array, right: Array) -> Array:
 
 
 def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
-    """Yield other interpretations of the measured θ (N, D)."""
+    """Yield the faults of joint sensors that could explain the measured θ (N, D).
+
+    The faults are wrong signs, degrees instead of radians, and two exchanged joints.
+    """
     robot = lengths.robot
     turning = np.flatnonzero(~robot.kinematics.slides).tolist()
     most = BEYOND * robot.kinematics.radian

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rejects messages after a length has jumped, until the new level of the length has lasted.
+"""Rejects messages after a length has jumped, until the length has stayed at its new level.
 
 A length jumps if it changes faster than a muscle can, for example because a module has lost its
 length offset. The change between two messages is compared with the pause between their receptions
@@ -69,12 +69,12 @@ class Jump:
 
     @classmethod
     def begin(cls, muscle_count: int, pause: float) -> Jump:
-        """Return an empty jump after a `pause` [s] of the messages."""
+        """Return a jump without any change; `pause` [s] is the pause before its first message."""
         nothing = np.zeros(muscle_count)
         return cls(nothing, nothing.copy(), nothing.copy(), pause > LIMITS.pause)
 
     def add(self, jumps: Bools, change: Array, allowed: float, pause: float, now: float) -> None:
-        """Add the changes of some muscles.
+        """Add the changes of the muscles whose lengths have changed by too much in one message.
 
         Args:
             jumps: Which muscles have changed by too much, (M,).
@@ -89,20 +89,21 @@ class Jump:
         self.winding[jumps] += LIMITS.step + LIMITS.speed * pause
 
     def remaining(self, used: Bools) -> Bools:
-        """Return which of the muscles `used` are at another level, (M,)."""
+        """Return which muscles in `used` (M,) have not returned to their level before the jump."""
         is_far: Bools = (np.abs(self.change) > self.allowed) & used
         return is_far
 
 
 class PresumedRupture:
-    """Recognizes a jump that the rupture of a tendon explains.
+    """Recognizes jumps of a length that a ruptured tendon may have caused.
 
     A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, the length
-    of this tendon appears to jump as well. If a single tendon is slack and has become shorter, the
-    muscle is therefore not counted as displaced, and the detectors of ruptures decide. This
-    requires that the motor can have wound in so much since the last message. If the tendon pulls
-    again, it has not ruptured. Its module may then have lost its length offset, so the muscle is
-    displaced.
+    of this tendon appears to jump. A rupture is presumed if exactly one tendon is slack and has
+    become shorter, by no more than the motor can have wound in since the last message. The muscle
+    then does not count as displaced, and the detectors of ruptures decide.
+
+    If the tendon pulls again, it has not ruptured. Its module may then have lost its length offset,
+    so the muscle counts as displaced after all.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -113,13 +114,13 @@ class PresumedRupture:
         self._taut_since: Array = np.full(robot.muscle_count, math.inf)
 
     def explains(self, jump: Jump, tension: Array, used: Bools) -> bool:
-        """Return whether a rupture explains a jump; if so, remember the muscle.
+        """Return whether a rupture may have caused a jump; if so, remember the muscle.
 
-        A rupture explains it if a single tendon has jumped, is slack and was wound in.
+        This is the case if a single tendon has jumped, is slack, and may have been wound in.
 
         Args:
             jump: The jump.
-            tension: T_read [N], (M,); NaN where it is unknown.
+            tension: Measured tensions [N], (M,); NaN where they are unknown.
             used: Which muscles are not isolated, (M,).
         """
         muscles = np.flatnonzero(jump.remaining(used))
@@ -148,9 +149,10 @@ class PresumedRupture:
 
 
 class LengthJumps:
-    """Detects jumps between successive messages, and waits for the new level to last.
+    """Detects jumps between successive messages, and waits until the new level has lasted.
 
-    The lengths are those measured, so that new length offsets do not look like jumps.
+    Lengths are compared as they were measured, without subtracting length offsets. A change of the
+    offsets therefore does not look like a jump.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -169,7 +171,7 @@ class LengthJumps:
 
         Args:
             length: Lengths as measured [m], (M,).
-            tension: T_read [N], (M,); NaN where it is unknown.
+            tension: Tensions as measured [N], (M,); NaN where they are unknown.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`MessageDelay`) [s].
@@ -208,7 +210,7 @@ class LengthJumps:
         return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {1e3 * jump.change[muscle]:.0f} mm'
 
     def calibrated(self) -> None:
-        """Take into account that the length offsets have been calibrated."""
+        """Discard presumed ruptures, because the length offsets have been calibrated."""
         self._rupture.forget()
 
 
@@ -235,7 +237,7 @@ class DisplacedMuscles:
             self.is_unseen = verdict.is_unseen
 
     def use_body(self, body: BodyState, is_calibrated: bool) -> None:
-        """Drop isolated muscles, and all muscles if new length offsets have been calibrated."""
+        """Remove isolated muscles, or all muscles if new length offsets have been calibrated."""
         if is_calibrated:
             self.muscles = frozenset()
         self.muscles -= set(body.isolated)

@@ -73,7 +73,10 @@ LENGTH_JUMPED = 'length jumped'
 
 
 def reading_range(robot: Robot) -> tuple[Array, Array]:
-    """Return the lowest and the highest plausible T_read [N] of every muscle, (M,) each."""
+    """Return the lowest and the highest plausible tension reading [N] of every muscle, (M,) each.
+
+    The reading is that of the tension sensor, or the motor current converted to newtons.
+    """
     most, low, high = robot.description.tension.max, LIMITS.lowest_tension, LIMITS.highest_tension
     if robot.tension_source.is_current:
         low, high = LIMITS.lowest_current, LIMITS.highest_current
@@ -139,9 +142,9 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
 class Persistence:
     """Distinguishes a lasting fault from a glitch. Times are of a steady clock [s].
 
-    A fault counts from its first message to its newest one, and at most for half the time
-    `LIMITS.glitch` after that. A pause of this process therefore does not turn a glitch into a
-    lasting fault.
+    A fault lasts from its first message to its newest one. The time since the newest message is
+    added, but at most half of `LIMITS.glitch`. A pause of this process therefore does not turn a
+    glitch into a lasting fault.
     """
 
     def __init__(self) -> None:

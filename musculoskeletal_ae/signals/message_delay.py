@@ -31,7 +31,7 @@ LONGEST_DELAY = 10.0
 
 
 def longer_pause(elapsed: float, delay_before: float, delay: float) -> float:
-    """Return the pause between two messages: that of reception or of sending, the longer one [s].
+    """Return the time between two receptions or between two sendings, whichever is longer [s].
 
     Args:
         elapsed: Time between the receptions [s].

@@ -168,7 +168,7 @@ class MotorInterface:
         return position
 
     def _find(self, names: list[str]) -> Ints:
-        """Return the places of the motors among the names of a message, (M,)."""
+        """Return the index of each muscle's motor in the names of a message, (M,)."""
         places = {name: place for place, name in enumerate(names)}
         if missing := [motor for motor in self._motors if motor not in places]:
             there = ', '.join(names[:20])

@@ -41,9 +41,9 @@ class RejectionError(MessageError):
     Attributes:
         reason: Short text under which the message is counted.
         states: The raw l, T and temperature, (3, M); None if the message had another shape.
-        pull: l [m] with the length offset removed, and T_read [N], (2, M): medians of the last
-            messages, including rejected ones; −∞ where they are implausible. None if there are not
-            enough messages.
+        pull: Lengths [m], with the length offset removed, and measured tensions [N], together
+            (2, M). They are medians of the last messages, including rejected ones; −∞ where they
+            are implausible. None if there are not enough messages.
     """
 
     def __init__(
@@ -111,7 +111,11 @@ class MuscleSample:
 
     @property
     def learned_tension(self) -> Array:
-        """T_read [N], (M,); where it is not known, the tension that models assume."""
+        """Tensions with which the network is learned [N], (M,).
+
+        They are the readings `tension_read`; where these are not known, the tensions that models
+        assume.
+        """
         tension: Array = np.where(np.isnan(self.tension_read), self.bone_tension, self.tension_read)
         return tension
 
@@ -153,7 +157,13 @@ class PlausiblePull:
         self._last.append(states)
 
     def median(self, offset: Array) -> Array | None:
-        """Return `RejectionError.pull` for these length offsets [m], (M,)."""
+        """Return the medians of lengths and tensions of the last messages, or None if too few.
+
+        The result has the format of `RejectionError.pull`.
+
+        Args:
+            offset: Length offsets [m], (M,), which are subtracted from the lengths.
+        """
         if len(self._last) < (self._last.maxlen or 0):
             return None
         return median_of_rows(
@@ -259,9 +269,13 @@ class MuscleStream:
     def take_states(
         self, states: Array, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert values as measured: l [m], T_read [N] and temperature [°C], (3, M).
+        """Check and convert lengths, tensions and temperatures as the sensors measured them.
 
-        `take` describes the times and the delay.
+        Args:
+            states: Lengths [m], tensions [N] and temperatures [°C], (3, M).
+            time: As in `take`.
+            now: As in `take`.
+            delay: As in `take`.
 
         Raises:
             RejectionError: If the values are implausible.

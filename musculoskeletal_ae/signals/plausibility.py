@@ -98,7 +98,10 @@ class TemperatureCheck:
         return np.where(possible, self._believed, math.nan)
 
     def _begins(self, read: Array, elapsed: float) -> Bools:
-        """Return where readings have agreed long enough to accept a first temperature, (M,)."""
+        """Return which muscles receive their first accepted temperature now, (M,).
+
+        Their readings must have agreed for longer than `LIMITS.glitch`.
+        """
         agrees = np.abs(read - self._first) <= LIMITS.temperature_step
         self._first_age = np.where(agrees, self._first_age + elapsed, 0.0)
         self._first = np.where(agrees, self._first, read)
