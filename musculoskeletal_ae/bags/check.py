@@ -35,7 +35,7 @@ _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 @dataclass
 class BagCheck:
-    """The report on a recording."""
+    """The report on the contents, completeness and fit of a recording."""
 
     lines: list[str] = field(default_factory=list)  # texts on the contents of the recording
     faults: list[str] = field(default_factory=list)  # why the recording is incomplete or unfit
@@ -51,7 +51,9 @@ def check_bag(
     namespace: str | None = None,
     motors: MotorSettings = NO_MOTORS,
 ) -> BagCheck:
-    """Read a recording, and return a report on it. Errors become faults in the report.
+    """Read a recording and report its contents, completeness and fit to a robot.
+
+    If the recording cannot be read, the report lists the error as a fault.
 
     Args:
         path: The bag.
@@ -84,7 +86,11 @@ def check_bag(
 
 
 def motion_text(robot: Robot, recording: Pairs) -> str:
-    """Return how many resting postures `train --from-bag` can learn from, as a text for users."""
+    """Return a text that tells the user how many different resting postures a recording contains.
+
+    `train --from-bag` learns from these postures. If they are too few, the text also says what to
+    record.
+    """
     samples = _resting_postures(robot, recording)
     least = preset_named('default').least_samples
     text = f'different resting postures to learn from: {samples}'
@@ -115,14 +121,18 @@ def _resting_postures(robot: Robot, recording: Pairs) -> int:
 
 
 def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
-    """Return (muscle of the column, muscle that it behaves like) for each misplaced column.
+    """Find columns of recorded lengths and tensions that seem to belong to another muscle.
 
-    Arrays carry no names, but the body resembles its geometric model. The length in column i must
-    therefore follow
+    Column i of the arrays should belong to muscle i of the robot, but arrays carry no names. The
+    geometric model therefore predicts the length of every muscle from the recorded joint angles
+    and tensions. Column i is misplaced if the prediction for another muscle fits its length
+    clearly better than the prediction for muscle i, up to a constant offset.
 
-        l̂_j = f_geo(θ) − L_e(f_geo,abs(θ), T)
+    Columns whose length hardly varies and columns of isolated muscles are not checked.
 
-    best for j = i, up to a constant offset.
+    Returns:
+        Two names for each misplaced column: the muscle to which the column should belong, and the
+        muscle whose prediction it fits.
     """
     known = np.flatnonzero(np.isfinite(pairs.theta).all(axis=1))
     if len(known) < 2:
@@ -176,7 +186,7 @@ class _Fit(NamedTuple):
 
 
 def _fit(bag: Bag, name: str, namespace: str | None, motors: MotorSettings) -> _Fit:
-    """Return whether a bag fits a robot."""
+    """Return the reasons why a bag does not fit a robot, and remarks on messages left unused."""
     try:
         robot = Robot.load(name)
         streams = read_streams(bag, robot, namespace, motors)

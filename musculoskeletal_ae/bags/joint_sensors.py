@@ -38,9 +38,11 @@ TEXTS = {
 
 
 def wrong_joint_sensors(robot: Robot, recording: Pairs) -> list[str]:
-    """Return a warning for each fault of the joint sensors of a moving arm.
+    """Return a warning for each fault of joint sensors that the recording of a moving arm reveals.
 
-    Muscles that are isolated at any time are not used.
+    Sensors can have the wrong sign or the wrong unit, be swapped with each other, or repeat one
+    reading while the arm moves. The readings are compared with the recorded muscle lengths.
+    Muscles that are isolated at any time during the recording are left out of the comparison.
     """
     if not len(recording.time):
         return []

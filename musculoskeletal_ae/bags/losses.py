@@ -11,8 +11,9 @@ UNNUMBERED = 0, (1 << 64) - 1
 class Losses:
     """Counts the messages of each topic that were published, but not received.
 
-    A message does not name its publisher. Gaps in the numbers are therefore only counted while a
-    topic has a single publisher.
+    Every publisher numbers its own messages, so a lost message leaves a gap in the sequence
+    numbers. A message does not name its publisher. Gaps are therefore only counted while a topic
+    has a single publisher.
     """
 
     def __init__(self) -> None:
@@ -31,7 +32,10 @@ class Losses:
         self._last[topic] = number
 
     def settle(self, publishers: Callable[[str], int]) -> None:
-        """Count the gaps since the last call as `lost`, for topics with at most one publisher.
+        """Add the messages that were missed since the last call to `lost`.
+
+        Gaps in the sequence numbers of a topic with several publishers are discarded, because each
+        publisher numbers its own messages.
 
         Args:
             publishers: Function that returns the number of publishers of a topic.

@@ -42,7 +42,7 @@ _LONGEST_QOS = 10_000  # largest length of the QoS profiles, as YAML [characters
 
 
 class _Span(NamedTuple):
-    """Log times and topics of a chunk, by which the reader decides whether to decompress it."""
+    """Log times and topics of a chunk; the reader decompresses only chunks that it needs."""
 
     start: int  # earliest log time [ns]
     end: int  # latest log time [ns]
@@ -60,8 +60,8 @@ class McapFile:
         """Read the whole file and verify its checksums.
 
         Raises:
-            BagError: If the file is damaged, or if its log times go back too far to be
-                sorted (LONGEST_DISORDER within a topic, LONGEST_PAUSE among topics).
+            BagError: If the file is damaged, or if its messages are too far out of order to be
+                sorted: by more than 1 s within a topic, or by more than 10 s between topics.
         """
         self.path = path
         self.topics: dict[str, BagTopic] = {}
@@ -131,7 +131,12 @@ class McapFile:
             )
 
     def _note_truncation(self) -> None:
-        """Record that the file ends within a record."""
+        """Set `unfinished` to a text which says that the file ends within a record.
+
+        Raises:
+            ValueError: If the file contains no complete record, or if it was closed properly, so
+                that the stated length of a record must be wrong.
+        """
         if self._complete == 0:
             raise ValueError('it ends within its first record')
         with open_file(self.path) as file:
@@ -227,7 +232,7 @@ def _record_reader(stream: Any, validate_crcs: bool) -> StreamReader:
 
 
 def _contents(record: McapRecord) -> list[McapRecord]:
-    """Return the records in a chunk, or any other record unchanged."""
+    """Return the records that a chunk contains; return any other record alone, in a list."""
     if not isinstance(record, Chunk):
         return [record]
     # The library would decompress any amount, but `_decompress` stops at the stated size.

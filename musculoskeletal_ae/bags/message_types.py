@@ -59,8 +59,15 @@ def decode(data: bytes, type_name: str) -> Any:
 def mismatch(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:
     """Return why messages of a recorded type cannot be decoded, '' if they can.
 
-    The RIHS01 hash and a definition in .msg format must agree with the type of this name in ROS 2
-    Jazzy. Recorders may omit both ('' and an empty encoding or definition).
+    A recorder may store the RIHS01 hash and the definition of a type. Each of them that is stored
+    must agree with the type of this name in ROS 2 Jazzy. Only definitions in .msg format are
+    compared.
+
+    Args:
+        type_name: Name of the type.
+        encoding: Format of the definition; '' if none was recorded.
+        text: The definition; empty if none was recorded.
+        recorded_hash: The hash; '' if none was recorded.
     """
     if not is_known(type_name):
         return f'has the type {type_name[:80]!r}, which ROS 2 Jazzy does not define'

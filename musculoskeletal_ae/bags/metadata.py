@@ -55,7 +55,7 @@ def offered_qos(latched: bool, reliable: bool = True) -> Qos:
     """Return the QoS profile of a publisher.
 
     Args:
-        latched: Whether late joiners receive the last message.
+        latched: Whether subscribers that join later receive the last message.
         reliable: Whether lost messages are sent again.
     """
     return Qos(

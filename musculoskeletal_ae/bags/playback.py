@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Playback of a recording: messages to publish, the time line, and demonstrated motions.
 
-While playback is not paused, recorded time advances with the steady clock t:
+While playback is not paused, recorded time advances with the time t of the steady clock:
 
-    recorded(t) = anchor_recorded + rate · (t − anchor_steady)
+    recorded(t) = recorded(t₀) + rate · (t − t₀)
 
-A motion that was demonstrated by hand becomes a smoothed, evenly spaced trajectory.
+t₀ is the time of the last start, jump, pause or resumption. A motion that was demonstrated by hand
+becomes a smoothed trajectory, whose points are evenly spaced in time.
 """
 
 import math
@@ -98,22 +99,32 @@ class Timeline:
         return (recorded - self._recorded) / (self._rate * 1e9) - (now - self._steady)
 
     def jump(self, recorded: int, now: float) -> None:
-        """Set the recorded time [ns]; while paused, all messages up to this time are due."""
+        """Set recorded time to `recorded` [ns] when the steady clock reads `now` [s].
+
+        While playback is paused, messages up to this time are due, and later messages are not.
+        """
         self._recorded, self._steady = recorded, now
 
     def hold(self, paused: bool, now: float) -> None:
-        """Pause, or resume from the current recorded time."""
+        """Pause playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
+
+        Neither changes the recorded time that has been reached.
+        """
         self.jump(self.recorded(now), now)
         self.paused = paused
 
     def catch_up(self, recorded: int, now: float) -> None:
-        """Continue from `recorded` [ns] if it was due more than LONGEST_LAG ago."""
+        """Set recorded time to `recorded` [ns] if that time was due more than 1 s ago.
+
+        After a long interruption, playback thus goes on at its normal rate and does not publish
+        all late messages at once. `now` is the reading of the steady clock [s].
+        """
         if self.wait(recorded, now) < -LONGEST_LAG:
             self.jump(recorded, now)
 
 
 class TaughtMotion(NamedTuple):
-    """N points of a trajectory."""
+    """A demonstrated motion of D joints, as the N points of a trajectory."""
 
     joints: tuple[str, ...]
     time: Array  # including LEAD_TIME to reach the first posture [s], (N,)
@@ -124,10 +135,11 @@ class TaughtMotion(NamedTuple):
 def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
     """Return the motion on a recorded JointState topic between two recorded times [ns].
 
-    Messages may name different joints; the motion is that of the most frequent set of joints.
+    Messages may name different joints; only messages with the most frequent set of joints are used.
 
     Raises:
-        BagError: If there is no motion, or none that a controller could follow.
+        BagError: If the topic contains no motion of at least 0.5 s, if the motion has a gap of more
+            than 1 s, or if it is too long for one trajectory.
     """
     postures = defaultdict[tuple[str, ...], list[tuple[float, Array]]](list)
     for message in bag.messages([topic], start, stop):

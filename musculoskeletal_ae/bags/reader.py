@@ -45,11 +45,11 @@ class Bag:
     def open(cls, path: str | Path) -> Bag:
         """Read and check a whole recording.
 
-        A recording of a killed recorder is read up to its last complete record, and `unfinished`
-        then has the reason.
+        If the recorder was killed, the recording is read up to its last complete record, and
+        `unfinished` says why the rest is missing.
 
         Raises:
-            BagError: If the recording is damaged, or the path is not that of a recording.
+            BagError: If the recording is damaged, or the path does not name a recording.
         """
         path = Path(path)
         contents = read_metadata(path) if path.is_dir() else Contents([path], None, '')
@@ -82,10 +82,16 @@ class Bag:
     def messages(
         self, topics: Collection[str] | None = None, start: int = 0, stop: int = LATEST
     ) -> Iterator[BagMessage]:
-        """Yield messages of topics, by default all, from start to stop [ns, log time], inclusive.
+        """Yield the messages whose log times are from `start` to `stop` [ns], both included.
 
-        The messages are sorted by log time, as far as `_in_order` can sort them. Messages of equal
-        time keep the order of the file.
+        The messages are sorted by log time, unless a file is more than 10 s out of order or has
+        more than 64 MiB of messages to sort at once. Messages with the same time keep the order of
+        the file.
+
+        Args:
+            topics: Recorded names of the topics, or None for all topics.
+            start: Earliest log time [ns].
+            stop: Latest log time [ns].
         """
         wanted = frozenset(self.topics if topics is None else topics)
         ordered = (_in_order(file.messages(wanted, start, stop)) for file in self.files)
@@ -122,10 +128,10 @@ def _open_file(path: Path) -> StorageFile:
 
 
 def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Yield messages sorted by log time; they may be out of order by at most LONGEST_PAUSE.
+    """Yield the messages sorted by log time.
 
-    At most MOST_HELD bytes are held to sort them. Messages whose order would require more remain
-    out of order.
+    Messages that are more than 10 s (LONGEST_PAUSE) out of order are not sorted. Neither are
+    messages whose sorting would require more than 64 MiB (MOST_HELD) of memory.
     """
     waiting: list[tuple[int, int, BagMessage]] = []
     newest = held = 0

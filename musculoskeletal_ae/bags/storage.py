@@ -68,7 +68,7 @@ class BagTopic:
 
     @property
     def is_latched(self) -> bool:
-        """Whether late joiners receive its last message."""
+        """Whether a subscriber that joins later receives the last message of the topic."""
         return any(profile.durability == QosDurability.TRANSIENT_LOCAL for profile in self.qos)
 
 
@@ -97,7 +97,7 @@ class StorageFile(Protocol):
     ) -> Iterator[BagMessage]:
         """Yield messages of these topics from start to stop [ns], both included.
 
-        They keep the order of the file, which is chronological within LONGEST_PAUSE.
+        The messages keep the order of the file, in which log times may go back by up to 10 s.
         """
         ...
 

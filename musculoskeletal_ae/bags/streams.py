@@ -46,7 +46,7 @@ class Series(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """P pairs of simultaneous θ and (T, l)."""
+    """P pairs, each of joint angles and of the muscle lengths and tensions at the same time."""
 
     time: Array  # time since the bag's start [s], (P,)
     theta: Array  # θ [rad], (P, D); NaN for joints without a sensor
@@ -73,7 +73,11 @@ class Streams(NamedTuple):
     notes: tuple[str, ...]  # further remarks for the user
 
     def pairs(self) -> Pairs:
-        """Pair θ and (T, l) by the same rule as the live learner (`signals/pairing.py`)."""
+        """Pair each muscle message with the joint angles at the same time.
+
+        The rule is that of online learning on the robot (`signals/pairing.py`). Muscle messages
+        without matching joint angles are left out.
+        """
         time = self.muscles.time
         pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
@@ -105,7 +109,7 @@ class _Arrival(NamedTuple):
 
 @dataclass
 class _Stream:
-    """Values of a topic while it is being read."""
+    """Collects the times and values of a topic's messages while the bag is being read."""
 
     shape: tuple[int, ...]  # shape of the values of one message
     read: Callable[[Any, _Arrival], Array]  # converts a message to values
@@ -113,7 +117,7 @@ class _Stream:
     values: list[Array] = field(default_factory=list)
 
     def take(self, message: tuple[_Arrival, Any]) -> None:
-        """Add a message, given as (arrival, content)."""
+        """Convert a message to values and append them; `message` is (arrival, decoded content)."""
         came, content = message
         self.values.append(self.read(content, came))
         self.times.append(came.time)
@@ -124,15 +128,23 @@ class _Stream:
 
 
 class _ArmStreams:
-    """The streams of one arm, and the conversion of its messages.
+    """The values that the topics of one arm carried, converted from messages to arrays.
 
     Attributes:
-        by_topic: All streams, by the name of the topic in the interface.
-        had_offsets: Whether the length offsets were known, for each message of muscle_states.
+        by_topic: The values of each topic, by relative topic name such as 'joint_states'.
+        had_offsets: For each message of muscle_states, whether the length offsets were known when
+            it was received.
     """
 
     def __init__(self, robot: Robot, motors: MotorSettings, ignore: Callable[[str], None]) -> None:
-        """Start empty; `ignore` is called with each unused part of a message of joint_states."""
+        """Prepare empty streams.
+
+        Args:
+            robot: The robot, whose joints and muscles the messages must have.
+            motors: How the motors of a ros2_control robot are connected.
+            ignore: Function that is called with a text for each position in joint_states that is
+                not finite and therefore not used.
+        """
         self._robot, self._ignore = robot, ignore
         self._interface = MotorInterface(motors, robot.muscles)
         self._muscle_stream = MuscleStream(robot)
@@ -183,10 +195,12 @@ def read_streams(
     """Read sensor data and commands of one arm.
 
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
-    implausible messages. Lengths are corrected by the length offsets that `muscle_length_zeros` had
-    published at that time. The first offsets on this topic, if known, also correct earlier lengths.
-    Messages received while offsets were unknown are rejected. For isolated muscles, lengths and
-    tensions that are not finite or absurdly large become 0, and such temperatures become NaN.
+    implausible messages. Each length is corrected by the newest length offsets on the topic
+    `muscle_length_zeros`. If the first offsets on this topic are known, they also correct earlier
+    lengths. Muscle states that were received while offsets were unknown are rejected.
+
+    An isolated muscle may have any readings. Lengths and tensions of an isolated muscle that are
+    not finite or exceed the legal range become 0, and such temperatures become NaN.
 
     Args:
         bag: The recording.
@@ -232,10 +246,14 @@ def read_streams(
 
 
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
-    """Return the names under which messages are counted, by topic of the interface.
+    """Return, for each topic of the interface, the name by which reports refer to its messages.
 
-    A recorded topic may carry the angles of joints as well as those of motors. Each of its messages
-    is then counted under both names.
+    This is the recorded name. One recorded topic may carry the angles of the joints as well as
+    those of the motors, and then stands for two topics of the interface. Its messages are then
+    counted twice, under two names of the form 'RECORDED NAME as INTERFACE NAME'.
+
+    Args:
+        recorded: The recorded name of each topic of the interface.
     """
     count = Counter(recorded.values())
     return {
@@ -251,14 +269,16 @@ def _deliver(
     clock_offsets: Mapping[str, int],
     reception: Reception,
 ) -> None:
-    """Pass all messages to the takers of their topic, as pairs of arrival and content.
+    """Call the functions that wait for a topic with each message, as (arrival, decoded content).
 
     Args:
         bag: The recording.
-        takers: Receivers of the messages by recorded topic and label.
-        early: Topics that are read before the others.
-        clock_offsets: Topics whose publish times are used, and the offsets of the clocks [ns].
-        reception: Rejects and counts messages.
+        takers: For each recorded topic, the functions to call, by the name under which `reception`
+            counts the messages.
+        early: Recorded names of the topics that are read before the other topics.
+        clock_offsets: Offset [ns] of the publisher's clock for each topic whose messages are timed
+            by publication; messages of other topics are timed by their log times.
+        reception: Rejects messages for which a function raises a MessageError, and counts them.
     """
     receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
     delays = defaultdict[tuple[str, ...], MessageDelay](MessageDelay)
@@ -282,9 +302,12 @@ def _deliver(
 
 
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:
-    """Raise a BagError if messages of a topic were rejected and none was used.
+    """Raise a BagError if all messages of a topic were rejected.
 
-    `used` are the streams by label; `warnings` are the texts on the first rejection of each kind.
+    Args:
+        bag: The recording.
+        used: The stream of accepted messages of each topic, by the topic's name in warnings.
+        warnings: A text for each reason for which messages of a topic were rejected.
     """
     for label, stream in used.items():
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]
@@ -294,11 +317,12 @@ def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -
 
 
 def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
-    """Return the topics with bunched log times, and the offsets of their publishers' clocks [ns].
+    """Return the topics with bunched log times, and an offset for their publish times [ns].
 
-    A recorder that was blocked for a moment writes many messages with the same log time. Publish
-    times are then better, but the clock of the publisher may differ from that of the recorder. The
-    offset is the shortest delay between publication and writing.
+    A recorder that was blocked for a moment writes many messages with almost the same log time.
+    The publish times are then more accurate, but the publisher's clock may differ from that of the
+    recorder. The offset to add to a publish time is the shortest difference between the log time
+    and the publish time of a message.
     """
     times = {topic: (array('q'), array('q')) for topic in topics}
     for message in bag.messages(topics):
@@ -326,7 +350,14 @@ def _latched(times: ArrayLike, when: ArrayLike) -> Any:
 
 
 def _body_at(time: float, before: BodyState, isolated: _Stream, offsets: _Stream) -> BodyState:
-    """Return the body state at a time [s], or `before` if it has not changed."""
+    """Return the isolated muscles and length offsets that held at a time [s] of the recording.
+
+    Args:
+        time: Time since the bag's start [s].
+        before: The body state at the previous message; it is returned if nothing has changed.
+        isolated: The recorded isolated muscles.
+        offsets: The recorded length offsets.
+    """
     body = before
     if isolated.values:
         body = body.with_isolated(np.flatnonzero(isolated.values[_latched(isolated.times, time)]))

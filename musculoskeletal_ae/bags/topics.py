@@ -30,7 +30,7 @@ NO_MOTORS = MotorSettings()
 
 
 def topics_with(motors: MotorSettings) -> dict[str, Topic]:
-    """Return the topics of the interface and those of a ros2_control robot, by name."""
+    """Return all topics of the interface, and the motor topics of a ros2_control robot, by name."""
     topics = dict(TOPICS)
     if motors.motor_state_topic:
         topics.setdefault(motors.motor_state_topic, Topic(JOINT_STATE, sent=True))
@@ -45,7 +45,8 @@ def interface_topics(
 ) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
-    The topic of the motors of a ros2_control robot stands for `muscle_states`.
+    If a ros2_control robot has a topic for its motor states, this topic is returned as
+    `muscle_states`.
 
     Args:
         bag: The recording.
@@ -78,16 +79,20 @@ def select(
     keep_names: bool,
     motors: MotorSettings = NO_MOTORS,
 ) -> dict[str, str]:
-    """Select topics to replay; return the name to publish on by recorded name.
+    """Select the topics to replay.
 
     Args:
         bag: The recording.
         wanted: ['default'] for measurements, requests of users, and commands to the muscle
             modules, ['all'] for every topic of the interface, or names of any topics, relative or
             as recorded.
-        namespace: The namespace of the arm; required only if the bag has several.
+        namespace: The namespace of the arm; required only if the bag has several and `keep_names`
+            is False.
         keep_names: Whether to publish on the recorded names.
         motors: How the motors of a ros2_control robot are connected.
+
+    Returns:
+        For each selected topic, by its recorded name, the name to publish on.
 
     Raises:
         BagError: If the namespace is ambiguous or not in the bag, or if a topic is missing or
@@ -135,10 +140,14 @@ def latched_topics(bag: Bag) -> set[str]:
 
 
 def namespaces(names: Iterable[str]) -> list[str]:
-    """Return the namespaces, '' or such as '/left_arm', of the interface's topics in a recording.
+    """Return the namespaces of the interface's topics in a recording, such as '/left_arm'.
 
-    A name can be ambiguous: `/sim/joint_states` may be `joint_states` in the namespace `/sim`. If
-    some namespaces explain all topics, only the shortest of them is returned.
+    The root namespace is ''. Recorded names can be ambiguous: `/sim/joint_states` is a topic of the
+    interface in the root, but also `joint_states` in the namespace `/sim`. If all topics can belong
+    to one namespace, only this namespace is returned, and the shortest if there are several.
+
+    Args:
+        names: Recorded names of topics.
     """
     readings = [
         {name[: -len(topic) - 1] for topic in TOPICS if name.endswith(f'/{topic}')}
@@ -156,10 +165,10 @@ def interface_name(name: str) -> str:
 
 
 def _motor_topics(bag: Bag, motors: MotorSettings) -> dict[str, str]:
-    """Return the topics of motors in a bag: by recorded name, the name in the motor settings.
+    """Return the name in the motor settings of each recorded motor topic, by recorded name.
 
-    If the motor settings have a relative name that the interface uses too, such as `joint_states`,
-    its topics are left out.
+    The motor settings may use a relative name that the interface uses too, such as `joint_states`.
+    Such a topic counts as one of the interface and is left out.
     """
     stated = [motors.motor_state_topic, motors.motor_command_topic]
     return {
@@ -177,9 +186,19 @@ def _topics_of(bag: Bag) -> str:
 def _relative_names(
     bag: Bag, namespace: str | None, motors: MotorSettings = NO_MOTORS
 ) -> dict[str, str]:
-    """Return the relative name of each recorded name; names outside the namespace stay absolute.
+    """Return the name of each recorded topic relative to a namespace, by recorded name.
 
-    A motor topic that the motor settings state with its full name stays absolute as well.
+    Names outside the namespace stay absolute, and so do motor topics that the motor settings state
+    with their absolute names. A topic of the interface that the namespace lacks may be taken from
+    an enclosing namespace.
+
+    Args:
+        bag: The recording.
+        namespace: The namespace, or None for the one that the bag has.
+        motors: How the motors of a ros2_control robot are connected.
+
+    Raises:
+        BagError: If the namespace is not in the bag, or if it is None and the bag has several.
     """
     motor_topics = _motor_topics(bag, motors)
     placed = [name for name in bag.topics if name not in motor_topics]
@@ -215,10 +234,15 @@ def _around(namespace: str) -> list[str]:
 
 
 def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
-    """Return the namespace that lies within all others.
+    """Return the namespace that all other namespaces enclose.
 
-    The result is None without such a namespace, or if two namespaces contain the same topic other
-    than /diagnostics.
+    Args:
+        topics: Recorded names of topics.
+        nested: The namespaces of these topics.
+
+    Returns:
+        The namespace, or None if there is no such namespace, or if two namespaces contain the
+        same topic of the interface (other than /diagnostics).
     """
     innermost = max(nested, key=len)
     if not set(nested) <= {innermost, *_around(innermost)}:
@@ -229,9 +253,13 @@ def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
 
 
 def _compare_type(bag: Bag, name: str, expected: str, leave_out: str = '') -> None:
-    """Raise a BagError if a topic has another type, or if its messages cannot be decoded.
+    """Raise a BagError if a topic does not have the expected type or cannot be decoded.
 
-    `leave_out` is appended to the remedy.
+    Args:
+        bag: The recording.
+        name: Recorded name of the topic.
+        expected: The message type that it must have.
+        leave_out: Text that is appended to the remedy in the error message.
     """
     topic = bag.topics[name]
     if topic.type != expected:

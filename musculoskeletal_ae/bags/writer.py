@@ -21,7 +21,7 @@ _LARGEST_CHUNK = 1 << 20  # size at which a chunk ends and the next one begins [
 
 
 class BagWriter:
-    """Writes messages to `DIR/DIR_0.mcap`, and metadata.yaml.
+    """Writes messages to `DIR/DIR_0.mcap`, and their topics and times to `DIR/metadata.yaml`.
 
     Messages written before the last `flush` survive a crash of the process.
     """
@@ -107,7 +107,7 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Write all messages so far to the file, and pass them to the operating system."""
+        """Write all messages so far to the file, and pass the data on to the operating system."""
         # Callbacks of several topics run slightly out of order, but readers expect ordered files.
         pending = sorted(self._pending, key=lambda entry: entry[0])
         self._pending, self._pending_size = [], 0
@@ -136,7 +136,7 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Complete the bag; after an exception, leave it unfinished."""
+        """Complete the bag with `close`; after an exception, only close the file."""
         if kind is None:
             self.close()
         else:
@@ -163,7 +163,8 @@ def recover(path: Path, target: Path, compression: str = 'zstd') -> tuple[int, l
     """Write all readable messages of a recording to a new, finished bag.
 
     Returns:
-        The number of messages, and the omitted topics, whose messages are not encoded in CDR.
+        The number of messages in the new bag, and the names of the topics that were left out
+        because their messages are not encoded in CDR.
     """
     bag = Bag.open(path)
     with BagWriter(target, compression) as writer:

@@ -4,10 +4,14 @@
 Each muscle is a massless tendon between a muscle module and a series elastic element at its far
 end:
 
-    bone side  L_e(l_abs, T_end) = f(θ) − l     elongation of element and tendon
-    friction   T = T_end exp(μ s),  |s| ≤ 1     s follows the sliding of the tendon (Dahl)
+    bone side  L_e(l_abs, T_end) = f(θ) − l
+    friction   T = T_end exp(μ s),  |s| ≤ 1
 
-Joint friction also follows Dahl's model, so that friction holds the resting arm without creep.
+L_e is the elongation of element and tendon at the bone-side tension T_end. At the joint angles θ
+the route has the length l_abs, which exceeds the length at θ = 0 by f(θ). The module has wound the
+tendon to the length l, at the motor-side tension T. The friction state s follows the sliding of the
+tendon according to Dahl's model. Joint friction follows the same model, so that friction holds the
+resting arm without creep.
 """
 
 import math
@@ -57,10 +61,19 @@ Parts = namedtuple('Parts', 'routes placed body constants muscle joint command w
 
 @njit(cache=True)
 def tension_from_elongation(elongation: float, force: float, rate: float, stretch: float) -> float:
-    """Solve ln(1 + T/force)/rate + stretch·T = elongation for T; return 0 for a slack tendon.
+    """Return the tension T [N] at which a tendon and its series elastic element are this elongated.
 
-    Newton's method in u = ln(1 + T/force). The equation is convex in u, and the start u =
-    rate·elongation lies beyond the root. The iteration therefore converges without overshooting.
+        ln(1 + T/force)/rate + stretch·T = elongation
+
+    The equation is solved by Newton's method in u = ln(1 + T/force). It is convex in u, and the
+    start u = rate·elongation lies beyond the root. The iteration therefore converges without
+    overshooting.
+
+    Args:
+        elongation: Elongation [m]; the tension is 0 if it is not positive (slack tendon).
+        force: Constant of the element [N].
+        rate: Constant of the element [1/m].
+        stretch: Stretch of the tendon itself [m/N].
     """
     if elongation <= 0.0:
         return 0.0
@@ -79,16 +92,21 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def make_handle(parts: Parts) -> Handle:
-    """Return a handle to `parts`, which `muscle_step` takes as an argument."""
+    """Pack `parts` into one argument for `muscle_step`. The arrays are shared, not copied."""
     return Handle(parts)
 
 
 @njit(cache=True)
 def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
-    """Advance joints and motors of `Parts` by one STEP; write generalised torques to joint.torque.
+    """Advance joints and muscle modules by one step of 1 ms, and compute the torques at the joints.
 
-    `arm` is a handle to the `Parts`, and `kind` is SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
-    `acceleration` is q̈ of the rigid-body dynamics, (J−1,).
+    The generalised torques of muscles, friction, springs, stops and the external wrench are written
+    to the member `joint.torque` of the `Parts`.
+
+    Args:
+        arm: Handle to the `Parts`, which are changed in place.
+        kind: Mode of the modules: SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
+        acceleration: Acceleration of each joint of the tree [rad/s²] or [m/s²], (J−1,).
     """
     routes, placed, body, constants, muscle, joint, command, wrench = arm.held
     for i in range(joint.q.shape[0]):
@@ -151,10 +169,13 @@ class EmulatedArm(modules.Arm):
     """An individual of the emulator model `kin`."""
 
     def __init__(self, robot: Robot, seed: int = 0, individual: Individual | None = None) -> None:
-        """Build an individual of a robot, at rest with its modules in the safe state.
+        """Build an emulated individual of a robot, at rest and before the first command.
 
-        `seed` selects the individual, unless `individual` is given. It also seeds the sensor noise,
-        the faults, and the errors of motor currents and thermal constants.
+        Args:
+            robot: The robot to emulate.
+            seed: Selects the individual, unless `individual` is given. It also seeds the sensor
+                noise, the faults, and the errors of motor currents and thermal constants.
+            individual: The true body of the arm; by default, it is drawn from `seed`.
         """
         self.individual = individual or Individual(robot, seed)
         super().__init__(robot, seed, self.individual.length_bias)
@@ -231,13 +252,14 @@ class EmulatedArm(modules.Arm):
         muscle_step(self._handle, self._kind, acceleration)
 
     def _coupled_acceleration(self) -> Array:
-        """Return q̈ (J−1,) of a tree with coupled joints.
+        """Return the acceleration of each joint of the tree, (J−1,), if some joints are coupled.
 
             q̈ = A θ̈ + Ȧ θ̇,   θ̈ = (Aᵀ M A)⁻¹ Aᵀ (τ − h − M Ȧ θ̇)
 
-        A = ∂q/∂θ, M is the inertia with the armature, and h the torque of weight and velocity. If a
-        coupling is nonlinear, q̈ is corrected so that all couplings hold exactly at the end of the
-        step.
+        q are the positions of all joints, and θ those of the joints that are not coupled to
+        another one. A = ∂q/∂θ, M is the inertia with the armature, τ the generalised torque, and h
+        the torque of weight and velocity. If a coupling is nonlinear, q̈ is corrected so that all
+        couplings hold exactly at the end of the step.
         """
         model, data, joint, kin = self._model, self._data, self._joint, self.robot.kinematics
         theta, gear = self.theta, kin.tree.transmission(self.theta)

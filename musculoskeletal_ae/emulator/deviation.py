@@ -59,13 +59,13 @@ def typical_arms(robot: Robot) -> Array:
 
 
 def slack(robot: Robot, draw: Draw) -> Array:
-    """Return a random slack of each tendon [m], (M,), which offsets its length sensor."""
+    """Return a random error of each tendon's length [m], (M,), which offsets its length sensor."""
     sigma = np.minimum(SLACK * typical_arms(robot), LONGEST)
     return sigma * draw.rng('slack').normal(size=len(sigma))
 
 
 class Attachments:
-    """Random displacements of the sites of a model's tendons; `move` redraws single muscles."""
+    """Random displacements of the points (MuJoCo sites) at which tendons are attached to bodies."""
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
         """Move the sites of `model`, whose tendons must have the names of the robot's muscles."""

@@ -5,10 +5,11 @@
     replace(Effects(), hysteresis=0.0)   one effect off; all other draws stay the same
     NONE                                 no effect: the body of the description or the MJCF file
 
-For an individual, most effects are drawn between 3/4 and all of their size, or normally distributed
-where the size is marked σ. The `stiffness` of an element is drawn from the whole range up to this
-deviation; `laws`, `spool_slip`, `jitter` and `dropouts` are not drawn. doc/explanation/emulators.md
-lists the sources of the sizes.
+The seed draws the effects of an individual. Most are drawn between 3/4 and all of their size. Sizes
+that are marked σ are the standard deviation of a normal distribution. The relative deviation of an
+element's stiffness is drawn between −1 and 1 times the size `stiffness`. The sizes `laws`,
+`spool_slip`, `jitter` and `dropouts` hold for every individual. doc/explanation/emulators.md lists
+the sources of the sizes.
 """
 
 import zlib
@@ -21,7 +22,7 @@ from musculoskeletal_ae.arrays import Array
 
 @dataclass(frozen=True)
 class Effects:
-    """Sizes of all effects."""
+    """Sizes of all effects of the emulator model `foreign`; 0 switches an effect off."""
 
     # Body
     attachment: float = 0.0105  # σ of each coordinate of each route point [m]

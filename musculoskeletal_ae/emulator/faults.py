@@ -129,7 +129,7 @@ class Faults:
         self.set([])
 
     def set(self, lines: Iterable[str]) -> None:
-        """Activate the faults of the lines, and end all others.
+        """Activate the faults that the lines describe, and end all other faults.
 
         Raises:
             MusculoskeletalError: If a line is not legal; the faults are then unchanged.
@@ -183,7 +183,14 @@ class Faults:
         return any(self._rng.random() < fault.size for fault in self._of(name))
 
     def deliver(self, readings: Readings, now: float) -> list[Readings]:
-        """Send `readings` at `now` [s]; return all readings that arrive now, in order."""
+        """Send `readings` at the time `now` [s], with all faults of communication applied.
+
+        Readings can be lost, duplicated, delayed or swapped with the next ones.
+
+        Returns:
+            The readings that arrive at `now`, in the order of arrival; they may have been sent
+            earlier. The list is empty if none arrive.
+        """
         sent = [] if self._happens('drop') else [readings]
         if sent and self._happens('duplicate'):
             sent *= 2

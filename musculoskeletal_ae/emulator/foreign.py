@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Emulator model `foreign`, whose muscles share no code with the model that the learner fits.
 
-MuJoCo simulates rigid bodies, wrapping, stops and joint friction; `tendons` simulates tendons,
-series elastic elements and spools. The muscle modules are those of all emulated arms. This file
-imports neither learning nor the geometric routes nor the series elastic class (checked by
+MuJoCo simulates rigid bodies, wrapping, stops and joint friction. The file `tendons.py` simulates
+tendons, series elastic elements and spools. The muscle modules are those of all emulated arms. This
+file imports neither learning nor the geometric routes nor the series elastic class (checked by
 `test/test_house.py`).
 """
 
@@ -39,10 +39,20 @@ OTHER_ROUTE = 0.02  # tolerated difference of a file's route lengths [m]
 
 
 class ForeignBody:
-    """True lengths, moment arms, elastic laws and sensor errors of one new arm at rest."""
+    """True lengths, moment arms, elastic laws and sensor errors of one arm.
+
+    They hold for an arm at rest whose tendons have not aged.
+    """
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
-        """Describe `model`, whose joints and tendons must have the names of the robot's."""
+        """Draw the elastic elements and sensor errors of the arm that `model` describes.
+
+        Args:
+            robot: The robot.
+            model: A MuJoCo model. Its joints and tendons must have the names of the robot's joints
+                and muscles.
+            draw: The random draws of the individual.
+        """
         self._robot, self._model = robot, model
         self._data = mujoco.MjData(model)
         names, count = robot.kinematics.model.names[1:], robot.muscle_count
@@ -57,13 +67,13 @@ class ForeignBody:
         self.length_bias: Array = np.zeros(count)
 
     def set_posture(self, data: Any, theta: Array) -> Any:
-        """Put the bones of `data`, an MjData, at θ [rad] (D,); update its lengths and return it."""
+        """Set the joint angles of an MjData to θ [rad], (D,); return it with updated lengths."""
         data.qpos[self.tree] = self._robot.kinematics.tree.angles(theta)
         mujoco.mj_fwdPosition(self._model, data)
         return data
 
     def _routed(self, theta: Array) -> Any:
-        """Return data with lengths and moment arms of the tendons at θ [rad] (D,).
+        """Return an MjData with the lengths and moment arms of the tendons at θ [rad], (D,).
 
         Contacts are not computed, because they would take most of the time in some files.
         """
@@ -75,12 +85,12 @@ class ForeignBody:
         return data
 
     def absolute_lengths(self, theta: Array) -> Array:
-        """Return the lengths of the routes [m] (N, M) for θ (N, D)."""
+        """Return the lengths of the routes [m], (N, M), for joint angles θ [rad], (N, D)."""
         data = (self._routed(row) for row in theta)
         return np.stack([each.ten_length[self.tendon_ids] for each in data])
 
     def muscle_jacobian(self, theta: Array) -> Array:
-        """Return G [m/rad] (N, M, D) for θ (N, D)."""
+        """Return the muscle Jacobian ∂l/∂θ [m/rad], (N, M, D), for joint angles θ [rad], (N, D)."""
         model = self._model
         jacobian = np.empty((len(theta), model.ntendon, model.nv))
         rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
@@ -91,9 +101,14 @@ class ForeignBody:
         )
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
-        """Return l [m] (N, M) for θ (N, D) and T (N, M).
+        """Return the muscle lengths [m], (N, M), for joint angles (N, D) and tensions (N, M).
 
-        Friction, hysteresis, give and sensor errors are not included.
+        They do not include the effects of friction, hysteresis, yielding route points and sensor
+        errors.
+
+        Args:
+            theta: Joint angles [rad].
+            tension: Tensions [N].
         """
         relative = self.absolute_lengths(theta) - self.length_at_zero
         return relative - self.elastic.elongation(tension)
@@ -102,9 +117,10 @@ class ForeignBody:
 def _individual_model(robot: Robot, draw: Draw) -> Any:
     """Return the MuJoCo model of a robot directory, with the deviations of an individual.
 
-    A tendon jumps by centimetres if it slips over the end of a described object. No one would route
-    a tendon there, so route points are redrawn until only those tendons jump that also jump in the
-    description, but at most MOST_DRAWS times.
+    If a tendon slips over the end of an object that it wraps around, its length jumps by
+    centimetres. No one would route a tendon there. The route points of such a tendon are therefore
+    redrawn, unless it also jumps without deviations. The number of draws is limited (MOST_DRAWS),
+    so some tendons may still jump.
     """
     again = np.zeros(robot.muscle_count, dtype=np.int64)
     model = mjcf.from_directory(robot, draw, again).compile()
@@ -122,9 +138,11 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
 
 def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
-    """Change the model of a file into an individual.
+    """Give the MuJoCo model of a file the random deviations of an individual, in place.
 
-    Attachment points are redrawn, at most MOST_DRAWS times, until no additional tendon jumps.
+    If displaced attachment points make the length of a tendon jump, because the tendon slips over
+    the end of an object, its points are redrawn. The number of draws is limited (MOST_DRAWS), so
+    some tendons may still jump. Tendons that jump in the file are not redrawn.
     """
     smooth = ~jumping(ForeignBody(robot, copy.copy(model), draw).absolute_lengths, robot)
     attachments = deviation.Attachments(robot, model, draw)
@@ -137,9 +155,13 @@ def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
 
 
 def _route_warnings(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
-    """Warn of muscles whose lengths in the file differ from the robot's by over OTHER_ROUTE.
+    """Return a warning for each muscle whose length in the file is off by more than 20 mm.
 
-    `off` are the differences in N postures [m], (N, M).
+    Args:
+        robot: The robot.
+        file: The MJCF file.
+        off: Lengths in the file minus those of the robot's geometric model, in N postures [m],
+            (N, M).
     """
     largest = np.abs(off).max(axis=0)
     return tuple(
@@ -150,7 +172,10 @@ def _route_warnings(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
 
 
 def _limit_warnings(robot: Robot, file: Path, model: Any) -> Iterator[str]:
-    """Warn of joints whose limits in the file differ clearly from the robot's (OTHER_LIMITS)."""
+    """Yield a warning for each joint whose limits differ between the file and the robot.
+
+    Differences of up to 2 % of the joint's range are tolerated.
+    """
     for name, lower, upper in zip(robot.joints, robot.lower, robot.upper):
         joint = model.joint(name).id
         unlimited = np.array([-np.inf, np.inf])
@@ -165,7 +190,7 @@ def _limit_warnings(robot: Robot, file: Path, model: Any) -> Iterator[str]:
 
 
 class LateSensors:
-    """Errors of joint sensors and delays of messages: offset, non-linearity, backlash and delay."""
+    """Errors of the joint sensors (offset, non-linearity, backlash), and delays of all messages."""
 
     def __init__(self, robot: Robot, draw: Draw) -> None:
         joints, radian = robot.joint_count, robot.kinematics.radian
@@ -178,22 +203,27 @@ class LateSensors:
         self._steps = 0
 
     def stand(self, theta: Array) -> None:
-        """Put the joints at θ, in the middle of their backlash."""
+        """Start from rest at θ [rad], (D,), each joint sensor in the middle of its backlash."""
         self._play = theta + self._zero
 
     def start(self, now: Array) -> None:
-        """Fill the whole history with the present values."""
+        """Fill the whole history with the present values of all sensed quantities, (D + 3 M,)."""
         self._history[:] = now
 
     def append(self, now: Array) -> None:
-        """Append the present values to the history, one step after the previous ones."""
+        """Append the values of all sensed quantities, (D + 3 M,), one step after the last ones."""
         self._steps += 1
         self._history[self._steps % HISTORY] = now
 
     def read(self, jitter: float) -> tuple[Array, Array, Array, Array]:
-        """Return the delayed θ, l, T and temperatures; `jitter` is added to the delays [s].
+        """Return the sensed quantities as they were before the delays of their messages.
 
-        θ has the errors of the joint sensors.
+        Args:
+            jitter: Time that is added to the delays [s]; may be negative.
+
+        Returns:
+            Joint angles [rad], (D,), with the errors of the joint sensors; lengths [m], tensions
+            [N] and temperatures [°C], each (M,).
         """
         late = np.maximum(self._delays + jitter, 0.0) / STEP
         joints, muscles = (self._history[(self._steps - round(steps)) % HISTORY] for steps in late)
@@ -205,7 +235,7 @@ class LateSensors:
 
 
 class Ageing:
-    """Changes over hours: tendons bed in, knots and spools slip, and length sensors drift.
+    """Changes over hours: tendons lengthen, slip in a knot or on a spool, and sensors drift.
 
     Attributes:
         drift: Drift of the length sensors [m/s], (M,).
@@ -222,7 +252,7 @@ class Ageing:
         self._slips, self._slipped = rng, np.zeros(muscles)
 
     def longer(self, duration: float) -> Array:
-        """Return how far the tendons have lengthened [m] (M,), then age them by `duration` [s]."""
+        """Return the present lengthening of each tendon [m], (M,), and let `duration` [s] pass."""
         age = self._time / BEDDING_TIME
         longer = self._bedding * -np.expm1(-age) + self._knot * (self._time > self._knot_time)
         slipping = self._slips.uniform(size=len(longer)) < duration / SLIP_TIME
@@ -243,14 +273,15 @@ class ForeignArm(Arm):
         file: Path | None = None,
         deviates: bool = False,
     ) -> None:
-        """Build an individual at rest, with its modules in the safe state.
+        """Build an emulated individual, at rest and before the first command.
 
         Args:
             robot: The robot to emulate.
             seed: Selects the individual.
-            effects: Sizes of the effects; by default the calibrated ones. Ignored with `file`,
-                except that a `joint_friction` of 0 removes all friction of the file if `deviates`
-                is false.
+            effects: Sizes of the effects; by default the calibrated ones. They apply to a body that
+                is built from the robot directory. An arm that equals `file` uses only
+                `joint_friction`: the value 0 removes all friction that the file defines. An arm
+                that deviates from `file` ignores `effects`.
             file: MJCF model of the arm, instead of a body that is built from the robot directory.
             deviates: Whether the arm is an individual that differs from `file`
                 (`emulator/deviation.py`).
@@ -316,7 +347,7 @@ class ForeignArm(Arm):
         self.reset()
 
     def _set_joint_friction(self) -> None:
-        """Add friction to each joint, in proportion to its load."""
+        """Add friction to each joint, in proportion to its load by weight and muscles at T_bias."""
         robot, draw, body = self.robot, self._draw, self.individual
         theta = robot.random_postures(200, draw.rng('load'))
         torque = robot.kinematics.holding_torque(theta)
@@ -325,7 +356,7 @@ class ForeignArm(Arm):
         self._model.dof_frictionloss[joints] += load * draw.about('joint_friction', len(joints))
 
     def _root_pose(self) -> pin.SE3:
-        """Return the pose of the robot's root link in the file's world frame, at mid-range.
+        """Return the pose of the robot's root link in the world frame of the MJCF file.
 
         `import_robot` may rename or remove links, and adds an upright root to a tilted one. The
         pose is therefore computed from the link that the file contains and that is nearest to the
@@ -360,7 +391,7 @@ class ForeignArm(Arm):
         self._sensors.stand(theta)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ, as `Arm.reset` does; the age of the arm is kept."""
+        """Put the arm at rest at θ [rad], (D,), as `Arm.reset` does; tendons do not become new."""
         super().reset(theta)
         self._memory.rest[:] = 1.0
         for m in range(self.robot.muscle_count):
@@ -382,7 +413,7 @@ class ForeignArm(Arm):
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
 
     def step(self, duration: float) -> None:
-        """Advance the time by `duration` [s], in whole steps of `STEP`."""
+        """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""
         self._memory.longer[:] = self._ageing.longer(duration)
         # The drift adds up, until `set_length_offset` sets the offsets anew.
         self._command.length_error[:] += self._ageing.drift * duration
@@ -413,7 +444,11 @@ class ForeignArm(Arm):
         self._sensors.append(self._sensed_quantities())
 
     def _sensed_quantities(self) -> Array:
-        """Return true θ, the modules' readings of l and T, and housing temperatures, joined."""
+        """Return all quantities that the sensors measure at this moment in one array, (D + 3 M,).
+
+        These are the true joint angles [rad], the lengths [m] and tensions [N] that the modules
+        read, and the temperatures of their housings [°C].
+        """
         memory, muscle = self._memory, self._muscle
         return np.concatenate([self.theta, memory.reading, memory.cell, muscle.housing])
 

@@ -49,7 +49,13 @@ class Individual:
     """True routes, elastic constants, friction and sensor errors of one arm."""
 
     def __init__(self, robot: Robot, seed: int, spread: Spread | None = None) -> None:
-        """Draw the individual `seed`, with the calibrated spread by default."""
+        """Draw an individual.
+
+        Args:
+            robot: The geometric model, from which the individual differs.
+            seed: Selects the individual.
+            spread: Sizes of the differences; by default the calibrated ones.
+        """
         spread = spread or Spread()
         rng = np.random.default_rng([seed, 0xB0D1])
         muscles, kin, nominal = robot.muscle_count, robot.kinematics, robot.routes
@@ -104,12 +110,12 @@ class Individual:
     def _redraw_jumping_routes(
         self, robot: Robot, off: Array, again: Array, routes: Callable[[Array], WrappedRoutes]
     ) -> None:
-        """Redraw route points until only those tendons jump that also jump in the model.
+        """Redraw the route points of tendons whose length jumps.
 
-        If all of `again` is used up, some tendons may still jump.
-
-        A tendon jumps by centimetres if it slips over the end of an object that it wraps around. No
-        one would route a tendon there.
+        If a tendon slips over the end of an object that it wraps around, its length jumps by
+        centimetres. No one would route a tendon there. Tendons that also jump in the geometric
+        model are not redrawn. If all deviations in `again` are used up, some tendons may still
+        jump.
 
         Args:
             robot: The geometric model.
@@ -133,15 +139,20 @@ class Individual:
         return wrapped_lengths(self.routes, q, Placed.empty(self.routes, self._muscles))
 
     def absolute_lengths(self, theta: Array) -> Array:
-        """Return the true route lengths [m] (N, M) for θ (N, D)."""
+        """Return the true route lengths [m], (N, M), for joint angles θ [rad], (N, D)."""
         return self._evaluate(theta)[0]
 
     def muscle_jacobian(self, theta: Array) -> Array:
-        """Return the true G [m/rad] (N, M, D) for θ (N, D)."""
+        """Return the true muscle Jacobian ∂l/∂θ [m/rad], (N, M, D), for joint angles (N, D)."""
         return self._kinematics.tree.of_theta(self._evaluate(theta)[1], theta)
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
-        """Return the true l [m] without friction and sensor errors, for θ (N, D) and T (N, M)."""
+        """Return the true muscle lengths [m], (N, M), without friction and sensor errors.
+
+        Args:
+            theta: Joint angles [rad], (N, D).
+            tension: Tensions [N], (N, M).
+        """
         absolute = self.absolute_lengths(theta)
         return absolute - self.length_at_zero - self.elastic.elongation(absolute, tension)
 
@@ -149,15 +160,23 @@ class Individual:
 def _objects(
     robot: Robot, point: Array, quantile: float, seed: int, thickness: Array
 ) -> WrapObjects:
-    """Return the object that each segment wraps around: a described one, or a bone's head.
+    """Return the object that each segment of the routes wraps around.
 
-    The radius of a described object differs slightly from the description, and is small enough that
-    the object does not enclose the true route points `point`. With a `quantile` of 0, described
-    objects are unchanged, and bones have no heads.
+    A segment wraps around the object that the robot description states, or else around the head of
+    a bone. The radius of a described object differs slightly from the description, and is small
+    enough that the object does not enclose the true route points.
 
-    A bone's head is centred at the revolute joint nearest to the tendon. The tendon touches the
-    head in about a share `quantile` of the postures. The head is smaller if the tendon could
-    otherwise slip over to the other side, or if the head would enclose the described route points.
+    A bone's head is centred at the revolute joint nearest to the tendon. The head is smaller than
+    `quantile` demands if the tendon could otherwise slip over to the other side, or if the head
+    would enclose the described route points.
+
+    Args:
+        robot: The geometric model.
+        point: True route points in the frames of their joints [m], (P, 3).
+        quantile: Approximate share of the postures in which a tendon touches a bone's head. With 0,
+            bones have no heads, and described objects are unchanged.
+        seed: Selects the individual.
+        thickness: Factor of the radius of the bone's head for each segment.
     """
     kin, routes = robot.kinematics, robot.routes
     count = len(routes.first)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """MuJoCo model of a robot, built from its directory or from a user's MJCF file.
 
-MuJoCo simulates rigid bodies, wrapping, joint stops and joint friction. Our muscle modules act on
-its tendons; the actuators of a file are removed.
+MuJoCo simulates rigid bodies, wrapping, joint stops and joint friction. The emulated muscle modules
+(`modules.py`) act on MuJoCo's tendons; the actuators of a file are removed.
 """
 
 from collections.abc import Iterator
@@ -64,7 +64,7 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
 
 
 def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
-    """Return an MjSpec of a robot's links and joints with deviations, and each joint's body."""
+    """Return an individual's links and joints as an MjSpec, and the MuJoCo body of each joint."""
     kin, spec = robot.kinematics, mujoco.MjSpec()
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
@@ -121,10 +121,11 @@ def _drawn_springs(robot: Robot, draw: Draw) -> JointElasticity:
 
 
 def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
-    """Add the springs of the joints; springs that couple joints become fixed tendons.
+    """Add the springs of the joints to a MuJoCo model.
 
-    The stiffness matrix of the coupled joints is represented by one spring for each of its
-    eigenvectors v. Each spring acts along the coordinate v · θ.
+    MuJoCo has no springs between joints. The stiffness matrix of joints that springs couple is
+    therefore represented by fixed tendons with stiffness, one for each eigenvector v of the matrix.
+    Each of them acts along the coordinate v · θ of the joint angles θ.
     """
     off = springs.stiffness - np.diag(np.diag(springs.stiffness))
     for k in np.flatnonzero(~off.any(axis=1)).tolist():
@@ -152,7 +153,13 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
     """Add the tendons: route points with deviations, and objects that the tendons wrap around.
 
     The objects are those of the description, and heads of bones or bellies of other muscles.
-    `again` holds how often the deviations of each muscle's route points are redrawn, (M,).
+
+    Args:
+        robot: The robot.
+        draw: The random draws of the individual.
+        again: How often the deviations of each muscle's route points are redrawn, (M,).
+        spec: The MjSpec, to which tendons, sites and objects are added.
+        bodies: The MuJoCo body of each joint.
     """
     kin, off, rng = robot.kinematics, draw.rng('attachment'), draw.rng('heads')
     poses = kin.tree.joint_poses(robot.random_postures(POSTURES, draw.rng('postures')))
@@ -203,7 +210,11 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
 
 
 def _bellies(robot: Robot) -> list[tuple[str, Obstacle]]:
-    """Return (muscle, belly) for every section of every route, with joints at mid-range."""
+    """Return the bellies of all muscles, each with the name of its muscle.
+
+    Every straight section of a route has a belly, along the section as it is with all joints at
+    mid-range. Other tendons may wrap around it.
+    """
     kin, bellies = robot.kinematics, list[tuple[str, Obstacle]]()
     poses = kin.tree.joint_poses(0.5 * (robot.lower + robot.upper)[None])
     turn, origin = poses.rotation[0], poses.translation[0]
@@ -228,14 +239,23 @@ def _obstacle(
     kink: float,
     cylinder: bool,
 ) -> tuple[int, Array, Array, float]:
-    """Return joint, centre, axis and radius [m] of the object that bends a tendon between two ends.
+    """Choose an object around which a straight section of a tendon wraps.
 
-    Centre and axis are in the frame of the joint, which is given by its index. The radius is 0 if
-    there is no such object.
+    Candidates are the heads of bones at joints between the ends of the section, and the bellies of
+    other muscles. The tendon may slip over the object to the other side.
 
-    Candidates are the heads of bones at joints between the ends, and the bellies of other muscles.
-    The object lengthens the tendon by `kink` [m] in at least one posture, or by as much as
-    possible. The tendon may slip over it to the other side.
+    Args:
+        kin: The kinematics of the robot.
+        poses: Poses of the joints in N postures.
+        ends: The two ends of the section.
+        others: The bellies of other muscles.
+        kink: Length by which the object lengthens the tendon in at least one posture [m]; less if
+            no object can do so.
+        cylinder: Whether the object is a cylinder instead of a sphere.
+
+    Returns:
+        Index of the joint that carries the object; centre [m] and axis of the object in the frame
+        of this joint; radius of the object [m], 0 if there is no object.
     """
     between = kin.tree.descends_from[ends[0][0]] ^ kin.tree.descends_from[ends[1][0]]
     joints = np.flatnonzero(between & ~kin.tree.prismatic)
@@ -298,9 +318,9 @@ def _loading(file: Path) -> Iterator[None]:
 
 
 def from_file(robot: Robot, file: Path) -> Any:
-    """Return the compiled model of a user's MJCF file, with our motors.
+    """Return the compiled model of a user's MJCF file, with a motor on the tendon of each muscle.
 
-    Joints that the robot does not have are held in the position that `import_robot` uses.
+    Joints that the robot does not have are fixed in the position that `import_robot` uses.
 
     Raises:
         MusculoskeletalError: If MuJoCo cannot load the file, or the file lacks a joint, tendon or
@@ -423,9 +443,16 @@ def _equalities(spec: Any, kind: Any, names: set[str]) -> list[Any]:
 def _placements_of_held(
     model: Any, spec: Any, held: list[Any]
 ) -> list[tuple[Any, dict[str, Array]]]:
-    """Return the bodies and joints whose placement in their parent depends on held joints.
+    """Return the new placements of bodies and joints after the held joints have been removed.
 
-    Each is paired with the values that it needs in the model without the held joints.
+    Args:
+        model: The compiled model, with all joints.
+        spec: The MjSpec of the model.
+        held: The joints that are fixed in their position and removed.
+
+    Returns:
+        For each body or joint whose placement in its parent depends on a held joint, the values of
+        the model's fields (such as 'body_pos') that it must have without the held joints.
     """
     rest, data = resting_joints(model), mujoco.MjData(model)
     for joint in held:
@@ -450,7 +477,7 @@ def _placements_of_held(
 
 
 def _rename_as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> str:
-    """Give joints and tendons the names that `import_robot` gives them; return the hand's body.
+    """Rename the joints and tendons of a file as `import_robot` does, and find the hand's body.
 
     Args:
         spec: The model of the file, changed in place.

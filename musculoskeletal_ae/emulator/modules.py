@@ -6,10 +6,11 @@
     position   dl/dt = (l_target − l)/POSITION_LAG, within the speed of the module; T ≤ T_max
     heat       C₁ ċ₁ = k T² − (c₁−c₂)/R₁,  C₂ ċ₂ = (c₁−c₂)/R₁ − (c₂−c_a)/R₂
 
-c₁, c₂ and c_a are the temperatures of winding, housing and surroundings. In MSC and motor control,
-l and T are the readings of the module's own sensors. `muscles.yaml` says whether the modules follow
-MSC or positions (`actuation`). A position-controlled module holds its length while it gets no
-commands, and pays out while its tension exceeds T_max.
+MSC is muscle stiffness control with the stiffness K. Except for heat, l and T are the length and
+tension that the module's own sensors read. `muscles.yaml` says whether the modules follow MSC or
+positions (`actuation`). A position-controlled module holds its length while it gets no commands,
+and pays out while its tension exceeds T_max. c₁, c₂ and c_a are the temperatures of winding,
+housing and surroundings, with the heat capacities C and the thermal resistances R.
 """
 
 import math
@@ -60,7 +61,7 @@ MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the ori
 
 
 def joint_gear(kinematics: Kinematics) -> Array:
-    """Return the factor of damping, stops and inertia for each joint of the tree, (J,).
+    """Return the factor of damping, stop stiffness and motor inertia for each joint, (J,).
 
     The factor is 1 for revolute joints. A prismatic joint is driven by a pinion of radius RACK, so
     its factor is 1/RACK² [1/m²].
@@ -112,9 +113,14 @@ class MuscleState(NamedTuple):
 
 @njit(cache=True)
 def friction_state(state: float, moved: float, distance: float) -> float:
-    """Return the state in [−1, 1] of Dahl's friction, which was `state`, after sliding by `moved`.
+    """Return the new state of Dahl's friction model after sliding.
 
-    `distance` is the sliding distance over which the state changes, in the unit of `moved`.
+    At ±1, friction has its full size and opposes the motion.
+
+    Args:
+        state: State before, in [−1, 1].
+        moved: Signed sliding distance [m] or [rad].
+        distance: Sliding distance over which friction builds up, in the unit of `moved`.
     """
     direction = 1.0 if moved > 0.0 else -1.0
     return direction + (state - direction) * math.exp(-abs(moved) / distance)
@@ -125,10 +131,19 @@ def wind(
     modules: Modules, muscle: MuscleState, kind: int, command: Command, m: int,
     reading: float, tension: float,
 ) -> float:  # fmt: skip
-    """Turn motor m for one STEP as its control law demands; return how far it has wound in [m].
+    """Turn the motor of one module for one step of 1 ms, as its control law demands.
 
-    `reading` [m] and `tension` [N] are what the sensors of the module read; `kind` is SAFE,
-    FOLLOW_LENGTH or FOLLOW_TENSION.
+    Args:
+        modules: Constants of all modules.
+        muscle: State of all muscles, changed in place.
+        kind: Mode of the modules: SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
+        command: Commands to all modules, and their faults.
+        m: Index of the module.
+        reading: Length that the module's sensor reads [m].
+        tension: Tension that the module's sensor reads [N].
+
+    Returns:
+        The length of tendon that was wound in [m]; negative if it was paid out.
     """
     previous, bias = muscle.reference[m], modules.tension_bias[m]
     most = min(modules.speed[m], SPEED_LIMIT * (1.0 - command.stuck[m]))
@@ -155,7 +170,10 @@ def wind(
 
 @njit(cache=True)
 def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
-    """Turn motor m at a speed [m/s] for one STEP; return how far it has wound in [m]."""
+    """Turn motor m for one step of 1 ms, and return the length that was wound in [m].
+
+    A positive `speed` [m/s] pays out. The motor stops at the limits of its length.
+    """
     before = muscle.length[m]
     after = min(modules.length_high[m], max(modules.length_low[m], before + STEP * speed))
     muscle.length[m] = after
@@ -164,7 +182,7 @@ def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
 
 @njit(cache=True)
 def heat(modules: Modules, muscle: MuscleState, command: Command, m: int) -> None:
-    """Update the temperatures of module m after one STEP at its present tension."""
+    """Update the temperatures of module m after one step of 1 ms at its present tension."""
     inner = (muscle.winding[m] - muscle.housing[m]) / modules.winding_resistance[m]
     outer = (muscle.housing[m] - AMBIENT) / modules.housing_resistance[m]
     loss = modules.loss[m] * muscle.tension[m] * muscle.tension[m]
@@ -228,8 +246,9 @@ class Arm(ABC):
     def _make_modules(self, span: Array, stretch: Array) -> Modules:
         """Return the modules' constants.
 
-        `span` are relative route lengths [m] in N postures, (N, M); `stretch` is L_e at T_max [m],
-        (M,).
+        Args:
+            span: Route lengths relative to those at θ = 0 [m], in N postures, (N, M).
+            stretch: Elongation of each series elastic element and tendon at T_max [m], (M,).
         """
         low, high = span.min(axis=0) - stretch - 0.05, span.max(axis=0) + 0.05
         tension = self.robot.tension
@@ -244,10 +263,13 @@ class Arm(ABC):
         return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ and at ambient temperature; mend ruptured tendons.
+        """Put the arm at rest and at ambient temperature, and repair ruptured tendons.
 
-        The external wrench ends, and the modules are in the safe state at T_bias. The default θ is
-        0, clipped to the joint limits. Payload, length offsets and `faults` are kept.
+        The external wrench ends. All muscles carry T_bias, and the modules wait for the first
+        command. Payload, length offsets and `faults` do not change.
+
+        Args:
+            theta: Joint angles [rad], (D,), which are clipped to the joint limits; by default 0.
         """
         posture = np.zeros(self.robot.joint_count) if theta is None else np.asarray(theta, float)
         self._stand(np.clip(posture, self.robot.lower, self.robot.upper))
@@ -302,7 +324,7 @@ class Arm(ABC):
 
     @property
     def has_diverged(self) -> bool:
-        """Whether excessive forces made the posture non-finite; `reset` clears it."""
+        """Whether a joint angle is NaN or infinite because of excessive forces, until `reset`."""
         return not np.isfinite(self.theta).all()
 
     @property
@@ -342,7 +364,8 @@ class Arm(ABC):
     def set_length_offset(self, offset: Array | Sequence[float]) -> None:
         """Set offsets of the length sensors [m]: one for all muscles, or one for each.
 
-        They are added to the offsets of the individual, and replace earlier offsets and drift.
+        The offsets are added to those of the individual. They replace offsets set earlier, and the
+        drift of the sensors so far.
 
         Raises:
             MusculoskeletalError: If the number of offsets is neither 1 nor M; nothing changes then.
@@ -365,9 +388,9 @@ class Arm(ABC):
         self._attach(repaired)
 
     def set_faults(self, lines: Iterable[str]) -> None:
-        """Activate the faults of the lines and end all others.
+        """Activate the faults that the lines describe, and end all other faults.
 
-        Tendons that become shorter, because a 'slack' fault ends, return to T_bias.
+        Muscles whose tendon becomes shorter, because a fault 'slack' ends, return to T_bias.
 
         Raises:
             MusculoskeletalError: If a line is not legal; nothing changes then.
@@ -377,7 +400,7 @@ class Arm(ABC):
         self._attach((self.faults.slack < before) & (self._muscle.ruptured == 0.0))
 
     def step(self, duration: float) -> None:
-        """Advance the time by `duration` [s], in whole steps of `STEP`."""
+        """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""
         for _ in range(round(duration / STEP)):
             self._age += STEP
             if self._age > self.command_timeout:
@@ -386,11 +409,15 @@ class Arm(ABC):
 
     @abstractmethod
     def _step(self) -> None:
-        """Advance the time by one `STEP`."""
+        """Advance the time by one step of 1 ms."""
 
     @abstractmethod
     def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
-        """Return θ [rad] (D,), l [m], T [N] and temperatures [°C] (M,) before adding noise."""
+        """Return the readings of all sensors without noise, rounding and faults.
+
+        Returns:
+            Joint angles [rad], (D,); lengths [m], tensions [N] and temperatures [°C], each (M,).
+        """
 
     def sense(self) -> Readings:
         """Read all sensors once, with noise, bias, resolution and faults."""
@@ -411,12 +438,13 @@ class Arm(ABC):
         return readings._replace(tension=self.robot.tension_source.known(readings.tension))
 
     def _read_currents(self, tension: Array) -> Array:
-        """Return T_read [N], (M,), converted from noisy motor currents.
+        """Return the tensions that noisy motor currents indicate [N], (M,).
 
-        The motors carry the drive friction in addition to the tension of their tendons.
+        They include the friction of the drive, which a motor carries in addition to the tension of
+        its tendon.
 
         Args:
-            tension: T before noise [N], (M,), as from `_raw_readings`.
+            tension: Tensions without noise [N], (M,), as from `_raw_readings`.
         """
         muscle = self._muscle
         load = np.where(muscle.ruptured > 0.0, 0.0, tension)
