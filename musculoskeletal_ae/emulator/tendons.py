@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """One step of the tendons, rubber elements and spools of emulator model `foreign`, by numba.
 
-element    x = g(T_end) (1 − h s_x / 2),  |s_x| ≤ 1      each muscle has its own law g
-slow       x = f(θ) − l − slack − Σ e_i,   τ_i ė_i = c_i − e_i      creep, delayed stretch
-guides     T = T_end exp(μ φ(θ) s (1 + p))      φ: bend of the tendon; p: stiction
-load cell  (1 + a) T + b + non-linearity + drift · (temperature − 25 °C)
-spool      l (1 + gain) + share of the second layer + eccentricity · sin(l / radius)
-give       route points yield to their own load, with a low-pass filter
+    element    x = g(T_end) (1 − h s_x / 2),  |s_x| ≤ 1
+    slow       x = f(θ) − l − slack − Σ e_i,   τ_i ė_i = c_i − e_i
+    guides     T = T_end exp(μ φ(θ) s (1 + p))
+    load cell  (1 + a) T + b + non-linearity + drift · (temperature − 25 °C)
+    spool      l (1 + gain) + share of the second layer + eccentricity · sin(l / radius)
+    give       route points yield to their own load, with a low-pass filter
+
+The element of each muscle has its own law g, by which the elongation x follows from the bone-side
+tension T_end, and a hysteresis loop of the width h with the state s_x. x is the relative route
+length f(θ) minus the motor-side length l, the slack, and slow elongations e_i. These are creep and
+the delayed stretch of the tendon; each approaches c_i with the time constant τ_i. The motor-side
+tension T follows from tendon friction μ per radian, the bend φ of the tendon, the direction s of
+sliding, and stiction p. The load cell and the spool have errors as sensors of T and l.
 """
 
 import math
@@ -44,9 +51,12 @@ class Springs:
     """Laws of M series elastic elements with their tendons: tables of elongation over tension."""
 
     def __init__(self, robot: Robot, at_zero: Array, draw: Draw) -> None:
-        """Draw the laws; `at_zero` are the tendon lengths at θ = 0 [m], (M,).
+        """Draw the laws, which deviate from the series elastic elements of the robot description.
 
-        The robot's series elastic elements serve as the data sheet, from which the laws deviate.
+        Args:
+            robot: The robot.
+            at_zero: Tendon lengths at θ = 0 [m], (M,).
+            draw: The random draws of the individual.
         """
         sheet, limit, count = robot.series_elastic, robot.tension.limit, robot.muscle_count
         self.tension: Array = np.linspace(0.0, 1.5, KNOTS)[:, None] * robot.tension.max
@@ -80,11 +90,14 @@ class Springs:
         self.spacing: Array = even[1]
 
     def elongation(self, tension: Array) -> Array:
-        """Return the immediate elongation [m] for T [N] (..., M), without hysteresis."""
+        """Return the elongations [m], (..., M), at tensions [N], (..., M).
+
+        Hysteresis, creep and delayed stretch are not included.
+        """
         return self._read(self.table, tension)
 
     def compliance(self, _absolute: Array, tension: Array) -> Array:
-        """Return the derivative of `elongation` at T [N] (..., M), [m/N] (..., M)."""
+        """Return the derivatives of the elongations [m/N], (..., M), at tensions [N], (..., M)."""
         slopes = [np.gradient(x, t) for x, t in zip(self.table.T, self.tension.T)]
         return self._read(np.transpose(slopes), tension)
 
@@ -161,7 +174,10 @@ def make_tendons(
 
 @njit(cache=True)
 def law(tendons: Tendons, m: int, elongation: float) -> float:
-    """Return T [N] of element m at an elongation [m]; beyond its table, T is extrapolated."""
+    """Return the tension [N] of the elastic element of muscle m at an elongation [m].
+
+    The tension is 0 if the elongation is negative, and is extrapolated beyond the element's table.
+    """
     if elongation <= 0.0:
         return 0.0
     at, table = min(elongation / tendons.spacing[m], 10.0 * KNOTS), tendons.table[m]
@@ -171,7 +187,10 @@ def law(tendons: Tendons, m: int, elongation: float) -> float:
 
 @njit(cache=True)
 def spooled(tendons: Tendons, m: int, length: float) -> float:
-    """Return the length sensor's reading of l [m], without its offset and drift."""
+    """Return what the length sensor of muscle m reads [m], apart from its offset and drift.
+
+    `length` is the true motor-side length [m].
+    """
     turned, phase = length / SPOOL, tendons.phase[m]
     wider = min(0.0, length - tendons.layer_start[m]) - min(0.0, -tendons.layer_start[m])
     off = tendons.spool_gain[m] * length + tendons.spool_layer[m] * wider
@@ -180,7 +199,10 @@ def spooled(tendons: Tendons, m: int, length: float) -> float:
 
 @njit(cache=True)
 def load_cell(tendons: Tendons, m: int, tension: float, temperature: float) -> float:
-    """Return the tension sensor's reading [N] of T [N] at a temperature [°C]."""
+    """Return what the tension sensor of muscle m reads [N].
+
+    `tension` is the true motor-side tension [N], `temperature` that of the module's housing [°C].
+    """
     full = tendons.full_scale[m]
     share = min(1.0, tension / full)
     off = tendons.tension_zero[m] + tendons.tension_drift[m] * (temperature - AMBIENT)
@@ -205,15 +227,20 @@ GuideParts = namedtuple('GuideParts', 'guides tension bend')
 
 @njit(cache=True)
 def make_handle(parts: TendonParts | GuideParts) -> Handle:
-    """Return a handle to `parts`, which `tendons_step` or `guides_step` takes as an argument."""
+    """Pack `parts` into one argument for `tendons_step` or `guides_step`; arrays are shared."""
     return Handle(parts)
 
 
 @njit(cache=True)
 def tendons_step(arm: Handle, kind: int, absolute: Array, control: Array) -> None:
-    """Advance the motors by one STEP and write the negative tendon tensions to `control` [N] (M,).
+    """Advance muscle modules and tendons by one step of 1 ms.
 
-    `arm` is a handle to TendonParts; `absolute` are the lengths of the routes [m], (M,).
+    Args:
+        arm: Handle to the TendonParts, which are changed in place.
+        kind: Mode of the modules: SAFE, FOLLOW_LENGTH or FOLLOW_TENSION.
+        absolute: Lengths of the routes [m], (M,).
+        control: Receives the bone-side tensions with a negative sign [N], (M,), as MuJoCo expects
+            them of motors that pull.
     """
     tendons, constants, muscle, memory, command = arm.held
     for m in range(absolute.shape[0]):
@@ -247,7 +274,9 @@ def tendons_step(arm: Handle, kind: int, absolute: Array, control: Array) -> Non
 def guides_step(arm: Handle, duration: float) -> None:
     """Update the bends of the tendons, and let route points yield to their load.
 
-    `arm` is a handle to GuideParts; `duration` is the time since the last call [s].
+    Args:
+        arm: Handle to the GuideParts, which are changed in place.
+        duration: Time since the last call [s].
     """
     guides, tension, bend = arm.held
     line, load, i = np.zeros(3), np.zeros(3), 0

@@ -2,9 +2,9 @@
 """Muscle routes that wrap around bones, compiled by numba: the true lengths of the emulated arm.
 
 A segment between two route points may wrap around a sphere (a bone's head) that the geometric model
-of `robot/routes.py` does not contain. Segments that the robot description wraps also wrap here,
-around an object of a slightly different size. `robot/wrapping.py` computes the path of the tendon
-on either kind of object.
+of `robot/routes.py` does not contain. If the robot description already states an object around
+which a segment wraps, the emulated object has a slightly different size. `robot/wrapping.py`
+computes the path of the tendon on either kind of object.
 """
 
 from __future__ import annotations
@@ -171,7 +171,17 @@ def add_torque(
     tree: Tree, placed: Placed, joint: int, point: Vector, force: Array, scale: float,
     torque: Array,
 ) -> None:  # fmt: skip
-    """Add scale · Jᵀ force to `torque` (J−1,), for a force at a point of a joint's body."""
+    """Add the torques that a force exerts on all joints between a body and the root link.
+
+    Args:
+        tree: The joints.
+        placed: Their poses.
+        joint: Index of the joint that carries the body.
+        point: Point at which the force acts, in the root link's frame [m].
+        force: The force divided by `scale`, in the axes of the root link.
+        scale: Factor of the force.
+        torque: Generalised torques of the tree's joints, (J−1,), to which the torques are added.
+    """
     while joint > 0:
         axis = placed.axis[joint]
         if tree.prismatic[joint]:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoint validation: a candidate network must explain the arm before it takes over.
+"""Checkpoint validation: tests whether a candidate network is accurate enough to be used.
 
 Four checks compare a candidate with the geometric model, the arm and the network in use:
 
     validation/postures.py        errors on fixed states of the geometric model
     validation/message_errors.py  errors on the healthy messages of the last seconds
-    validation/agreement.py       differences of θ and l; the reference is joint sensors, or else
-                                  the network in use
-    validation/detector.py        a calibrated detector is silent on these messages, and would
-                                  detect a rupture
+    validation/agreement.py       differences of joint angles and lengths; the reference is joint
+                                  sensors, or else the network in use
+    validation/detector.py        a calibrated anomaly detector reports nothing on these messages,
+                                  and would detect a rupture
 
 The first network is only subject to the first and the last check, because its error on a body that
 differs from its model cannot be predicted. A network that a user has chosen is not subject to
@@ -17,12 +17,12 @@ networks of both presets, on arm26 and musashi_left_arm, with both emulator mode
 bench gate` prints these values, and the values of networks that must be rejected.
 
 A candidate without a calibrated detector inherits the detector in use, which would otherwise be
-switched off. A muscle that was repaired within the last RELEARNING_TIME seconds may be relearned,
+switched off. A muscle that was repaired within the last 600 s (RELEARNING_TIME) may be relearned,
 and its residuals then differ from the calibrated ones. The inherited detector ignores this
 muscle and judges all others, until a network with a calibrated detector of its own takes over.
 
-When an anomaly is detected, networks that took over less than PROOF seconds ago are discarded,
-except for the oldest one, and the newest of the remaining networks takes over again.
+When an anomaly is detected, the networks that took over less than 10 s ago (PROOF) are discarded,
+except for the oldest network. The newest of the remaining networks is used again.
 """
 
 from collections import deque
@@ -77,10 +77,10 @@ class CheckpointValidator:
         """Record a measurement on which candidates are tested.
 
         Args:
-            tension: T_read [N], (M,).
-            length: l [m], (M,).
+            tension: Tensions as read [N], (M,).
+            length: Muscle lengths [m], (M,).
             now: Time of the measurement [s].
-            theta: Measured θ [rad], (D,), or None.
+            theta: Joint angles from joint sensors [rad], (D,), or None if there are none.
         """
         self._messages.note(tension, length, now, theta, is_healthy=not self._is_anomaly)
 
@@ -130,7 +130,7 @@ class CheckpointValidator:
             raise GateError('; '.join(faults))
 
     def declare_repaired(self, muscles: Iterable[int], now: float) -> None:
-        """Record that a user has repaired muscles (indices) and declares them healthy."""
+        """Record that a user has repaired these muscles (indices) and declares them healthy."""
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
@@ -142,12 +142,13 @@ class CheckpointValidator:
             del self._used[1]  # the oldest network stays, because it is most likely to be proven
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
-        """Record whether an anomaly is detected; when one begins, roll back unproven networks.
+        """Record whether an anomaly is present, and return to a proven network when one begins.
 
-        The newest proven network is then in use, or the oldest network if none is proven.
+        A network is proven after 10 s in use without an anomaly. The newest proven network is used
+        again, or the oldest network if none is proven.
 
         Returns:
-            The network that takes over again, or None if there is no rollback.
+            The network that is used again, or None if the network in use does not change.
         """
         if detected == self._is_anomaly:
             return None
@@ -166,9 +167,9 @@ class CheckpointValidator:
         return message_errors.message_errors(mae, self._messages, self.isolated)
 
     def agreement(self, mae: Mae) -> list[Comparison]:
-        """Return the comparisons of a network with joint sensors or with the network in use.
+        """Compare a network with joint sensors or, without them, with the network in use.
 
-        The result is [] if no network is in use.
+        Return [] if no network is in use.
         """
         if self.mae is None:
             return []
@@ -177,10 +178,11 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def detector_measures(self, mae: Mae) -> Iterator[float]:
-        """Yield the measures of a network's detector (`validation/detector.py` defines them).
+        """Yield how far a network's anomaly statistic is from its threshold on recent messages.
 
-        The first measure is of the recent messages. Each following measure is of the same messages
-        with the tension of one muscle set to 0, as if it were ruptured.
+        The first value is that of the recent messages as they are. Each following value is that of
+        the same messages with the tension of one muscle set to 0, as if the muscle were ruptured.
+        `validation/detector.py` defines the values.
         """
         return detector.measures(mae, self._messages, self.isolated)
 
@@ -198,7 +200,7 @@ class CheckpointValidator:
         return detector.with_detector_of(statistics, mae, self._messages, self.isolated)
 
     def _steps(self, mae: Mae, is_chosen: bool) -> Iterator[str | None]:
-        """Yield each fault of a candidate, or None after each piece of work."""
+        """Check a candidate step by step; yield a text for each fault, or None between steps."""
         yield from self.postures.faults(mae)
         if self.mae is not None:
             errors = self.message_errors(mae)

@@ -5,13 +5,17 @@
     F     = argmin Σ_j ((JᵀF − τ_ext)_j / σ_j)² + ‖F‖²/F₀²,   without a moment at the hand
     d     = √(Σ_j (τ_ext,j / σ_j)²),   contact: d > CONTACT in IN_A_ROW consecutive messages
 
-M is the inertia matrix. h contains the torques due to velocity and weight, and those of the joints'
-springs and dampers. s is the direction in which a tendon slid last (`signals/friction.py`). θ and
-Gᵀ T_end pass through the same second-order low-pass filter, which also gives θ̇ and θ̈. The result
-is the residual of the momentum observer (De Luca 2005) without numerical differentiation of noise.
-Tendon friction μ has to be known: unknown friction hides a contact force of 10 N. σ is the residual
-torque of the healthy moving arm (`estimation/healthy_torque.py`). The term with F₀ keeps those
-components of F small that produce no joint torque, such as the component along a stretched arm.
+τ_ext is the external torque at the joints, F the force at the hand, and d the evidence for contact.
+M is the inertia matrix, G the muscle Jacobian ∂l/∂θ, and J the Jacobian of the hand. h contains the
+torques due to velocity and weight, and those of the joints' springs and dampers. The bone-side
+tension T_end follows from the measured tension T, tendon friction μ, and the direction s in which a
+tendon slid last (`signals/friction.py`). σ is the residual torque of the healthy moving arm
+(`estimation/healthy_torque.py`). The term with F₀ keeps those components of F small that produce no
+joint torque, such as the component along a stretched arm.
+
+θ and Gᵀ T_end pass through the same second-order low-pass filter, which also yields θ̇ and θ̈. The
+result is the residual of the momentum observer (De Luca 2005), without numerical differentiation
+of noise. Tendon friction has to be known: unknown friction hides a contact force of 10 N.
 
 At a joint limit, the unknown torque of the stop is added to τ_ext. A computed torque that points
 away from the stop may be due to the stop alone and therefore counts as 0. If the computed torque
@@ -48,11 +52,12 @@ class Contact(NamedTuple):
     """External load estimated from one message.
 
     Attributes:
-        torque: τ_ext [N·m], (D,); 0 where a stop may be its only cause.
-        force: Function that returns F [N], (3,), acting on the origin of the end effector, in the
-            axes of the root link. It is a function, because few callers need the force.
-        distance: d; NaN if the residual torque of the healthy arm has not been calibrated, or if a
-            reading is not finite.
+        torque: External torques at the joints [N·m], (D,); 0 where the stop of a joint may be the
+            only cause.
+        force: Function that computes the force [N], (3,), which acts on the origin of the end
+            effector, in the axes of the root link. It is a function because few callers need it.
+        distance: Root sum square of the torques, each divided by its standard deviation on the
+            healthy arm; NaN if this deviation is not calibrated, or if a reading is not finite.
         is_contact: Whether there is contact.
     """
 
@@ -65,7 +70,9 @@ class Contact(NamedTuple):
 class LowPass:
     """A second-order low-pass filter that also returns the derivatives of its output.
 
-    ÿ = ω (ω (u − y) − ẏ)
+        ÿ = ω (ω (u − y) − ẏ)
+
+    u is the input, y the output, and ω the bandwidth [1/s].
     """
 
     def __init__(self, bandwidth: float) -> None:
@@ -78,9 +85,12 @@ class LowPass:
         self._value = None
 
     def step(self, value: Array, dt: float) -> tuple[Array, Array, Array]:
-        """Filter an input u that arrives dt [s] after the previous one; return y, ẏ and ÿ.
+        """Filter an input that arrives dt [s] after the previous one.
 
-        The implicit Euler method is stable at any dt.
+        The equation is integrated by the implicit Euler method, which is stable at any dt.
+
+        Returns:
+            The output y and its derivatives ẏ [1/s] and ÿ [1/s²], each of the shape of `value`.
         """
         if self._value is None:
             self._value, self._rate = value, np.zeros_like(value)
@@ -93,7 +103,7 @@ class LowPass:
 
 
 class ContactEstimator:
-    """Estimates the external load message by message. `use` has to be called first.
+    """Estimates the external load message by message. `use` must be called before `step`.
 
     Attributes:
         velocity: Filtered θ̇ [rad/s], (D,).
@@ -133,8 +143,8 @@ class ContactEstimator:
         """Return the external load at one message.
 
         Args:
-            theta: θ [rad], (D,).
-            end_tension: T_end [N], (M,).
+            theta: Joint angles [rad], (D,).
+            end_tension: Bone-side tensions [N], (M,).
             dt: Time since the previous message [s].
         """
         kinematics, joint_count = self._robot.kinematics, len(theta)

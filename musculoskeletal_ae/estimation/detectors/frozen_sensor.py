@@ -31,7 +31,7 @@ class FrozenSensor(Detector):
         self._shortest, self._longest = np.inf, -np.inf
 
     def use(self, mae: Mae) -> None:
-        """Use this network."""
+        """Use another network to predict lengths; its isolated muscles are ignored."""
         self._mae, self._robot = mae, self._complete_robot.without(mae.isolated)
         self._stop_observing()
 

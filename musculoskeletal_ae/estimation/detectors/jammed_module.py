@@ -3,12 +3,16 @@
 
     |T − T_ref| > max(JAM, JAM_SHARE · T_ref) and |Δl| < STANDS for JAM_TIME
 
-A position-controlled module has no T_ref. It is jammed if it neither reaches l_target nor moves,
-although it could pull harder:
+T is the measured and T_ref the commanded tension; Δl is the change of the muscle length since the
+winch moved last. The names in capitals are constants of this file.
+
+A position-controlled module has no T_ref. It is jammed if it neither reaches its target length
+l_target nor moves, although it could pull harder:
 
     |l − l_target| > BEHIND, T ≤ FULL · T_max and |Δl| < STANDS for JAM_TIME
 
-The readings of a jammed module may be consistent with a posture, so residuals may not reveal it.
+The readings of a jammed module may be consistent with a posture. The residuals of the network then
+do not reveal the fault.
 """
 
 import numpy as np
@@ -46,7 +50,7 @@ class JammedModule(Detector):
         self._time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the winch that has been stationary longest, if that is at least JAM_TIME."""
+        """Report the winch that has been stationary longest, if at least for 1 s; or None."""
         is_far, length = self._is_far(observation), observation.sample.length
         if is_far is None:
             self._time[:] = 0.0
@@ -65,7 +69,7 @@ class JammedModule(Detector):
         return Finding(muscle, Kind.JAMMED_MODULE, 'its winch does not follow the commands')
 
     def _is_far(self, observation: Observation) -> Bools | None:
-        """Return a mask (M,) of modules that are far from T_ref, or None without a command."""
+        """Return which modules are far from the commanded tension, (M,); None without a command."""
         tension, most = observation.sample.motor_tension, self._robot.tension.max
         if observation.demand is None:
             return None
@@ -75,10 +79,10 @@ class JammedModule(Detector):
 
 
 class JammedPosition(JammedModule):
-    """Measures how long each position-controlled winch has been stationary off its l_target."""
+    """Measures how long each position-controlled winch has been stationary away from its target."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
-        """Return a mask (M,) of modules that are far from l_target and could pull harder, or None.
+        """Return which modules are far from their target length and could pull harder, (M,).
 
         The result is None without a command.
         """

@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects that muscle lengths and joint sensors indicate different postures.
 
-    g = l − ①(θ, T_end),   θ from joint sensors; g is the median over COUNT · SPACING seconds
-    Δ = g − g_usual,       g_usual: median of g in healthy messages
+    g = l − l_net(θ, T_end)
+    Δ = g − g_usual
+
+l are the measured muscle lengths. l_net are the lengths that the network computes from the joint
+angles θ of the joint sensors and the bone-side tensions T_end. g is the median over the last
+second, and g_usual the median of g in healthy messages.
 
 If all joints are measured, g is the error of every muscle's length. On a healthy arm it is small
 and changes little with the posture. When the length offset of a module jumps or drifts, g changes
 by as much as the offset.
 
-A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ. Because
-muscles outnumber joints, arbitrary errors of lengths rarely have this form. If some δθ explains
-most of Δ, the joint sensor with the largest δθ is reported; otherwise, the lengths are reported.
+A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
+is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
+have this form. If some δθ explains most of Δ, the joint sensor with the largest δθ is reported;
+otherwise, the lengths are reported.
 
-A healthy tendon whose length is below ①(θ, T_end) is stretched. If such a tendon has no tension, it
-is ruptured, and its muscle is reported, provided that the lengths of all others agree with θ. This
-is how a rupture is detected while no commands arrive.
+If a tendon is shorter than l_net, a healthy one would be stretched and have tension. If such a
+tendon has no tension, it is ruptured, and its muscle is reported, provided that the lengths of all
+other muscles agree with θ. This is how a rupture is detected while no commands arrive.
 """
 
 from collections import deque
@@ -35,13 +40,18 @@ LASTING = 1.0  # time for which Δ has to exceed its limits before it is reporte
 
 
 class Largest(NamedTuple):
-    """Limits of Δ, or of g itself while g_usual is unknown."""
+    """Largest tolerated differences between measured lengths and those of the network."""
 
     single: float  # largest absolute value of a single muscle [m]
     all: float  # largest root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return the ratio of a change [m] (M,) to its limits; a change above 1 is too large."""
+        """Return the ratio of length differences to these limits; above 1, they are too large.
+
+        Args:
+            change: Difference of each length [m], (M,).
+            used: The muscles in use, (M,).
+        """
         size = float(np.sqrt(np.square(change[used]).mean())) if used.any() else 0.0
         return max(float(np.abs(change).max()) / self.single, size / self.all)
 
@@ -71,10 +81,11 @@ UNEXPLAINED = 0.5
 
 
 class JointDisagreement(Detector):
-    """Compares measured muscle lengths with those that the network computes at the measured θ.
+    """Compares measured muscle lengths with those that the network computes for measured angles.
 
     Attributes:
-        gap: g [m], (M,); None without measurements.
+        gap: Measured minus computed length of each muscle [m], (M,); 0 for isolated muscles. None
+            without measurements of all joints.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -89,20 +100,20 @@ class JointDisagreement(Detector):
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Use this network, without the muscles that are isolated in it."""
+        """Use another network to compute lengths; its isolated muscles are ignored."""
         self._mae = mae
         self._used = ~np.isin(np.arange(self._robot.muscle_count), mae.isolated)
         self.reset()
         self._compute_usual()
 
     def reset(self) -> None:
-        """Discard the last messages; g_usual is kept, because it remains valid."""
+        """Discard the last messages, but not the usual difference, which remains valid."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Discard the last messages and g_usual, because the length offsets change."""
+        """Discard the last messages and the usual difference, when the length offsets change."""
         self.reset()
         self._healthy.clear()
         self._usual = None
@@ -119,7 +130,7 @@ class JointDisagreement(Detector):
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the lengths or a joint sensor if Δ has exceeded its limits for LASTING seconds."""
+        """Report lengths or a joint sensor if they have disagreed for more than 1 s; or None."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9 or self._mae is None:
             return None
@@ -152,7 +163,13 @@ class JointDisagreement(Detector):
             self._compute_usual()
 
     def _change(self, gap: Array) -> tuple[Array, Largest]:
-        """Return Δ [m] (M,) and its limits, or g and its limits while g_usual is unknown."""
+        """Return how much the lengths differ from what is usual [m], (M,), and the limits of that.
+
+        While the usual difference is unknown, it counts as 0, and the limits are wider.
+
+        Args:
+            gap: Measured minus computed lengths [m], (M,).
+        """
         assert self._mae is not None
         statistics = self._mae.anomaly
         has_learned = statistics is not None and statistics.calibrated
@@ -196,13 +213,13 @@ class JointDisagreement(Detector):
     def _is_ruptured(
         self, muscle: int, sample: MuscleSample, change: Array, largest: Largest
     ) -> bool:
-        """Return whether this muscle alone is too short, although it has no tension.
+        """Return whether a muscle has no tension, although it alone is shorter than computed.
 
         Args:
-            muscle: Index of the muscle with the largest Δ.
+            muscle: Index of the muscle whose length differs most.
             sample: The readings.
-            change: Δ [m], (M,).
-            largest: The limits of Δ.
+            change: Difference of each length from what is usual [m], (M,).
+            largest: The limits of these differences.
         """
         slack_tension = LIMITS.slack_share * self._robot.tension.bias[muscle]
         is_slack = sample.motor_tension[muscle] < slack_tension

@@ -2,7 +2,7 @@
 """Detects a muscle whose sensors report NaN for some time.
 
 Messages with NaN are rejected, so nothing is estimated while they arrive. If only one muscle has
-NaN, its sensor is faulty, and a verification is not necessary.
+NaN, its sensor is certainly faulty. The fault need not be verified by winding in the muscle.
 """
 
 import math
@@ -27,7 +27,7 @@ class MissingValues(Detector):
         self._since = self._last = -math.inf
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Report the only muscle with NaN in a message, if it has had NaN for SILENT seconds.
+        """Report the only muscle with NaN in a message, if it has had NaN for 0.15 s; or None.
 
         `Detector.read` describes the arguments.
         """
