@@ -178,8 +178,8 @@ def add_torque(
         placed: Their poses.
         joint: Index of the joint that carries the body.
         point: Point at which the force acts, in the root link's frame [m].
-        force: The force divided by `scale`, in the axes of the root link.
-        scale: Factor of the force.
+        force: The force in the axes of the root link, before it is multiplied by `scale`.
+        scale: Factor by which the force is multiplied.
         torque: Generalised torques of the tree's joints, (J−1,), to which the torques are added.
     """
     while joint > 0:

@@ -178,11 +178,11 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def detector_measures(self, mae: Mae) -> Iterator[float]:
-        """Yield how far a network's anomaly statistic is from its threshold on recent messages.
+        """Yield ratios of a network's anomaly statistic to its threshold on recent messages.
 
-        The first value is that of the recent messages as they are. Each following value is that of
+        The first ratio is that of the recent messages as they are. Each following ratio is that of
         the same messages with the tension of one muscle set to 0, as if the muscle were ruptured.
-        `validation/detector.py` defines the values.
+        Nothing is yielded without a calibrated threshold, or if there are too few messages.
         """
         return detector.measures(mae, self._messages, self.isolated)
 

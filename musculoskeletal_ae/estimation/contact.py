@@ -90,7 +90,8 @@ class LowPass:
         The equation is integrated by the implicit Euler method, which is stable at any dt.
 
         Returns:
-            The output y and its derivatives ẏ [1/s] and ÿ [1/s²], each of the shape of `value`.
+            The output y, its first derivative ẏ and its second derivative ÿ, each of the shape of
+            `value`.
         """
         if self._value is None:
             self._value, self._rate = value, np.zeros_like(value)

@@ -8,9 +8,10 @@
                          ▲                                                              │
                          └────────────── isolated muscles ──────────────────────────────┘
 
-The estimator owns the body state. When isolated muscles or length offsets change, it creates a new
-body state, which its node publishes. During a length calibration, only the detectors that do not
-need lengths report findings. `suspects.py` describes the sequence from a rupture to resuming.
+The body state consists of the isolated muscles and the length offsets. When they change, only the
+estimator creates a new body state, which its node publishes. During a length calibration, only the
+detectors that do not need lengths report findings. `suspects.py` describes the sequence from a
+rupture to resuming.
 """
 
 import math
@@ -62,10 +63,10 @@ class Output(NamedTuple):
 
     Attributes:
         sample: The readings.
-        state: (θ, T, l) as the network restores them.
-        covariance: Covariance of θ [rad²], (D, D), or None.
-        anomaly: A, in scaled units.
-        detected: Whether this message latches a finding.
+        state: Joint angles, tensions and lengths as the network restores them from the readings.
+        covariance: Covariance of the joint angles [rad²], (D, D), or None if it is unknown.
+        anomaly: Anomaly score A: the size of the network's residual, in scaled units.
+        detected: Whether a finding has been latched because of this message.
         contact: External load; None while the length offsets are unknown, and on a robot whose
             tensions are unknown.
     """
@@ -96,14 +97,19 @@ class Estimator:
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
-        measured: θ from joint sensors [rad], (D,), at the last message with an estimate; None
-            unless all joint sensors reported a value within the JOINTS_AGE seconds before it.
+        measured: Joint angles from joint sensors [rad], (D,), at the last message with an estimate;
+            None unless all joint sensors reported a value within the 0.05 s before it.
         stepped_at: Time on the steady clock at which the last message was accepted while there was
             a network [s].
     """
 
     def __init__(self, robot: Robot, preset: str = 'default') -> None:
-        """Start without a network; the preset provides the detectors."""
+        """Start without a network.
+
+        Args:
+            robot: The nominal body.
+            preset: Name of the preset that provides the detectors.
+        """
         self.robot = robot
         self.body = BodyState.healthy(robot.muscle_count)
         self.stream = MuscleStream(robot, self.body)
@@ -140,7 +146,7 @@ class Estimator:
     # -- settings and services ------------------------------------------------------------------
 
     def configure(self, settings: Detection) -> None:
-        """Use these detection settings."""
+        """Use these detection settings from the next message on."""
         self.health.configure(settings)
         self.suspects.settings = settings
 
@@ -232,11 +238,11 @@ class Estimator:
         """Clear the anomaly, and consider the body healthy in its present state.
 
         If the length of the suspect has jumped since the finding, its length offset is checked
-        first. A wrong one revokes the length offsets.
+        first. If this offset is wrong, all length offsets become unknown.
 
         Raises:
-            MusculoskeletalError: If the length offsets have been revoked, and joint sensors do not
-                agree with the lengths.
+            MusculoskeletalError: If the length offsets are unreliable, and joint sensors do not
+                confirm the lengths.
         """
         self._check_repair()
         if self.body.offsets.is_suspect:
@@ -256,13 +262,16 @@ class Estimator:
     # -- messages -------------------------------------------------------------------------------
 
     def take(self, message: Any, time: float, now: float, delay: float = 0.0) -> Output | None:
-        """Process a muscle_states message as `step` processes raw values.
+        """Estimate the state from a message of muscle_states, and check for faults.
 
         Args:
             message: The message.
             time: Time of the message [s].
             now: Time on the steady clock [s].
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is, compared with the fastest one [s].
+
+        Returns:
+            The results; None without a network, or before the first estimate of the length offsets.
 
         Raises:
             RejectionError: If the message cannot be used.
@@ -270,7 +279,7 @@ class Estimator:
         return self._take(partial(self.stream.take, message, time, now, delay), now)
 
     def step(self, states: Array, time: float, now: float) -> Output | None:
-        """Estimate the state and check for faults.
+        """Estimate the state from the raw values of a message, and check for faults.
 
         Args:
             states: Raw l [m], T [N] and temperature [°C], (3, M).
@@ -337,10 +346,13 @@ class Estimator:
         """Estimate the state, and check the health of the body.
 
         Args:
-            sample: The sample.
-            elapsed: Time between the receptions of this sample and the one before [s].
-            sent_apart: Time between the sendings of these two samples [s].
+            sample: The readings of one message.
+            elapsed: Time between the receptions of this message and the previous one [s].
+            sent_apart: Time between the publications of these two messages [s].
             now: Time on the steady clock [s].
+
+        Returns:
+            The results; None before a running length calibration has its first estimate.
         """
         dt, guess = min(elapsed, LONGEST_PERIOD), self.body.offsets
         if self.calibration is not None:
@@ -385,9 +397,10 @@ class Estimator:
         return theta
 
     def _handle_jump(self, now: float) -> None:
-        """Handle a jump of lengths during a calibration or without a network.
+        """Respond to a jump of lengths in two cases in which the detector `LengthJump` does not.
 
-        In all other cases, the detector `LengthJump` reports it.
+        During a length calibration, the calibration starts again. Without a network, the jump is
+        latched as a finding.
         """
         if self.stream.displaced.jumps == self._jumps:
             return
@@ -400,7 +413,10 @@ class Estimator:
             self._handle(finding_of(jumped), now)
 
     def _check_repair(self) -> None:
-        """After a jump of the suspect's length, confirm or revoke the length offsets."""
+        """If the suspect's length has jumped since the finding, check its length offset.
+
+        The offset is then confirmed, or all length offsets become unreliable.
+        """
         suspected, offsets = self.suspects.finding, self.body.offsets
         if suspected is None or not self.suspects.has_suspect_jumped or not offsets.known:
             return
@@ -416,10 +432,10 @@ class Estimator:
             self._use_body(self.body.with_offsets(confirmed))
 
     def _wrong_zero(self, muscle: int) -> str:
-        """Return evidence that the length offset of a repaired muscle is wrong, or ''.
+        """Return evidence that the length offset of a repaired muscle is wrong, or '' if it is not.
 
-        Its length is compared with the joint sensors or, without them, with the posture that the
-        other muscles indicate.
+        The length of the muscle is compared with the joint sensors or, without them, with the
+        posture that the other muscles indicate.
         """
         joints, sample, mae = self.health.joints, self.sample, self.state.complete_mae
         if joints.gap is not None:
@@ -439,7 +455,11 @@ class Estimator:
         )
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
-        """Handle a finding, if there is one; return whether it has just been latched."""
+        """Latch a finding and isolate its muscle, as its kind and the settings require.
+
+        A finding that makes the lengths unreliable also revokes the length offsets. Return whether
+        the finding has just been latched; False without a finding, or if another one is latched.
+        """
         if finding is None:
             return False
         before = self.suspects.finding
@@ -483,7 +503,11 @@ class Estimator:
     def _calibrate(
         self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
-        """Continue the length calibration; return the newest estimate of the offsets, or None."""
+        """Continue the length calibration, and return the newest estimate of the offsets.
+
+        The result is None before the first estimate. If the arm stands in a stated posture, it is
+        None until the calibration is complete.
+        """
         measured = self._measured_theta(now)
         calibration.step(sample.model_tension, sample.length_read, dt, measured)
         guess = calibration.offsets

@@ -73,12 +73,12 @@ class Observation:
     Attributes:
         sample: The readings.
         estimate: The network's estimate.
-        demand: T that the newest command demands of the muscle modules [N], (M,); None without a
-            command, and for position-controlled modules.
+        demand: Tensions that the newest command demands of the muscle modules [N], (M,); None
+            without a command, and for position-controlled modules.
         dt: Time since the previous message [s]; the caller limits it after a pause.
         lengths_known: Whether the length offsets are known.
-        measured: θ from joint sensors [rad], (D,); None unless all of them are measured.
-        command: l_target of the muscle modules [m], (M,); None without a length command.
+        measured: Joint angles from joint sensors [rad], (D,); None unless all are measured.
+        command: Target lengths of the muscle modules [m], (M,); None without a length command.
     """
 
     sample: MuscleSample
@@ -104,13 +104,13 @@ def observe(
 
     Args:
         mae: The network; its isolated muscles are ignored.
-        length: l with the length offset removed [m], (M,).
-        motor_tension: T [N], (M,).
-        bone_tension: T_end [N], (M,).
+        length: Muscle lengths, with the length offsets removed [m], (M,).
+        motor_tension: Motor-side tensions [N], (M,).
+        bone_tension: Bone-side tensions [N], (M,).
         dt: Time since the previous message [s].
-        demand: T commanded to the modules [N], (M,), or None.
-        state: The state that the network restores; None to compute it.
-        command: l_target of the modules [m], (M,), or None.
+        demand: Tensions demanded of the modules [N], (M,), or None if they are unknown.
+        state: The state that the network restores from the readings; None to compute it here.
+        command: Target lengths of the modules [m], (M,), or None without a length command.
     """
     unknown = np.full(len(length), np.nan)
     sample = MuscleSample(
@@ -133,21 +133,21 @@ def observe(
 class Detector:
     """Base class of the detectors, each of which looks for one sign of a fault.
 
-    `SuspectHandling` latches what they find. A new detector overrides `step` or `read`, and other
-    methods as needed. To use it, add it to the list in `HealthMonitor`.
+    `SuspectHandling` latches their findings. A new detector overrides `step` or `read`, and other
+    methods as needed. To use a new detector, add it to the list in `HealthMonitor`.
     """
 
     def use(self, mae: Mae) -> None:
         """Use another network; its isolated muscles are ignored."""
 
     def configure(self, settings: Detection) -> None:
-        """Use these settings."""
+        """Use these settings from the next message on."""
 
     def reset(self) -> None:
         """Reset the detector, for example after a jump of the clock or a reset by the user."""
 
     def accept(self, muscles: Iterable[int]) -> None:
-        """Consider muscles healthy in their present state."""
+        """Consider these muscles (indices) healthy in their present state."""
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:  # noqa: ARG002
         """Check the raw readings of a message, even of a rejected one; return a finding or None.

@@ -22,7 +22,7 @@ from musculoskeletal_ae.signals.heat import Heat
 
 
 class HealthMonitor:
-    """Passes every message to all detectors, and returns the first finding in their order.
+    """Checks every message with all detectors; the first detector with a finding decides.
 
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
@@ -65,7 +65,7 @@ class HealthMonitor:
             detector.use(mae)
 
     def configure(self, settings: Detection) -> None:
-        """Use these settings."""
+        """Use these settings from the next message on."""
         self.settings = settings
         for detector in self._detectors:
             detector.configure(settings)
@@ -76,7 +76,7 @@ class HealthMonitor:
             detector.reset()
 
     def accept(self, muscles: Iterable[int]) -> None:
-        """Consider muscles healthy in their present state."""
+        """Consider these muscles (indices) healthy in their present state."""
         muscles = tuple(muscles)
         for detector in self._detectors:
             detector.accept(muscles)

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures σ, the root mean square of τ_ext that is estimated for a healthy arm in motion.
+"""Measures the external torque that is wrongly estimated for a healthy moving arm without contact.
 
-    σ_j² ← σ_j² + (dt / t) (τ_ext,j² − σ_j²),   t: time of motion so far, MEMORY at most
+    σ_j² ← σ_j² + (dt / t) (τ_ext,j² − σ_j²)
 
-`estimation/contact.py` divides the external torque by σ to decide whether there is contact.
+τ_ext,j is the estimated external torque of joint j, and σ_j its root mean square. t is the time of
+motion so far, limited to MEMORY. `estimation/contact.py` divides the external torque by σ to decide
+whether there is contact.
 """
 
 from dataclasses import replace
@@ -27,7 +29,10 @@ LEAST_SPREAD = 1e-3  # smallest σ [N·m]
 
 
 class HealthyTorque:
-    """Measures σ over the last minutes of motion. `use` has to be called first."""
+    """Measures the residual torque σ of a healthy arm over the last minutes of motion.
+
+    `use` must be called before `step`.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._contact, self._direction = ContactEstimator(robot), FrictionDirection()
@@ -39,10 +44,10 @@ class HealthyTorque:
         self._square, self._time = np.zeros_like(self._radian), 0.0
 
     def use(self, mae: Mae) -> Mae:
-        """Use another network, and return it.
+        """Use another network, and return it with the measured residual torque σ.
 
-        If it contains a σ, the returned copy contains the measured one instead. Until the arm has
-        moved, the σ of the network is kept.
+        A network that contains no σ is returned unchanged. Until the arm has moved, σ is that of
+        the network.
         """
         if (known := mae.touch) is None:
             self._mae = mae
@@ -55,16 +60,16 @@ class HealthyTorque:
         return self._mae
 
     def reset(self) -> None:
-        """Restart the filters, for example after a jump of the clock; σ is kept."""
+        """Restart the filters, for example after a jump of the clock, but not the measurement."""
         self._contact.reset()
         self._direction.reset()
 
     def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Update σ with a message.
+        """Update the residual torque σ with a message, if the arm moves.
 
         Args:
-            tension: T_read [N], (M,).
-            length: l [m], (M,).
+            tension: Tensions as read [N], (M,).
+            length: Muscle lengths [m], (M,).
             dt: Time since the previous message [s].
         """
         end = self._direction.end_tension(self._mae.transmission, tension, length)

@@ -3,11 +3,13 @@
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),  e = (T_est − T, l_est − l)      (arXiv 2407.08050)
 
-A, the size of e, is published, but its healthy value varies with the posture. The decision is based
-on d instead, which relates the residual of every muscle to its healthy spread. The healthy
-statistics μ and Σ have to be measured on the real arm: with statistics of the geometric
-model, most healthy postures would count as anomalous. Without calibrated statistics, d is
-published, but not compared with a threshold.
+The residual e is the difference between the tensions and lengths that the network restores from all
+readings (T_est, l_est) and the readings themselves (T, l). Its size A is published, but the healthy
+value of A varies with the posture. The decision is based on d instead, which relates the residual
+of every muscle to its healthy spread. The healthy
+mean μ and covariance Σ have to be measured on the real arm: with statistics of the geometric model,
+most healthy postures would count as anomalous. Without calibrated statistics, d is published, but
+not compared with a threshold.
 
 Threshold. Far from calibrated postures, the network is less accurate, so the threshold grows with
 the distance to the nearest one (`unfamiliarity`). It also grows in proportion to a tension above
@@ -17,11 +19,12 @@ threshold does not grow, because a ruptured muscle has no tension in any posture
 Suspect. An anomaly affects the residuals of all muscles. The suspect of a finding is the muscle
 without which the remaining residual is most likely. If tendons are slack, only they can be suspect.
 
-Slack. While a slack tendon is being wound in, its measured length is longer than the length that ②
-restores, and messages do not count. The measured length of a ruptured tendon is shorter than the
-restored one, so its messages do count.
+Slack. While a slack tendon is being wound in, its measured length is longer than the restored
+length, and messages do not count. The measured length of a ruptured tendon is shorter than the
+restored length, so its messages do count.
 
-If the parameter `anomaly_threshold` is set, A is compared with it instead of d with its threshold.
+If the parameter `anomaly_threshold` is set, A is compared with this parameter, and d is not
+compared with its threshold.
 """
 
 import math
@@ -48,14 +51,14 @@ WIDEST = 3.0  # largest factor by which the threshold is raised
 
 
 class Reading(NamedTuple):
-    """Results of one message."""
+    """The residual distance of one message, and its most suspect muscle."""
 
     distance: float  # d, in healthy standard deviations; NaN without statistics
     suspect: int  # index of the most suspect muscle
 
 
 class ResidualDistance(Detector):
-    """Compares d with its threshold and names the most suspect muscle.
+    """Reports the most suspect muscle if the residual distance d exceeds its threshold.
 
     A subclass may use a statistic of the residual other than d.
 
@@ -73,9 +76,10 @@ class ResidualDistance(Detector):
 
         Args:
             robot: The nominal body.
-            settings: Settings with the threshold of A.
-            slack: The detector that knows which slack tendons are being wound in; None if all
-                messages count.
+            settings: Settings; if their `anomaly_threshold` is above 0, it is compared with the
+                anomaly score A instead of d.
+            slack: The detector that knows which slack tendons are being wound in. Messages do not
+                count meanwhile; None if all messages count.
         """
         self._robot = self._complete_robot = robot
         self._settings, self._slack = settings, slack
@@ -91,7 +95,7 @@ class ResidualDistance(Detector):
         return self._statistics is not None and self._statistics.calibrated
 
     def use(self, mae: Mae) -> None:
-        """Use this network and its healthy statistics."""
+        """Use another network with its healthy statistics; its isolated muscles are ignored."""
         statistics = mae.anomaly
         if statistics is not None:
             self._whiten: Array = np.linalg.inv(np.linalg.cholesky(statistics.covariance))
@@ -102,11 +106,11 @@ class ResidualDistance(Detector):
             self.threshold = statistics.thresholds.get(self.threshold_name, np.inf)
 
     def configure(self, settings: Detection) -> None:
-        """Use these settings."""
+        """Use these settings from the next message on."""
         self._settings = settings
 
     def reset(self) -> None:
-        """Discard the count of consecutive messages."""
+        """Discard the count of consecutive messages above the threshold."""
         self._beyond = 0
 
     def forget_reading(self) -> None:
@@ -114,7 +118,10 @@ class ResidualDistance(Detector):
         self.reading = None
 
     def step(self, observation: Observation) -> Finding | None:
-        """Update `reading`, and report its suspect after IN_A_ROW messages above the threshold."""
+        """Update `reading`; report the suspect after five consecutive messages above the threshold.
+
+        The result is None if there is nothing to report.
+        """
         sample, error = observation.sample, observation.estimate.residual
         tension, muscle_count = sample.model_tension, len(sample.motor_tension)
         distance, share = math.nan, error
@@ -150,9 +157,13 @@ class ResidualDistance(Detector):
         return Finding(suspect, Kind.RESIDUAL_DISTANCE, evidence) if evidence else None
 
     def unfamiliarity(self, theta: Array) -> float:
-        """Return the distance of θ [rad] (D,) to the nearest calibrated posture, divided by NEAR.
+        """Return how far a posture is from the nearest one in which the network was calibrated.
 
-        A posture with a value above 1 is unfamiliar. Without calibrated postures, the value is 0.
+        Above 1, the posture is unfamiliar. A distance of a quarter of every joint's range (root sum
+        square over the joints) counts as 1. Without calibrated postures, the result is 0.
+
+        Args:
+            theta: Joint angles [rad], (D,).
         """
         postures = None if self._statistics is None else self._statistics.postures
         if postures is None or not len(postures):
@@ -161,24 +172,29 @@ class ResidualDistance(Detector):
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
     def limit(self, theta: Array, tension: Array) -> float:
-        """Return the threshold of d at θ [rad] (D,) and T [N] (M,); ∞ if it is not calibrated."""
+        """Return the threshold of the statistic in a posture; ∞ if it is not calibrated.
+
+        Args:
+            theta: Joint angles [rad], (D,).
+            tension: Tensions [N], (M,).
+        """
         used = self._robot.used
         highest = float((tension[used] / self._robot.tension.limit[used]).max(initial=0.0))
         factor = np.clip(max(self.unfamiliarity(theta), highest), 1.0, WIDEST)
         return self.threshold * float(factor)
 
     def statistic(self, observation: Observation, distance: float) -> float:  # noqa: ARG002
-        """Return the statistic that is compared with the threshold: d."""
+        """Return the statistic that is compared with the threshold: here, the distance d itself."""
         return distance
 
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
     ) -> str:
-        """Count messages above the threshold; return the evidence after IN_A_ROW of them, or ''.
+        """Count messages above the threshold; return evidence after five in a row, otherwise ''.
 
         Args:
             observation: The message.
-            distance: d of the message.
+            distance: Residual distance d of the message.
             has_slack: Whether a tendon is slack, so that the threshold does not grow.
             waits: Whether the message does not count, because a slack tendon is being wound in.
         """
@@ -202,7 +218,16 @@ class ResidualDistance(Detector):
         return f'{name} = {reached} exceeded {most}{where} in {IN_A_ROW} consecutive messages'
 
     def _least_likely(self, bone_tension: Array, length: Array, candidates: Bools) -> int:
-        """Return the candidate (index) without which the remaining residual is most likely."""
+        """Return the index of the most suspect muscle among the candidates.
+
+        This is the muscle whose removal makes the residual of the other muscles most likely on a
+        healthy arm.
+
+        Args:
+            bone_tension: Bone-side tensions [N], (M,).
+            length: Muscle lengths [m], (M,).
+            candidates: The muscles that can be suspect, (M,).
+        """
         assert self._mae is not None
         distance = np.full(len(candidates), np.inf)
         for muscle in np.flatnonzero(candidates).tolist():

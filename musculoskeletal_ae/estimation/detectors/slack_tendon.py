@@ -3,24 +3,26 @@
 
     T < slack_share · T_ref for DEAD_TIME, and the tendon is not being wound in
 
-The rule needs no statistics, because a healthy module maintains at least T_bias. A slow winch takes
-time to wind in slack. The detector waits while the winch moves at `slack_speed` or faster, until it
-has wound in `slack_length`. Changes of length that are due to the motion of the arm do not count
-towards `slack_length`, but they do count towards the speed.
+T is the measured and T_ref the demanded tension. The rule needs no statistics, because a healthy
+module maintains at least T_bias. A slow winch takes time to wind in slack. The detector waits while
+the winch moves at `slack_speed` or faster, until it has wound in `slack_length`. Changes of length
+that are due to the motion of the arm do not count towards `slack_length`, but they do count towards
+the speed.
 
 A position-controlled module maintains no tension, so a healthy tendon is slack if a long length is
-commanded. For these modules, the rule is that a tendon is stretched, but has no tension:
+commanded. Such a module is reported if its tendon is stretched, but has no tension:
 
     T < T_slack for DEAD_TIME, and d − d̄ > SIGMAS · σ,   d = l(θ, T_slack) − l
     T_slack = slack_share · T_bias
 
-θ is estimated from the tendons that are not slack. d contains errors of the network, which may be
-centimetres before the network has learned the arm. Mean d̄ and standard deviation σ of these errors
-follow from the readings with which the tendon was last taut, and from the covariance of the
-network's errors (`estimation/length_errors.py`). Just after a loss of tension, σ is small. The
-farther the arm moves from the posture in which the tendon was taut, the larger σ becomes. If a
-tendon ruptures while it carries no load, the rupture is detected as soon as the tendon should carry
-load.
+d is the stretch: the length that the network computes for a barely taut tendon, minus the measured
+length l. The joint angles θ are estimated from the tendons that are not slack. d contains errors of
+the network, which may be centimetres before the network has learned the arm. Mean d̄ and standard
+deviation σ of these errors follow from the readings with which the tendon was last taut, and from
+the covariance of the network's errors (`estimation/length_errors.py`). Just after a loss of
+tension, σ is small. The farther the arm moves from the posture in which the tendon was taut, the
+larger σ becomes. If a tendon ruptures while it carries no load, the rupture is detected as soon as
+the tendon should carry load.
 """
 
 from collections import deque
@@ -71,7 +73,7 @@ class SlackTendon(Detector):
         self._robot = self._complete_robot.without(mae.isolated)
 
     def configure(self, settings: Detection) -> None:
-        """Use these settings."""
+        """Use these settings from the next message on."""
         self._settings = settings
 
     def reset(self) -> None:
@@ -79,7 +81,7 @@ class SlackTendon(Detector):
         self._slack_time[:] = self._idle_time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has been slack for DEAD_TIME seconds and is not being wound in."""
+        """Report a muscle that has been slack for 0.5 s and is not being wound in; or None."""
         sample, theta, dt = observation.sample, observation.estimate.state.theta, observation.dt
         tension, length = sample.motor_tension, sample.length
         demand = self._demand(observation)
@@ -164,7 +166,7 @@ class StretchedTendon(SlackTendon):
         self._taut_predictions.clear()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has been stretched without tension for DEAD_TIME seconds."""
+        """Report a muscle that has been stretched without tension for 0.5 s; or None."""
         sample, used = observation.sample, self._robot.used
         lowest = self._slack_tension
         is_slack = (sample.motor_tension < lowest) & used
@@ -184,17 +186,18 @@ class StretchedTendon(SlackTendon):
 
     @property
     def _slack_tension(self) -> Array:
-        """T_slack [N], (M,)."""
+        """Tension below which each tendon counts as slack [N], (M,)."""
         tension: Array = LIMITS.slack_share * self._complete_robot.tension.bias
         return tension
 
     def _is_stretched(self, sample: MuscleSample, is_slack: Bools, start: Array) -> Bools:
-        """Return a mask (M,) of slack muscles so short that a healthy tendon would have tension.
+        """Return which slack tendons are so short that a healthy tendon would have tension, (M,).
 
         Args:
             sample: The readings.
             is_slack: The muscles without tension, (M,).
-            start: An estimate of θ with which the fit of a posture starts [rad], (D,).
+            start: Initial values of the joint angles, which are fitted to the lengths of the
+                muscles with tension [rad], (D,).
         """
         used = self._robot.used & ~is_slack
         tension = np.where(is_slack, self._slack_tension, sample.bone_tension)
@@ -209,9 +212,15 @@ class StretchedTendon(SlackTendon):
         return is_stretched
 
     def _taut_prediction(self, muscle: int, used: Bools, start: Array) -> Prediction:
-        """Return the prediction from the readings at which a slack tendon was last taut.
+        """Predict the lengths at the last moment when a tendon, which is now slack, was taut.
 
-        The prediction uses the lengths of the muscles in `used`, as does the present prediction.
+        The posture of that moment is fitted to the lengths of the same muscles as the present
+        posture, so that the errors of both predictions can be compared.
+
+        Args:
+            muscle: Index of the slack muscle.
+            used: The muscles to whose lengths the posture is fitted, (M,).
+            start: Initial values of the joint angles [rad], (D,).
         """
         sample = self._taut[muscle]
         if muscle in self._taut_predictions:

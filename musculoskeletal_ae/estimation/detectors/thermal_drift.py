@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects a muscle module whose drag, cooling or tension sensor has changed, by its thermal model.
+"""Detects a hot muscle module whose drag, cooling or tension sensor has changed.
 
-`signals/heat.py` estimates the constants of the model. A changed module is a finding only if its
-winding is hot. A cool module that has changed is reported in /diagnostics, and the arm is not
-stopped.
+Such a change alters the constants of the module's thermal model, which `signals/heat.py` estimates.
+A changed module is a finding only if its winding is hot. A cool module that has changed is reported
+in /diagnostics, and the arm is not stopped.
 """
 
 from collections.abc import Iterable
@@ -21,11 +21,11 @@ class ThermalDrift(Detector):
         self._heat = heat
 
     def accept(self, muscles: Iterable[int]) -> None:
-        """Consider the modules of these muscles healthy as they are now."""
+        """Consider the modules of these muscles (indices) healthy in their present state."""
         self._heat.accept(*muscles)
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
-        """Report a module whose thermal constants have changed and whose winding is hot."""
+        """Report a module with changed thermal constants and a hot winding, or return None."""
         for muscle, change in self._heat.changed.items():
             if self._heat.core[muscle] > COOL:
                 return Finding(muscle, Kind.THERMAL_DRIFT, f'its module {change}')
