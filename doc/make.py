@@ -89,17 +89,17 @@ NAME:=VALUE`, `--params-file FILE`, or `./bringup.sh -p NODE:NAME:=VALUE`.
 [config/nodes.yaml](../../config/nodes.yaml) holds all defaults as a parameter file, and `ros2 param
 describe` gives the same texts.
 
-Parameters marked * can be set while the node runs. To empty a list of names, use `"['']"`. A
-parameter that no node has, and a value outside the legal range, are refused with the legal set."""
+Parameters marked * can be set while the node runs. To empty a list of names, use `"['']"`. An
+unknown parameter and a value outside the legal range are refused, with the legal set."""
 COMMAND_LINE_INTRODUCTION = """\
 `python doc/make.py` writes this page from `--help`. `ros2 run musculoskeletal_ae NAME` and
 `install/musculoskeletal_ae/lib/musculoskeletal_ae/NAME` run the same executable. Nodes take no
 options of their own, only `--ros-args`; [Parameters](parameters.md) lists their parameters.
 
-A node ends with status 0 on Ctrl-C (SIGINT) and SIGTERM. `record` and `replay`, for which that is
-the usual end, end with 0 as well. Any other tool ends with 130 and one line, which states whether
-its result was written. `train --from-bag` then saves what it has learned to
-`NAME.interrupted.safetensors` beside the file of `--out`."""
+On Ctrl-C (SIGINT) and SIGTERM, a node ends with exit status 0. `record` and `replay` also end with
+0, because this is the usual way to end them. Any other tool ends with 130 and prints one line,
+which states whether its result was written. In this case, `train --from-bag` saves what it has
+learned to `NAME.interrupted.safetensors` beside the file of `--out`."""
 
 
 def _first(node: ast.AST) -> str:

@@ -13,11 +13,13 @@ INTRODUCTION = """\
 # Why the arm stops, and how to continue
 
 This page is generated from the code: `python -m musculoskeletal_ae.control.stops_page > \
-doc/reference/stops.md`. While the arm is *running*, the mode that the controller reports is \
-what the arm does: {activities}. Otherwise the mode is one of {states}. A program compares these \
-identifiers and the identifiers of the causes. The latched topic `controller_mode` contains the \
-mode, or the mode and the cause as in `stopped:operator_stop`. The values `mode` and `stop cause` \
-of the controller in `/diagnostics` contain the same identifiers.
+doc/reference/stops.md`.
+
+The controller reports a *mode*. While the arm is *running*, the mode states what the arm does: \
+{activities}. Otherwise the mode is one of {states}. Programs should compare these identifiers and \
+the identifiers of the causes. The latched topic `controller_mode` contains the mode. If there is \
+a stop cause, it follows the mode, as in `stopped:operator_stop`. The values `mode` and `stop \
+cause` of the controller in `/diagnostics` contain the same identifiers.
 
 ## Modes
 
@@ -27,12 +29,16 @@ of the controller in `/diagnostics` contain the same identifiers.
 
 ## Causes
 
-The action `hold` keeps the last command, because the cause may clear; after `hold_time`, it does \
-the same as `release`. The action `release` keeps the last command for `hold_time` in any case, \
-and then pays out all muscles until each exerts T_bias. The action `release at once` does not wait \
-for `hold_time`. Modules that follow positions are paid out until their measured tension is \
-T_bias, or by `release` of muscles.yaml where no tension is known. If several causes begin \
-together, the first one in this table is reported.
+The table names the action with which each cause stops the arm:
+
+- `hold` keeps the last command, because the cause may clear. After `hold_time`, it does the same \
+as `release`.
+- `release` keeps the last command for `hold_time` in any case. Then it pays out all muscles until \
+each exerts T_bias. Modules that follow positions are paid out until their measured tension is \
+T_bias, or by `release` of muscles.yaml where no tension is known.
+- `release at once` does not wait for `hold_time`.
+
+If several causes begin together, the first one in this table is reported.
 
 {table}
 
