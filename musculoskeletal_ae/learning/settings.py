@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of learning: one table for the core and for the node's parameters."""
+"""Settings of learning, from which the parameters of the learner node are derived as well."""
 
 from dataclasses import dataclass
 

@@ -66,10 +66,10 @@ def synthetic_samples(
 
 
 def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Draw random tensions [N], (count, M).
+    """Draw random tensions [N] for `count` samples, (count, M).
 
-    In a share HELD_SHARE of the samples, most tensions are near T_bias. In all others, tensions are
-    uniform up to `highest_tensions`.
+    In a share HELD_SHARE of the samples, most tensions are near T_bias, as in an arm that holds a
+    posture. In all other samples, tensions are uniform from 0 to `highest_tensions`.
     """
     shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
     anywhere = rng.uniform(0.0, 1.0, shape) * highest

@@ -38,7 +38,10 @@ class Trainer:
     """Runs each update in the calling process when its job is submitted."""
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
-        """Use the preset with this name; `seed` is the random seed."""
+        """Create a trainer for the preset of this name; `begin` sets the network.
+
+        `seed` is the random seed of all updates.
+        """
         self.robot, self.preset, self.seed = robot, preset_named(preset), seed
         self.trouble = ''  # why no updates are made, or ''
         self._updater: Updater | None = None
@@ -56,7 +59,7 @@ class Trainer:
 
     @property
     def body(self) -> CalibratedBody | None:
-        """The most recently fitted body; None if there is none or if another process has it."""
+        """The most recently fitted body, or None if none is known in this process."""
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
@@ -70,7 +73,7 @@ class Trainer:
         return update
 
     def values(self) -> dict[str, str]:
-        """Return values for /diagnostics."""
+        """Return values for /diagnostics by name; this class has none."""
         return {}
 
     def close(self) -> None:

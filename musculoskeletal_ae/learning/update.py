@@ -49,7 +49,11 @@ LEAST_WEIGHT = 0.3  # smallest robust weight with which a rest sample is used fo
 
 
 def learned_steps(mae: Mae) -> int:
-    """Return the number of online training steps of preset `default` in a network's history."""
+    """Return how many online training steps of preset `default` a network has had.
+
+    The number comes from the description of its training. It is 0 if the network has not learned
+    online with this preset.
+    """
     match = re.search(f'{LEARNED}.*, preset default, (\\d+) steps$', mae.training)
     return int(match[1]) if match else 0
 
@@ -102,7 +106,10 @@ class BodyUpdater(Updater):
         )
 
     def _at_angles(self, read: Observations | None) -> Observations | None:
-        """Return messages with θ corrected for the estimated joint-sensor offsets."""
+        """Return messages with θ corrected for the estimated joint-sensor offsets.
+
+        Without messages, return None.
+        """
         return read and replace(read, theta=read.theta - self.body.zero)
 
     def _mix_in_real(self, data: TrainingData, observed: Observations, fit: Fit) -> None:
@@ -123,7 +130,8 @@ class BodyUpdater(Updater):
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
         """Replace the training samples at `places` by random real samples.
 
-        The tension of real samples is converted to the bone-side tension.
+        The tensions of real samples are converted to bone-side tensions, and creep since the sample
+        is added to their lengths.
         """
         if len(real) == 0:
             return

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of all online learning methods: an updater turns samples into a network.
+"""Base class of all online learning methods: an updater trains a network on samples.
 
 An updater keeps its network and optimiser between updates. Each preset chooses its own updater
 (`Preset.make_updater`).

@@ -145,7 +145,7 @@ class Metadata(Strict, frozen=True):
 
 
 def to_bytes(mae: Mae) -> bytes:
-    """Return a network as safetensors bytes; `from_bytes` restores it bit by bit."""
+    """Return a network as safetensors bytes, from which `from_bytes` restores it exactly."""
     anomaly = mae.anomaly
     tensors: dict[str, Array] = {'mean': mae.mean, 'std': mae.std}
     for name, stack in (('encoder', mae.encoder), ('decoder', mae.decoder)):
@@ -192,8 +192,9 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
 
     Args:
         data: The bytes.
-        robot: If present, the network must have this robot's joints and muscles in the same order,
-            and the network's estimate of the middle posture must be within LARGEST_ESTIMATES.
+        robot: The robot whose joints and muscles the network must have in the same order, or None
+            to accept any. The network's estimate of this robot's middle posture must be within
+            LARGEST_ESTIMATES.
         source: Name of the checkpoint in error messages.
 
     Raises:

@@ -4,18 +4,19 @@
     L = ‖θ − θ_calc‖ + ‖T − T_calc‖ + ‖l − l_calc‖ + ‖G − G_calc‖
 
 Each norm is in units of the standard deviation of the data, so that all have similar weight. G is
-the muscle Jacobian ∂l/∂θ through ①, which control needs. Each sample has a twin, which is a close
-neighbour. The difference between the length errors of the two, divided by their distance, serves
-as the error of G. Every sample passes through all three masks. Muon updates the matrices, with a
-step size that rises and then falls to zero.
+the muscle Jacobian ∂l/∂θ of the lengths that the network restores from θ and T. Control needs it.
+Each sample has a twin, which is a close neighbour. The difference between the length errors of the
+two, divided by their distance, serves as the error of G. Every sample passes through all three
+masks. Muon updates the matrices, with a step size that rises and then falls to zero.
 
 LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. A body of several groups
 that share no joint or muscle gets a block of the network for each group. The layers of a larger
 group grow in proportion to its D + M. If they grew by the square root, the error of θ of a
 body with 17 joints and 40 muscles would be 0.0045 instead of 0.0030 rad per joint. The number of
 mini-batches in initial training grows with D + M of the largest group to the power of 1.5. With
-this power, the error of ② is a tenth lower for that body than for the arm with 5 joints. If the
-number grew in proportion to D + M, the error would be higher than for the arm.
+this power, the estimation error from T and l is a tenth lower for the larger body than for the arm
+with 5 joints. If the number grew in proportion to D + M, the error would be higher than for the
+arm.
 """
 
 import math
@@ -99,15 +100,19 @@ def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
 
 
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
-    """Return random states with tensions up to tension.limit, and in some up to tension.max."""
+    """Return random states of the geometric model, some of which exceed the tension limit.
+
+    `highest_tensions` describes the range of the tensions.
+    """
     highest = highest_tensions(robot, count, rng)
     return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
 
 
 def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Return the upper limit of the tensions of each sample [N], (count, M).
+    """Return up to which tension [N] each sample draws its random tensions, (count, M).
 
-    It is tension.limit, except in some random samples, where it is up to tension.max.
+    In most samples, this is T_limit. In a random share OVERLOAD_SHARE, it is a random value between
+    T_limit and T_max.
     """
     limit, most = robot.tension.limit, robot.tension.max
     overloaded = rng.uniform(size=(count, 1)) < OVERLOAD_SHARE
@@ -141,7 +146,10 @@ def with_twins(robot: Robot, samples: Array, std: Array, rng: np.random.Generato
 
 
 def loss(network: Network, samples: Tensor) -> Tensor:
-    """Return the mean of L over scaled (θ, T, l) of samples and their twins, (N, 2, D+2M)."""
+    """Return the training loss L, averaged over the samples.
+
+    `samples` contains scaled (θ, T, l) of each sample and of its twin, (N, 2, D+2M).
+    """
     joints, muscles = network.joints, network.muscles
     rows, twins = samples[:, 0], samples[:, 1]  # (N, D+2M) each
     count = len(twins)
@@ -169,7 +177,7 @@ def train(
         robot: The geometric model.
         seed: Random seed of states, weights and order of the samples.
         steps: Number of mini-batches.
-        progress: Called after every mini-batch.
+        progress: Function that is called after every mini-batch; see `Progress`.
     """
     rng = np.random.default_rng(seed)
     samples = overload_states(robot, min(SAMPLES, steps * BATCH), rng).scaled()
@@ -193,7 +201,10 @@ def train(
 
 
 def annealing(progress: float) -> float:
-    """Return the factor of the step size at a progress of the training in [0, 1)."""
+    """Return the factor of the step size after a share `progress` of the training, in [0, 1).
+
+    The factor rises from 0 to 1 at first, and then falls back to 0 as a cosine.
+    """
     if progress < RISE:
         return progress / RISE
     return 0.5 * (1.0 + math.cos(math.pi * (progress - RISE) / (1.0 - RISE)))

@@ -36,7 +36,7 @@ def initial_mae(
         robot: The geometric model.
         preset: Name of the preset.
         seed: Random seed; on the same machine, the same seed gives the same network.
-        progress: Called after every mini-batch.
+        progress: Function that is called after every mini-batch; see `Progress`.
         steps: Number of mini-batches; None for the preset's number.
     """
     chosen = preset_named(preset)

@@ -11,16 +11,17 @@ The products use single precision, because the weights of a large body then fit 
 The rounding error of 1e-6 is far below the error of a network. Inputs and outputs are arrays of
 double precision.
 
-Sensor values of isolated muscles have no influence. If muscles are isolated, θ is the most likely
-posture given the lengths of the other muscles:
+The network has two uses: ①(θ, T) are the lengths that it restores from θ and T, and ② restores
+(θ, T, l) from measured T and l. Sensor values of isolated muscles have no influence. If muscles are
+isolated, θ is the most likely posture for the lengths of all other muscles:
 
-    θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T) of the other muscles
+    θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T) of the muscles that are not isolated
 
 The length of each isolated muscle is then replaced by ①(θ, T), and ② gives T and l of all muscles.
 
 θ̄ and s are the mean and standard deviation of θ in the training data. Σ is the covariance of the
-length residuals of ② on the healthy arm. ② fits θ to the same lengths, so its residuals lack the
-part that an error of θ explains. Generalised least squares give the same θ with or without that
+length residuals of ② on the healthy arm. These residuals lack the part that an error of θ explains,
+because ② fits θ to the same lengths. Generalised least squares give the same θ with or without that
 part, for any subset of the muscles.
 """
 
@@ -67,9 +68,10 @@ class BlockDiagonal:
 
         Args:
             blocks: Weights of the blocks, each (in, out).
-            into: x[..., into] are the inputs of all blocks, in order; None if x is in this order.
-            out: The result is y[..., out], where y are the outputs of all blocks, in order; None
-                if the result is y.
+            into: Indices of x that are the inputs of the blocks, one block after another; None if x
+                already has this order.
+            out: Indices that bring the outputs of the blocks, one block after another, into the
+                order of the result; None if the result has the order of the blocks.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
@@ -94,8 +96,8 @@ class BlockDiagonal:
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
     """Return x @ weight, shape (..., out), for x (..., in).
 
-    The method `dot` is used where possible, because the operator @ has 0.4 µs more overhead. This
-    is as long as the product of one row with a layer takes.
+    The method `dot` is used where possible. The operator @ takes 0.4 µs longer, which is as much as
+    the whole product of one row with a layer.
     """
     if x.ndim > 2 or isinstance(weight, BlockDiagonal):
         return x @ weight
@@ -242,7 +244,10 @@ class Stack:
 def side_by_side(
     stacks: Sequence[Stack], into: Ints | None = None, out: Ints | None = None
 ) -> Stack:
-    """Return one stack of block-diagonal layers; `into` and `out` are those of `BlockDiagonal`."""
+    """Combine stacks into a single one, which computes all of them with block-diagonal layers.
+
+    `into` and `out` are the orders of inputs and outputs, as in `BlockDiagonal`.
+    """
     if len(stacks) == 1:
         return stacks[0]
     layers = list[tuple[BlockDiagonal, Singles]]()
@@ -256,7 +261,7 @@ def side_by_side(
 
 @dataclass(frozen=True, eq=False)
 class Mae:
-    """A trained network with the other content of its checkpoint."""
+    """A trained network, with the statistics and other data that its checkpoint contains."""
 
     joints: tuple[str, ...]  # D names, in the order of θ
     muscles: tuple[str, ...]  # M names, in the order of T and l
@@ -385,7 +390,7 @@ class Mae:
         return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
 
     def estimate(self, tension: Array, length: Array) -> State:
-        """Estimate (θ, T, l) from (T, l) by decode(encode ②) (paper, §III-D).
+        """Estimate (θ, T, l) from measured T and l with the network (paper, §III-D).
 
         Sensor values of isolated muscles are not used; their T and l are estimates as well.
 
@@ -457,15 +462,16 @@ class Mae:
         return replace(self, isolated=isolated, anomaly=anomaly)
 
     def lengths(self, theta: Array, tension: Array) -> Array:
-        """Return l [m] (..., M) at (θ, T), by decode(encode ①)."""
+        """Return the lengths l [m] (..., M) that the network restores from θ and T."""
         return self.decode(self.encode(Mask.THETA_TENSION, theta, tension)).length
 
     def lengths_with_pullback(
         self, theta: Array, tension: Array
     ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return l [m] (N, M) at (θ, T) through ①, and the function that maps dL/dl to dL/dθ.
+        """Return the lengths l [m] (N, M) that the network restores from θ and T, and a pullback.
 
-        Applied to T, the function gives Gᵀ T at the cost of one evaluation instead of D.
+        The pullback is a function that maps the gradient dL/dl of any scalar L to dL/dθ. Applied to
+        T, it returns Gᵀ T at the cost of one evaluation instead of D.
         """
         length, pullback = self._compiled.with_pullback(np.concatenate((theta, tension), axis=-1))
         joints = len(self.joints)
@@ -482,7 +488,10 @@ class Mae:
         return Stack((*enter.layers, *leave.layers), (*before, LINEAR, *after))
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
-        """Return the muscle Jacobian G = ∂l/∂θ [m/rad] (..., M, D) of ① at (θ, T), exactly."""
+        """Return the muscle Jacobian G = ∂l/∂θ [m/rad] (..., M, D) of `lengths` at (θ, T).
+
+        The derivative is exact, without finite differences.
+        """
         return self._lengths_and_jacobian(theta, tension)[1]
 
     def _lengths_and_jacobian(self, theta: Array, tension: Array) -> tuple[Array, Array]:

@@ -118,7 +118,7 @@ class Network(nn.Module):
         return self.encoder(x)  # (N, D+M)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return scaled (θ, T, l) (N, D+2M) of z (N, D+M); `decoder` returns them standardised."""
+        """Return scaled (θ, T, l), (N, D+2M), of z (N, D+M)."""
         return self.decoder(z) * self.std + self.mean
 
     def forward(self, values: Tensor, mask: Tensor) -> Tensor:
@@ -187,7 +187,7 @@ class TorchLengths:
     def lengths_with_pullback(
         self, theta: Array, tension: Array
     ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return lengths and their pullback, as `Mae.lengths_with_pullback` does."""
+        """Return the lengths at (θ, T) and their pullback, as `Mae.lengths_with_pullback` does."""
         angles, tensions = self._tensor(theta, requires_grad=True), self._tensor(tension)
         values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
         mask = torch.zeros(len(theta), dtype=torch.long, device=values.device)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residuals (T and l restored by ② minus measured T and l) and their statistics on a healthy arm.
+"""Residuals of tensions and lengths, and their statistics on a healthy arm.
 
     e = (T_est − T, l_est − l)                        scaled units, shape (2M,)
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                   (paper, §III-D, eq. 4)
 
-A checkpoint contains mean and covariance of e over healthy data. The detector that uses them is
+T and l are measured, and the network restores T_est and l_est from them. A checkpoint contains mean
+and covariance of e over healthy data. The detector that uses them is
 `estimation/detectors/residual_distance.py`.
 """
 

@@ -42,9 +42,9 @@ def random_states(
         robot: The geometric model.
         count: Number of states N.
         rng: Draws the states.
-        highest: Upper end of the uniform distribution of T_r [N]; a number, (M,) or (N, M).
-        lowest: Lower end of the uniform distribution of T_r [N]; a number, (M,) or (N, M).
-        margin: How far θ_r may exceed each joint limit, as a fraction of the range.
+        highest: Upper end of the uniform distribution of T [N]; a number, (M,) or (N, M).
+        lowest: Lower end of the uniform distribution of T [N]; a number, (M,) or (N, M).
+        margin: How far θ may exceed each joint limit, as a fraction of the joint's range.
     """
     theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(lowest, highest, (count, robot.muscle_count))

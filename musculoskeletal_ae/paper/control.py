@@ -49,21 +49,24 @@ def geometric(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Arra
 
 
 def first(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
-    """Return the command (7) for T_const."""
+    """Return the length command by equation (7); `tension` is T_const [N], (M,)."""
     length = mae.lengths(theta, tension) + msc_compensation(robot, tension)
     return Solution(length, tension, np.zeros(robot.joint_count))
 
 
 def second(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
-    """Return the command (8) for T_current; this method runs after `first`."""
+    """Return the length command by equation (8); `tension` is T_current [N], (M,).
+
+    This method runs after `first`.
+    """
     return first(robot, mae, theta, torque, tension)
 
 
 def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
-    """Return the command (12) for T_current.
+    """Return the length command by equation (12); `tension` is T_current [N], (M,).
 
-    The method does not enforce tension limits. It reports a missing torque of 0, whatever torque is
-    missing.
+    The method does not enforce tension limits. The solution states a missing torque of 0 even if
+    the planned tensions do not produce τ_target.
     """
     terms = control_loss(robot, mae, theta, torque, tension)
     z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
@@ -90,7 +93,7 @@ def control_loss(
 
 
 def torque_term(weight: float, jacobian: Array, tension_rows: Array, torque: Array) -> Term:
-    """Return w ‖τ_target + Gᵀ T‖₂ with τ in N·mm, as (9) and (13) contain it.
+    """Return the term w ‖τ_target + Gᵀ T‖₂ of the losses (9) and (13), with τ in N·mm.
 
     Args:
         weight: w₃ or w₆.
@@ -103,7 +106,10 @@ def torque_term(weight: float, jacobian: Array, tension_rows: Array, torque: Arr
 
 
 def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_STEP) -> Array:
-    """Return G(θ, T) [m/rad] (..., M, D), the forward difference quotient of l = ①(θ, T)."""
+    """Return the muscle Jacobian G(θ, T) [m/rad], (..., M, D), by forward differences.
+
+    The lengths are those that the network restores from θ and T.
+    """
     joints = theta.shape[-1]
     offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])
     postures = theta[..., None, :] + offsets  # (..., D+1, D)

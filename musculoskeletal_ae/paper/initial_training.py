@@ -61,13 +61,13 @@ def train(
     progress: Progress | None = None,
     hidden: tuple[int, ...] = HIDDEN,
 ) -> TrainedNetwork:
-    """Train a new network by Adam; encode each sample under ①, ② or ③ at random.
+    """Train a new network by Adam, with the mask ①, ② or ③ of each sample chosen at random.
 
     Args:
         robot: The geometric model.
         seed: Seed of the states, weights, masks and the order of the samples.
         steps: Total number of mini-batches.
-        progress: Called after every mini-batch.
+        progress: Function that is called after every mini-batch; see `Progress`.
         hidden: Numbers of units in the encoder's hidden layers.
     """
     rng = np.random.default_rng(seed)

@@ -39,7 +39,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def draw_batch(values: Array, rng: np.random.Generator) -> Array:
-    """Return the rows of a batch, once for each of ①, ②, ③, (3 (C_data + 2), D+2M).
+    """Return the rows of a batch, repeated for each mask ①, ② and ③: (3 (C_data + 2), D+2M).
 
     Args:
         values: Stored samples, scaled (θ, T, l), the newest last, (N, D+2M).

@@ -44,7 +44,7 @@ SEARCH = StepSearch(SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_E
 
 
 class LatentSimulation:
-    """Simulates arms of one robot, with the same interface as `QuasiStatics`."""
+    """Simulator of preset `paper`, which moves each arm by a descent in the latent space."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -62,7 +62,10 @@ class LatentSimulation:
         wrench: Array,
         fixed: Array,
     ) -> ArmState:
-        """Return the state of all arms after one descent for each of them."""
+        """Return the state of all arms after one descent for each of them.
+
+        `SimulatedBody.step` describes the arguments. A descent has no duration, so `h` is not used.
+        """
         load, _ = self._load(state.theta, wrench)
         length = np.where(command == PAID_OUT, state.length, command)
         # Limit commands to the whole length of the muscle, which exceeds every reasonable command.
@@ -75,7 +78,11 @@ class LatentSimulation:
     def _descend(
         self, theta: Array, tension: Array, length: Array, torque: Array, fixed: Array
     ) -> tuple[Array, Array, Array]:
-        """Return θ, T and l of one arm after a descent."""
+        """Return θ [rad] (D,), T [N] (M,) and l [m] (M,) of one arm after a descent.
+
+        The arguments are the present θ and T, the length l_sim [m] (M,), τ_target [N·m] (D,), and
+        the angles that joints are forced to [rad] (D,), NaN for a free joint.
+        """
         robot, mae = self._robot, self._mae
         joints, muscles = robot.joint_count, robot.muscle_count
         row = np.eye(joints + 2 * muscles)

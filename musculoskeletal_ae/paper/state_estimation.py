@@ -29,7 +29,7 @@ class AnomalyNorm(ResidualDistance):
     symbol, threshold_name = 'A', NORM
 
     def statistic(self, observation: Observation, distance: float) -> float:  # noqa: ARG002
-        """Return A (4)."""
+        """Return the anomaly A of a message by equation (4); `distance` is not used."""
         count = len(observation.sample.length)
         tension, length = (
             observation.estimate.residual[:count],

@@ -6,11 +6,12 @@
     l = l_target,  0 ≤ T ≤ T_max                                position-controlled modules
     B θ̇ = −(g(θ) + K θ − b − JᵀF + Gᵀ T_end),  G = ∂l/∂θ at (θ, T_end)    between the joint limits
 
-The paper minimises a sum of norms (§III-F, eq. 13). With its weights, ‖T‖ outweighs torque and
-length, so the arm does not settle at the balance of torques. This module therefore solves torque
-and length as equations. On the surface z = ①(θ, T) of the latent space, they are D+M equations for
-D+M unknowns, and their root is the rest posture. (One could also solve for z itself, with decoded θ
-and T. This root is no closer to the rest posture of the body, and each step costs more.)
+Here ① encodes θ and T (paper, §III-A). The paper minimises a sum of norms (§III-F, eq. 13). With
+its weights, ‖T‖ outweighs torque and length, so the arm does not settle at the balance of torques.
+This module therefore solves the equations of lengths and torques above. On the surface z = ①(θ, T)
+of the latent space, they are D+M equations for D+M unknowns, and their root is the rest posture.
+(One could also solve for z itself, with decoded θ and T. That root is no closer to the rest posture
+of the body, and each step costs more.)
 
 The arm approaches the root against a viscous resistance B, by linearly implicit Euler steps. These
 are Newton steps on the equations with B/h on the diagonal. B models the resistance of joints and
@@ -89,9 +90,10 @@ class Body(NamedTuple):
 
 
 class Limbs(NamedTuple):
-    """The cubics of all limbs (groups of joints and muscles), concatenated for `add_slopes`.
+    """Fitted cubic polynomials of the muscle lengths of all limbs, concatenated for `add_slopes`.
 
-    Flat arrays let the same compiled code serve any number of limbs.
+    A limb is an independent group of joints and muscles. The arrays are flat, so that the same
+    compiled code serves any number of limbs.
     """
 
     counts: Ints  # number of joints D and muscles M of each limb, (limbs, 2)
@@ -106,7 +108,7 @@ class Limbs(NamedTuple):
 
 @njit(cache=True)
 def handed(body: Body, tree: Tree, limbs: Limbs) -> Handle:
-    """Return a handle that holds the constants; it is the argument `robot` of `advance`."""
+    """Return a handle with the constants of the robot, which `advance` takes as an argument."""
     return Handle((body, tree, limbs))
 
 
@@ -266,12 +268,14 @@ def advance(
     robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, pulled: Array,
     command: Array, wrench: Array, fixed: Array,
 ) -> None:  # fmt: skip
-    """Fill `after` with the arms h [s] after `state`. The last axis is that of the arms.
+    """Compute the state of N arms after a step of h [s], and write it into `after`.
+
+    The last axis of all arrays is that of the arms.
 
     Args:
         robot: Handle of Body, Tree and Limbs.
-        state: The arms now; its length is the network's at (θ, T_end), (M, N).
-        after: Filled with the arms after the step.
+        state: The present state; its lengths are those of the network at (θ, T_end), (M, N).
+        after: Output: the state after the step.
         h: Duration of the step [s].
         passed: Fraction of the tension that reaches the bone despite friction, T_end / T, (M, N).
         pulled: The network's Gᵀ T_end [N·m], (D, N).
@@ -455,7 +459,7 @@ class Slopes:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Prepare fits over the whole joint range, at the middle of the tension range."""
+        """Draw the postures of the fits over all joint ranges; tensions are in mid-range."""
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))

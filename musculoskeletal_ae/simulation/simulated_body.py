@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interface of a simulator, which contains the equations of a preset."""
+"""The interface of all simulators; each preset has one with its own equations."""
 
 from typing import Any, Protocol
 
@@ -21,7 +21,7 @@ class SimulatedBody(Protocol):
 
         Args:
             state: The arms now.
-            command: l_target [m], (N, M); PAID_OUT for muscles without a command.
+            command: l_target [m], (N, M); PAID_OUT (∞) for muscles without a command.
             h: Duration of the step [s].
             wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).
             fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.

@@ -117,7 +117,10 @@ class Simulation:
         self.state = ArmState(theta, tension, length, length, holding, slid)
 
     def step(self, dt: float) -> ArmState:
-        """Advance by `dt` [s] if it is positive, and return the new state of the arms."""
+        """Advance by `dt` [s], and return the new state of the arms.
+
+        If `dt` is 0 or negative, the state does not change.
+        """
         substeps = int(np.ceil(dt / LONGEST_STEP - 1e-9))
         for _ in range(substeps):
             self._advance(dt / substeps)
