@@ -117,7 +117,7 @@ def _changes(
     The change of a muscle is the largest difference [mm] between its curves before and after
     learning. Keys with "relative" hold the change of l − l(origin), because the curves in the paper
     pass through the origin. Changes whose keys contain "all" cover the whole sweep, as in the
-    paper's figure. Changes whose keys do not contain it cover the points in `trained` only.
+    paper's figure. All other changes cover the points in `trained` only.
 
     Args:
         robot: The robot.
@@ -196,7 +196,10 @@ def length_against_tension(study: Study, rows: Rows) -> Plot:
 
 
 def worn_muscles(study: Study, rows: Rows) -> Plot | None:
-    """Draw the muscle length over the tension for the worn arm; return None if it is missing."""
+    """Draw the muscle length over the tension for the worn arm.
+
+    Return None if the worn arm was not measured.
+    """
     title = 'muscle length at θ = 0, #2 worn, #6 with high friction'
     figure = _panels(study, rows, 'worn', 'T [N]', title)
     if figure is None:

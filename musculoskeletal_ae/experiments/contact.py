@@ -77,7 +77,10 @@ class ContactLoop(ClosedLoop):
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Push a learned individual at rest, in motion and under gravity compensation."""
+    """Push the hand of one individual at rest, in motion and under gravity compensation.
+
+    The loop uses the network that has learned this individual.
+    """
     robot, rng = study.robot, np.random.default_rng([seed, CONTACT_STREAM])
     settings, share = Settings(first_duration=2.0), QUICK_SHARE if study.quick else 1.0
     loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed)
@@ -152,8 +155,8 @@ def _push_at_rest(loop: ContactLoop, force: Array) -> tuple[Array, Array, bool]:
     """Push the hand of the resting arm.
 
     Returns:
-        The force [N] (3,), its estimate [N] (3,) averaged over the end of the push, and whether
-        all joints stayed within their limits.
+        The force [N] (3,), its estimate [N] (3,) averaged over the last EVALUATED [s] of the push,
+        and whether all joints stayed within their limits.
     """
     robot, estimates, free = loop.arm.robot, list[Array](), True
     loop.push(force)
@@ -193,7 +196,7 @@ def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Arra
 def _healthy(loop: ContactLoop, seconds: float) -> int:
     """Return how many contacts are wrongly detected while an arm explores without any contact.
 
-    The exploration takes `seconds` [s] and another 5 s, which precede and are not counted.
+    The arm explores for 5 s first. Contacts are counted in the following `seconds` [s].
     """
     contacts, before = 0, False
     for n in range(round((seconds + 5.0) / SAMPLE_TIME)):

@@ -145,15 +145,17 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
-    """Return measures that separate the causes why `proposed` needs more than the least tension.
+    """Return measures that show why `proposed` needs more than the least tension.
 
-    `proposed` first plans the tensions at each target, and then moves the same body without tendon
-    friction there. The mean ratios to the least ‖T‖ with which the true body holds the target are
-    - planned_to_bound, of the planned ‖T‖: it shows the error of the learned body, and
-    - frictionless_to_bound, of ‖T‖ after the motion: it is larger because tensions are commanded
-      as lengths.
-    The arm with friction exceeds even this ratio because of its friction. frictionless_rad is the
-    mean distance [rad] of the frictionless arm from the target.
+    `proposed` first plans the tensions that hold each target. It then moves the same body without
+    tendon friction to the target. The arm with friction needs still more tension, because of the
+    friction.
+
+    Returns:
+        planned_to_bound, the mean ratio of the planned ‖T‖ to the least ‖T‖ with which the true
+        body holds the target. It shows the error of the learned body. frictionless_to_bound, the
+        same ratio for ‖T‖ after the motion. It also includes that tensions are commanded as
+        lengths. frictionless_rad, the mean distance [rad] of the frictionless arm from the target.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:

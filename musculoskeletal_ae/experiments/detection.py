@@ -132,7 +132,7 @@ class GraspAndRupture:
 
 
 def grasp_and_release(arm: Arm, time: float) -> None:
-    """Grasp and release a payload in turn, one a minute; see `recording.Script`."""
+    """Alternate between grasping and releasing a payload, once a minute; see `recording.Script`."""
     turn, since = divmod(round(time / SAMPLE_TIME), round(GRASPING / SAMPLE_TIME))
     if since == 0:
         arm.set_payload(PAYLOAD if turn % 2 else 0.0)
@@ -235,8 +235,8 @@ def anomaly_levels(
 
     All measures exist before and after learning. They are the largest and the median value of
     healthy messages, the level of each rupture, the smallest level of the muscles in
-    `plan.counted`, and the AUROC. The level of a rupture is the median of A or d over the messages
-    of `GraspAndRupture.while_ruptured`. The levels have the order of `plan.muscles`.
+    `plan.counted`, and the AUROC (`auroc`). The level of a rupture is the median of A or d over the
+    messages of `GraspAndRupture.while_ruptured`. The levels have the order of `plan.muscles`.
 
     Args:
         plan: The script that ruptured the muscles.

@@ -36,7 +36,7 @@ DIFFERENCE = 1e-4  # step of finite differences [rad]
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Estimator that solves many messages at once by Levenberg–Marquardt, within joint limits."""
+    """Estimates θ from many messages at once by Levenberg–Marquardt, within the joint limits."""
 
     robot: Robot
     lengths: Callable[[Array, Array], Array]  # maps θ (N, D) and T [N] (N, M) to l [m] (N, M)

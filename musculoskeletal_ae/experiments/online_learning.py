@@ -226,7 +226,7 @@ def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) 
 def samples_to_halve(curve: Curve) -> int | None:
     """Return after how many samples the error stays below half its initial value.
 
-    Return None if the last error still exceeds this half.
+    Return None if even the last error is larger.
     """
     above = [i for i, error in enumerate(curve.errors) if error > 0.5 * curve.errors[0]]
     return None if above[-1] + 1 >= len(curve.errors) else curve.samples[above[-1] + 1]

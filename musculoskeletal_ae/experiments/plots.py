@@ -43,7 +43,10 @@ def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **o
 
 
 def tidy(axes: Any, xlabel: str = '', ylabel: str = '', title: str = '', legend: str = '') -> None:
-    """Label axes; add a light grid and a legend at a position of `LEGENDS`, and remove the box."""
+    """Label axes, add a light grid, and hide the upper and right border.
+
+    `legend` names a position of `LEGENDS`; without it, there is no legend.
+    """
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.set_title(title, loc='left' if legend == 'above' else 'center')
     axes.grid(alpha=0.25)

@@ -210,12 +210,15 @@ def mean_error(estimate: Array, truth: Array) -> float:
 
 
 def end_tensions(mae: Mae, recording: Recording) -> Array:
-    """Return T_end [N] (N, M) of a recording, computed as in the nodes by a network's friction."""
+    """Return the bone-side tensions T_end [N] (N, M) of a recording, computed as in the nodes.
+
+    The tendon friction is the one that the network has learned.
+    """
     return mae.transmission.end(recording.tension, directions(recording.length))
 
 
 def motor_tensions(mae: Mae, recording: Recording) -> Array:
-    """Return the motor-side T [N] (N, M) of a recording, computed as in the nodes."""
+    """Return the motor-side tensions T [N] (N, M) of a recording, computed as in the nodes."""
     return mae.transmission.motor(recording.tension, directions(recording.length))
 
 

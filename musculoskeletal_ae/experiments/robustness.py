@@ -89,8 +89,8 @@ def measure(study: Study, seed: int) -> Measured:
 def _study_of_model(study: Study, seed: int, reality: str) -> Study:
     """Return a study whose individuals have the emulator model `reality`.
 
-    If the given study has another model, the individual of `seed` first learns online with this
-    one.
+    If the given study has another emulator model, the individual of `seed` first explores and
+    learns online with the model `reality`.
     """
     if reality == study.reality:
         return study

@@ -84,7 +84,7 @@ def measure(study: Study, seed: int) -> Measured:
 def sighted(learner: Learner) -> bool:
     """Return whether the emulated camera now detects the marker.
 
-    It does so for one of SIGHTED rest samples: from the sample before it until it is accepted.
+    It detects the marker after every SIGHTED-th accepted rest sample, until the next is accepted.
     """
     # Count accepted samples, because the number of stored ones is bounded.
     return learner.samples.accepted % SIGHTED == 0

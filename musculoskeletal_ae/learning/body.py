@@ -87,7 +87,7 @@ class ResidualModel(NamedTuple):
     def drawn(
         cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator
     ) -> ResidualModel:
-        """Draw the features of one muscle.
+        """Draw the random features of one muscle's residual model.
 
         Args:
             robot: The robot, whose joint ranges scale the kernel.
@@ -131,7 +131,7 @@ class Poses(NamedTuple):
 
 
 class CalibratedBody:
-    """Computes the muscle lengths of the calibrated body and their parameter derivatives."""
+    """Computes muscle lengths of the calibrated body, and their derivatives by its parameters."""
 
     def __init__(
         self,

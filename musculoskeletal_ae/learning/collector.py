@@ -119,8 +119,8 @@ class SampleCollector:
     def imu(self, time: float, link: str, acceleration: Array) -> None:
         """Record an accelerometer reading [m/s²] (3,) in the axes of a link.
 
-        At rest the reading is opposite to gravity and therefore gives its direction. Readings
-        during motion are not used.
+        At rest, the reading points opposite to gravity and thus shows the direction of gravity.
+        Readings during motion are not used.
         """
         joint, placement = self._robot.kinematics.placement(link)
         down = -placement.rotation @ acceleration / np.linalg.norm(acceleration)
@@ -182,7 +182,7 @@ class SampleCollector:
         return self._pairing.muscles(time, sample)
 
     def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
-        """Detect rests in a message and its θ; return the samples that were stored.
+        """Use a message and its θ to detect rests; return the samples that were stored.
 
         A message is used only after `margin` has held it back for some time. Messages during an
         anomaly and shortly after it are ignored.

@@ -162,7 +162,7 @@ class MuscleFit:
         return minimise(self, start, ROUNDS, enough).point.parameters
 
     def point(self, parameters: Array) -> MusclePoint:
-        """Return the point of `parameters`, with residuals and derivatives."""
+        """Return these parameters with their residuals and derivatives."""
         m, observed = self._m, self._observed
         of_all = list(self._body.parameters)
         of_all[m] = parameters

@@ -104,8 +104,8 @@ class CheckpointKeeper:
     ) -> None:
         """Record a plausible message for the validation of networks and for contact detection.
 
-        Contact detection uses the torque of a healthy arm. The message contributes to it only if no
-        anomaly is present.
+        Contact detection needs the usual residual torque of the healthy arm. Messages during an
+        anomaly do not contribute to this torque.
 
         Args:
             message: The message.
@@ -163,7 +163,7 @@ class CheckpointKeeper:
         return True
 
     def numbered(self, mae: Mae) -> Mae:
-        """Return the network with a version above its own and that of the network in use."""
+        """Return the network with a version higher than its own and that of the network in use."""
         before = 0 if self.mae is None else self.mae.version
         return replace(mae, version=1 + max(mae.version, before))
 

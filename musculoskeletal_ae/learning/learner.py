@@ -207,7 +207,7 @@ class Learner:
     def _believe_offsets(self) -> None:
         """Accept the present length offsets, because they agree with the messages.
 
-        Samples that were taken under other offsets are dropped or corrected (`offset_history`).
+        Samples that were taken under wrong offsets are dropped or corrected (`offset_history`).
         """
         before = self.offset_history.corrected
         self.offset_history.use(self.body.offsets.offset)

@@ -73,9 +73,9 @@ class OffsetHistory:
     def use(self, offset: Array) -> None:
         """Use plausible offsets [m] (M,) from now on.
 
-        If they equal the previous ones, samples that were held back are used again. Otherwise these
-        samples are dropped. If the previous offsets were wrong from the start, all samples since
-        then are corrected.
+        If they equal the previous offsets, samples that were held back are used again. Otherwise
+        these samples are dropped. If the previous offsets were wrong from the start, all samples
+        that were taken under them are corrected.
         """
         change = self._offset - offset
         size = float(np.nanmax(np.abs(change)))  # NaN for a muscle that was added at a restart

@@ -43,7 +43,7 @@ class Unknowns(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residuals and derivatives at one point."""
+    """Residuals and their derivatives at given values of the unknowns."""
 
     length: Array  # residuals of the lengths [m], (N, M)
     muscle_jacobian: Array  # G [m/rad], (N, M, D)
@@ -118,7 +118,7 @@ class PostureModel:
         return self.columns[-1].stop
 
     def residuals(self, at: Unknowns) -> Residuals:
-        """Return residuals and derivatives at a point."""
+        """Return the residuals and their derivatives at given values of the unknowns."""
         body, observed, columns = (
             self.body.with_parameters(at.parameters),
             self.observed,

@@ -136,7 +136,11 @@ class RestDetector:
         self._rest: OpenRest | None = None  # None while the arm moves
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
-        """Process a reading, `dt` [s] after the previous one, with NaN for unmeasured θ.
+        """Add a reading, and detect whether a rest has ended.
+
+        Args:
+            reading: The reading, with NaN for unmeasured θ.
+            dt: Time since the previous reading [s].
 
         Returns:
             The mean of a rest that has ended, or of a part that has reached `LONGEST_PART` or

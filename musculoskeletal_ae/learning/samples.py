@@ -51,7 +51,7 @@ class Sample(NamedTuple):
 
 
 class StoredSample(NamedTuple):
-    """A sample with its number in the store, and the muscles that it describes."""
+    """A sample with its number in the order of acceptance, and the muscles that it describes."""
 
     sample: Sample
     known: Bools  # whether the sample describes each muscle, (M,)

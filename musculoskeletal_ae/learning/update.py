@@ -130,8 +130,8 @@ class BodyUpdater(Updater):
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
         """Replace the training samples at `places` by random real samples.
 
-        The tensions of real samples are converted to bone-side tensions, and creep since the sample
-        is added to their lengths.
+        The tensions of real samples are converted to bone-side tensions, and their target lengths
+        are corrected for the creep since the samples were taken.
         """
         if len(real) == 0:
             return

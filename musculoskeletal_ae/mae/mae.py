@@ -11,9 +11,9 @@ The products use single precision, because the weights of a large body then fit 
 The rounding error of 1e-6 is far below the error of a network. Inputs and outputs are arrays of
 double precision.
 
-The network has two uses: ①(θ, T) are the lengths that it restores from θ and T, and ② restores
-(θ, T, l) from measured T and l. Sensor values of isolated muscles have no influence. If muscles are
-isolated, θ is the most likely posture for the lengths of all other muscles:
+Here ①(θ, T) are the lengths that the network restores from θ and T, and ② restores (θ, T, l) from
+measured T and l. Sensor values of isolated muscles have no influence. If muscles are isolated, θ is
+the most likely posture for the lengths of all other muscles:
 
     θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T) of the muscles that are not isolated
 
@@ -422,7 +422,7 @@ class Mae:
 
     @cached_property
     def _length_weight(self) -> Array:
-        """Σ⁻¹ of the lengths [1/m²], (M, M); 0 for isolated muscles."""
+        """Inverse covariance Σ⁻¹ of the length residuals [1/m²], (M, M); 0 for isolated muscles."""
         muscles = len(self.muscles)
         used = np.delete(np.arange(muscles), self.isolated)
         rows, weight = np.ix_(used, used), np.zeros((muscles, muscles))

@@ -85,7 +85,7 @@ class AnomalyStatistics:
         return self._with_spread(muscles, FLOOR)
 
     def ignoring(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return statistics in which any residual of these muscles is normal.
+        """Return statistics in which any residual of these muscles counts as normal.
 
         Their residuals then hardly change the result of `distances`.
         """

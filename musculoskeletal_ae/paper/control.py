@@ -43,7 +43,7 @@ SEARCH = StepSearch(CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS)
 
 
 def geometric(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
-    """Return the command of the geometric model; it does not use the network."""
+    """Return the length command of the geometric model; the network is not used."""
     bias = np.full(robot.muscle_count, robot.tension.bias)
     return Solution(robot.muscle_lengths(theta, bias), bias, np.zeros(robot.joint_count))
 

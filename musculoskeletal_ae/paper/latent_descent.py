@@ -40,10 +40,10 @@ class StepSearch(NamedTuple):
 
 
 class Loss:
-    """The loss L. All terms are evaluated by one matrix product, because this is faster."""
+    """The loss L, a sum of terms. One matrix product evaluates all terms, which is faster."""
 
     def __init__(self, terms: Sequence[Term]) -> None:
-        """Stack the rows of all terms."""
+        """Stack the matrices and targets of all terms."""
         rows = np.array([len(term.target) for term in terms])
         self._weights = np.array([term.weight for term in terms])
         self._matrix = np.concatenate([term.matrix for term in terms])

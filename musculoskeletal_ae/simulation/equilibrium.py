@@ -387,7 +387,7 @@ def advance(
 
 
 class QuasiStatics:
-    """Simulates arms of one robot by the module's equations, with the network set by `use`."""
+    """Simulates arms of one robot by the equations of this module; `use` sets the network."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self.slopes = robot, Slopes(robot)
@@ -400,7 +400,7 @@ class QuasiStatics:
         """Set the network, and the robot with the currently isolated muscles.
 
         Raises:
-            FloatingPointError: If the network's lengths are not finite somewhere.
+            FloatingPointError: If the network's lengths are not finite at some posture.
         """
         self.slopes.fit(mae)
         robot = robot.with_elasticity(mae.elasticity)

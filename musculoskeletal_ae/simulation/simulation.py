@@ -81,7 +81,7 @@ class Simulation:
         self.start_from(np.zeros((arms, robot.joint_count)))
 
     def use(self, mae: Mae) -> None:
-        """Set a new network; from their present state, the arms move to its equilibrium.
+        """Set a new network; the arms then move from their present state to its equilibrium.
 
         Raises:
             FloatingPointError: If the new network cannot be simulated; the current network then
@@ -91,7 +91,7 @@ class Simulation:
         self.mae = mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Isolate exactly the muscles with these indices in T and l; they then exert no tension."""
+        """Isolate exactly the muscles with these indices; isolated muscles exert no tension."""
         self.robot = self.robot.without(muscles)
         self.use(self.mae)
 
@@ -127,7 +127,7 @@ class Simulation:
         return self.state
 
     def settle(self) -> ArmState:
-        """Advance in long steps to the equilibrium of the command, and return the arms.
+        """Advance in long steps to the equilibrium of the command, and return the arms' state.
 
         Arms that have not settled after SETTLING_STEPS are returned in their current state.
         """
