@@ -61,5 +61,5 @@ class ActivityControl(ABC):
 
     @property
     def new_target(self) -> Array | None:
-        """Posture [rad], (D,), that replaces the target; None: the target is kept."""
+        """Posture [rad], (D,), that replaces the target; None if the target does not change."""
         return None

@@ -275,10 +275,10 @@ class Controller:
 
     @contextmanager
     def _relieving(self, now: float, delay: float = 0.0) -> Iterator[None]:
-        """A context in which a `RejectionError` still makes its tensions available.
+        """A context in which the tensions of a rejected message are still used.
 
         The limiter and the watchdog can thus react to a tension that is too high, even though the
-        message was rejected. The error leaves the context unchanged.
+        message was rejected. The `RejectionError` is then raised again.
         """
         try:
             yield
@@ -379,8 +379,8 @@ class Controller:
     def clock_jumped_back(self) -> None:
         """Adapt to a backward jump of the messages' clock.
 
-        The comparison of this clock with the steady clock starts again, and earlier muscle states
-        are discarded, because their time stamps now lie in the future.
+        The comparison of this clock with the steady clock starts again, and the muscle states of
+        earlier messages are discarded from the filters.
         """
         self.watchdog.age.clock_jumped_back()
         self.stream.reset()

@@ -138,9 +138,10 @@ class RestFeedback:
 class MotionFeedback:
     """Corrects the estimated posture error e while the arm moves along a trajectory and settles.
 
-    The desired posture is shifted by k_p e + c, with dc/dt = k_i e. The integral c is stored in the
-    rest feedback (`RestFeedback.correction`) and therefore persists from one motion to the next.
-    While the limiter holds a muscle back, no entry of c grows, so that c does not wind up.
+    The desired posture is shifted by k_p e + c, with dc/dt = k_i e and the gains k_p and k_i. The
+    integral c is stored in the rest feedback (`RestFeedback.correction`) and therefore persists
+    from one motion to the next. While the limiter holds a muscle back, no entry of c grows, so that
+    c does not wind up.
     """
 
     def __init__(self, rest: RestFeedback) -> None:

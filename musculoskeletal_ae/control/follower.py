@@ -195,7 +195,7 @@ class Follower(ActivityControl):
         return Command(LENGTH, self._desired.copy())
 
     def _moving(self, trajectory: Trajectory, inputs: Inputs) -> Array:
-        """Return l_target [m], (M,), during the motion and while the arm settles."""
+        """Return the length command [m], (M,), during the motion and while the arm settles."""
         error = self.progress.error
         error = np.zeros_like(error) if self.plan.is_stiff else error
         shift = self._motion_feedback.step(error, self._is_held_back(inputs), inputs.dt)
@@ -213,7 +213,7 @@ class Follower(ActivityControl):
         return bool((inputs.length - self._desired > HELD_BACK).any())
 
     def _resting(self, inputs: Inputs) -> Array:
-        """Return l_target [m], (M,), at rest."""
+        """Return the length command [m], (M,), while the arm rests at the end of its trajectory."""
         feedback, mae, plan = self.feedback, inputs.mae, self.plan
         if self._held is None:
             self._motion_feedback.continue_at_rest()

@@ -113,7 +113,7 @@ def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array
 def proposed(
     robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, limit: Array | float
 ) -> Solution:
-    """Return the command of `proposed`.
+    """Return the command of the method `proposed`: the least tensions that balance the torque.
 
     Args:
         robot: The body, in which isolated muscles have no tension.
@@ -169,7 +169,7 @@ class StiffnessModel(NamedTuple):
         )
 
     def muscle_stiffness(self, tension: Array) -> tuple[Array, Array]:
-        """Return k [N/m] and dk/dT [1/m] of every muscle at T [N], (M,) each."""
+        """Return the stiffness k [N/m] of every muscle, and dk/dT [1/m], at T [N], (M,) each."""
         square, linear, constant = self.compliance
         compliance = (square * tension + linear) * tension + constant
         # Treat a tendon as rigid if the network wrongly predicts that it shortens under tension.
@@ -178,13 +178,16 @@ class StiffnessModel(NamedTuple):
         return k, -k * k * slope
 
     def joint_stiffness(self, tension: Array) -> Array:
-        """Return K_θ [N·m/rad], (D, D), at the tensions T [N], (M,)."""
+        """Return the joint stiffness K_θ [N·m/rad], (D, D), at the tensions T [N], (M,)."""
         k, _ = self.muscle_stiffness(tension)
         muscular = robot_stiffness.joint_stiffness(self.jacobian, self.hessian, k, tension)
         return self.springs + muscular
 
     def slope(self, tension: Array) -> Array:
-        """Return ∂K_jj/∂T_i [N·m/rad/N], (D, M), at the tensions T [N], (M,)."""
+        """Return by how much each joint's stiffness K_jj changes with each tension T_i.
+
+        The result is ∂K_jj/∂T_i [N·m/rad/N], (D, M), at the tensions `tension` [N], (M,).
+        """
         _, bend = self.muscle_stiffness(tension)
         return (self.jacobian**2 * bend[:, None]).T + np.einsum('mjj->jm', self.hessian)
 

@@ -276,7 +276,7 @@ def _random_postures(robot: Robot, start: Array) -> Array:
 
 
 def _shortened(path: Array, cost: PathCost) -> Array:
-    """Return a path [rad], (K, D), after removing postures whose removal does not cost more."""
+    """Remove postures from a path [rad], (K, D), as long as its cost does not increase."""
     k = 1
     while k < len(path) - 1:
         around = cost.of_edge(path[k - 1], path[k]) + cost.of_edge(path[k], path[k + 1])

@@ -30,7 +30,10 @@ DOING = {
 
 
 def report(core: Controller, now: float) -> Report:
-    """Return the status for /diagnostics: a stop, else why control waits, else all warnings.
+    """Return the status for /diagnostics.
+
+    The message describes a stop or, without a stop, what control waits for. If control does not
+    wait either, the message contains all warnings, or states what the arm does.
 
     The values `mode`, `stop cause`, `stop causes`, `waits for` and `remedy steps` are stable
     identifiers for programs. The message and the values `stop` and `remedy` are texts for users.

@@ -152,8 +152,8 @@ class Supervisor:
     def on_offsets(self, known: bool) -> None:
         """Adapt the activity to new length offsets.
 
-        While they are unknown, the arm can only explore gently. A motion to a target ends, because
-        its trajectory was planned with the previous offsets.
+        While the offsets are unknown, the arm can only explore gently. A motion to a target ends,
+        because its trajectory was planned with the previous offsets.
         """
         if not known and self.activity is Activity.EXPLORING:
             self.activity = Activity.CALIBRATING

@@ -52,7 +52,7 @@ class Stiffening:
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
     ) -> Array:
-        """Advance by dt [s] and return T_K [N], (M,).
+        """Advance by dt [s] and return the tensions T_K [N], (M,).
 
         The rate of T_K is limited. Trajectories may use the fraction SHARE of the rate limit of the
         lengths, and T_K may use half of the remaining fraction.
@@ -136,7 +136,7 @@ class TensionPlan:
 
     @property
     def solution(self) -> Solution | None:
-        """The last solution of method `stiffness`."""
+        """The last solution of the method `stiffness`; None if there is none."""
         return self._stiffening.solution
 
     def adopt_limit(self, limit: Array) -> bool:
@@ -149,7 +149,7 @@ class TensionPlan:
     def step(
         self, trajectory: Trajectory, time: float, shift: Array, lag: float, inputs: Inputs
     ) -> Array:
-        """Plan the next setpoint of a trajectory, and return its l_target [m], (M,).
+        """Plan the next setpoint of a trajectory, and return its length command [m], (M,).
 
         Args:
             trajectory: The trajectory.
@@ -182,6 +182,9 @@ class TensionPlan:
         return self.length(mae, at.theta + shift) + lag * speed
 
     def length(self, mae: Mae, theta: Array) -> Array:
-        """Return l_target [m], (M,), that exerts the planned tensions at rest at θ [rad], (D,)."""
+        """Return the length command [m], (M,), that exerts the planned tensions at rest.
+
+        The arm rests at the posture `theta` [rad], (D,).
+        """
         length = mae.lengths(theta, self.tension.bone)
         return length + msc_compensation(self._robot, self.tension.motor)

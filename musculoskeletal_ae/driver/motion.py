@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common parts of the motion tests of both kinds of muscle modules.
 
-If a muscle departs too far from its commands, it runs away: it is released, and the test ends.
-Each kind of test defines when a muscle runs away (`MotionTest._run_away`).
+A muscle that departs too far from its commands is said to run away. It is then released, and the
+test ends. Each kind of test defines when a muscle runs away (`MotionTest._run_away`).
 
 Since the test also moves the joints, their sensors are compared with the lengths afterwards.
 """
@@ -48,7 +48,12 @@ class MotionTest(ABC):
     _highest: Array  #: highest test tension [N] (M,)
 
     def __init__(self, verdict: Verdict, muscles: Sequence[int]) -> None:
-        """Prepare to test muscles, by default all. The verdict receives the results."""
+        """Prepare to test the muscles with the given indices.
+
+        Args:
+            verdict: Receives the results.
+            muscles: Indices of the muscles; if there are none, all muscles are tested.
+        """
         self.verdict, robot = verdict, verdict.robot
         self._robot, self._muscles = robot, muscles or range(robot.muscle_count)
         #: index of the muscle that is being tested; None while the arm is held

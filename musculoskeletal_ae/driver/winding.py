@@ -238,7 +238,10 @@ class Winding(MotionTest):
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]
     ) -> Generator[None, None, _Reading]:
-        """Demand a tension, follow the arm as it gives way, and return the resulting reading.
+        """Demand a tension of a muscle, and return the reading that results.
+
+        If the arm yields, so that the muscle shortens, l_target moves further inwards, until the
+        demand or the distance FURTHEST is reached.
 
         Args:
             m: The muscle.

@@ -174,7 +174,7 @@ class Learner(Shell):
         return report.with_warning(f'{IMU} is not used: {problem}') if problem else report
 
     def destroy_node(self) -> None:
-        """End the training process with the node."""
+        """End the training process, then destroy the node."""
         if self.core:
             self.core.close()
         super().destroy_node()

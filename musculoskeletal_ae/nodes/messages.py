@@ -82,7 +82,7 @@ def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Return whether a publisher has a subscriber; without one, no message need be built."""
+    """Return whether a publisher has a subscriber; otherwise, building a message is useless."""
     return publisher.get_subscription_count() > 0
 
 

@@ -53,7 +53,7 @@ def end_process() -> None:
 
 
 class ProgressWatch:
-    """Watches the main thread between `start` and `stop`."""
+    """Watches, between `start` and `stop`, whether the main thread makes progress."""
 
     def __init__(
         self,

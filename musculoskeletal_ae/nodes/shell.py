@@ -359,7 +359,7 @@ class Shell(Node):
         handle: Callable[[UInt8MultiArray], Iterator[None]],
         unfit: Callable[[str], None] = lambda _: None,
     ) -> CheckpointQueue:
-        """Return a queue that handles the checkpoints of a topic in small steps."""
+        """Return a queue that processes the checkpoints of a topic in small steps."""
         return CheckpointQueue(self, self._reception, topic, handle, unfit)
 
     # -- messages -------------------------------------------------------------------------------
@@ -391,8 +391,8 @@ class Shell(Node):
     ) -> None:
         """Subscribe, and count messages that are repeated, late or refused by the callback.
 
-        Messages of a topic of `AUTHORS` are rejected while it has several publishers (`sources`),
-        unless the topic is one of `accepted_from_all`.
+        A topic in `AUTHORS` should have exactly one publisher. While such a topic has several
+        publishers, its messages are rejected (`sources`), unless it is in `accepted_from_all`.
 
         Args:
             kind: Message type.

@@ -105,7 +105,7 @@ class Situation:
         suspect: Name of the muscle that the estimator suspects most, or ''.
         evidence: Why the estimator has detected an anomaly, or ''.
         distance: Distance d of the anomaly detector; NaN if unknown.
-        limit: Value of d above which a message is an anomaly; NaN if unknown.
+        limit: Value of d above which a message counts as an anomaly; NaN if unknown.
         samples: Number of samples learned, or '' without a learner.
         checkpoints: Number of networks published, or '' without a learner.
         doing: Message of the controller's last report.
@@ -390,10 +390,9 @@ class Situation:
 
     @property
     def _stands_still(self) -> bool:
-        """Whether the arm does not move as long as length offsets are unknown.
+        """Whether the arm waits, without moving, while length offsets are unknown.
 
-        This is so in those modes of the controller in which the arm is neither stopped nor
-        exploring, nor guided by hand. Even in the mode `moving`, it then waits for the offsets.
+        It waits in the modes `idle`, `holding`, `moving` and `torque` of the controller.
         """
         mode = self._values('controller').get('mode')
         return mode in [activity.value for activity in STANDING_STILL]

@@ -138,7 +138,7 @@ class Twins:
         self._heard_at = -math.inf  # time of the last report of another node [s]
 
     def take(self, report: bytes, now: float) -> None:
-        """Process a report in CDR that arrived at `now` [s].
+        """Process a serialized report (CDR) that arrived at `now` [s].
 
         A report before our own first one is ignored, because a killed predecessor may have sent it.
         """

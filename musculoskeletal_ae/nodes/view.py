@@ -300,7 +300,7 @@ class View(Node):
             self._ask('controller/reset', then=note_reset, quiet=True)
 
     def _look(self) -> None:
-        """Show the page's controls of those nodes that run, and request the emulator's state."""
+        """Show the controls for the nodes that are running, and request the emulator's state."""
         running = {node for node, name in SIGNS.items() if self.clients_of[name].service_is_ready()}
         if any(push.get_subscription_count() for push in self.pushes):
             running.add('pushed')

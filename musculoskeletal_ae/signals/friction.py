@@ -87,7 +87,12 @@ class Transmission:
         return cls(nothing, np.zeros((3, len(limit))), np.eye(3) * np.square(spread)[:, None])
 
     def motor(self, read: Array, direction: Array) -> Array:
-        """Return T [N] for T_read [N] and s, (..., M) each."""
+        """Return the motor-side tensions T [N], (..., M).
+
+        Args:
+            read: Readings T_read [N], (..., M).
+            direction: Sliding directions s, (..., M).
+        """
         if self.drive is None:
             return read
         gain, offset, friction = self.drive
@@ -95,7 +100,14 @@ class Transmission:
         return np.maximum(tension, 0.0)
 
     def spread(self, read: Array, direction: Array) -> Array:
-        """Return σ_T [N] for T_read [N] and s, (M,) each; σ_T is 0 for tension sensors."""
+        """Return the standard deviations σ_T [N] of the motor-side tensions, (M,).
+
+        They are 0 for tension sensors.
+
+        Args:
+            read: Readings T_read [N], (M,).
+            direction: Sliding directions s, (M,).
+        """
         if self.drive is None or self.drive_covariance is None:
             return np.zeros_like(read)
         gain, _, friction = self.drive
@@ -105,12 +117,22 @@ class Transmission:
         return np.sqrt(variance)
 
     def end(self, read: Array, direction: Array) -> Array:
-        """Return T_end [N] for T_read [N] and s, (..., M) each."""
+        """Return the bone-side tensions T_end [N], (..., M).
+
+        Args:
+            read: Readings T_read [N], (..., M).
+            direction: Sliding directions s, (..., M).
+        """
         end: Array = self.motor(read, direction) * np.exp(-self.friction * direction)
         return end
 
     def reading(self, motor: Array, direction: Array) -> Array:
-        """Return T_read [N] for T [N] and s, (..., M) each."""
+        """Return the readings T_read [N], (..., M), that the muscle modules would report.
+
+        Args:
+            motor: Motor-side tensions T [N], (..., M).
+            direction: Sliding directions s, (..., M).
+        """
         if self.drive is None:
             return motor
         gain, offset, friction = self.drive
@@ -139,7 +161,7 @@ class FrictionDirection:
         self._length: Array | None = None
 
     def step(self, length: Array) -> Array:
-        """Update the directions with the next l [m], (M,), and return s (M,)."""
+        """Update the sliding directions with the next lengths [m], (M,), and return them, (M,)."""
         if self._length is None:
             self._length, self._mean, self._read = length, length, (length, length)
             self._off, self._direction = np.zeros_like(length), np.zeros_like(length)
@@ -160,7 +182,13 @@ class FrictionDirection:
         return self._direction
 
     def end_tension(self, transmission: Transmission, read: Array, length: Array) -> Array:
-        """Update s with the next l [m], and return T_end [N] for T_read [N], (M,) each."""
+        """Update the sliding directions, and return the bone-side tensions [N], (M,).
+
+        Args:
+            transmission: Converts readings to bone-side tensions.
+            read: Readings T_read [N], (M,).
+            length: Next muscle lengths [m], (M,).
+        """
         return transmission.end(read, self.step(length))
 
     def reset(self) -> None:
@@ -169,6 +197,6 @@ class FrictionDirection:
 
 
 def directions(length: Array) -> Array:
-    """Return s (N, M) for the lengths l [m], (N, M), of consecutive messages."""
+    """Return the sliding directions s, (N, M), for the lengths [m], (N, M), of N messages."""
     step = FrictionDirection().step
     return np.array([step(each) for each in length]).reshape(length.shape)

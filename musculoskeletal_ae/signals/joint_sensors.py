@@ -183,7 +183,7 @@ class _Lengths:
         return self.robot.muscle_lengths(theta, self._tension)[:, self._used]
 
     def _centred(self, lengths: Array) -> Array:
-        """Return lengths (N, M) without their mean in each segment."""
+        """Return lengths (N, M) after subtracting each muscle's mean in each segment."""
         centred = lengths.copy()
         for rows in self._segments:
             centred[rows] -= lengths[rows].mean(axis=0)
@@ -296,7 +296,7 @@ def _exchanged(theta: Array, pair: tuple[int, int]) -> Array:
 
 
 def _repeats(time: Array, values: Array) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each run of equal values that lasts STUCK_TIME."""
+    """Yield the first and last index of each run of equal values of at least STUCK_TIME seconds."""
     edges = np.flatnonzero(values[1:] != values[:-1]) + 1
     begins = np.concatenate([[0], edges])
     ends = np.concatenate([edges, [len(values)]]) - 1
@@ -318,7 +318,8 @@ def _hidden_motion(error: Array, jacobian: Array) -> Array:
     The result is 0 if no motion explains enough of the errors.
 
     Args:
-        error: l − l̂ without a constant for each muscle, such as its mean [m], (N, M).
+        error: Measured minus modelled lengths [m], (N, M), from which a constant for each muscle,
+            such as the mean, has been subtracted.
         jacobian: G of these joints [m/rad], (N, M, S).
     """
     hidden: Array = np.einsum('nsm,nm->ns', np.linalg.pinv(jacobian), error)

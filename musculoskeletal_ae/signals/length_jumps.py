@@ -219,7 +219,7 @@ class DisplacedMuscles:
     """Records muscles whose lengths have jumped since their last length calibration.
 
     Attributes:
-        muscles: Indices of the muscles, whose lengths are not reliable.
+        muscles: Indices of these muscles; their lengths are not reliable.
         jumps: Number of accepted jumps since the start.
         is_unseen: Whether the last jump was during a pause of the messages, in which the arm may
             have moved.

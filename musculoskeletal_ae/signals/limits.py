@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of plausible sensor values, and checks that use them.
 
-The limits leave a margin to the extremes of five healthy arms that each explored for a minute, with
-and without an unknown payload of 3.6 kg, under the initial network of preset `default`. On these
-arms, lengths changed by up to 0.9 mm in 10 ms, estimates exceeded a joint's range by up to 0.13 of
-the range, and tensions reached 343 N.
+The limits lie beyond the extremes of five healthy arms by a margin. The arms explored for a minute,
+with and without an unknown payload of 3.6 kg, under the initial network of preset `default`.
+Lengths changed by up to 0.9 mm in 10 ms, estimates exceeded a joint's range by up to 0.13 of the
+range, and tensions reached 343 N.
 """
 
 import math

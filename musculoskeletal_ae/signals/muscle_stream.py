@@ -103,7 +103,7 @@ class MuscleSample:
 
     @property
     def model_tension(self) -> Array:
-        """T [N], (M,), as measured; where T is not known, the tension that models assume."""
+        """Motor-side tensions [N], (M,), as measured; where unknown, those that models assume."""
         tension: Array = np.where(
             np.isnan(self.motor_tension), self.bone_tension, self.motor_tension
         )
