@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compares kinds of muscle modules: stiffness control or positions, and sources of tension.
+"""Compares muscle modules by control (stiffness or position) and by source of tension.
 
     python -m bench actuation [--robot musashi_left_arm] [--seeds 0,1,2,3,4] [--quick]
 
@@ -9,8 +9,9 @@ network. With the learned network, the bench measures:
 - estimate: mean ‖θ_est − θ‖ in further exploration, before and after learning,
 - control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random holdable postures,
 - rupture: several muscles rupture in turn while the arm explores. The columns are the share of
-  ruptures after which a muscle is isolated within 10 s, the share after which it is the ruptured
-  muscle, and the mean time from a rupture to the first isolation (10 s if there is none),
+  ruptures after which a muscle is isolated within 10 s, the share after which only the ruptured
+  muscle is isolated, and the mean time from a rupture to the first isolation (10 s if there is
+  none),
 - max/limit: the highest true tension as a multiple of `tension.limit`, except after a rupture,
 - wrong: the number of isolations and stops although the arm is healthy.
 
@@ -105,8 +106,8 @@ def learn(
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
     """Explore for a time [s]; return the mean estimation error [rad] and the number of mistakes.
 
-    Each isolation of a muscle is a mistake, because the arm is healthy. A stop that has not ended
-    by then is another one.
+    Each isolation of a muscle is a mistake, because the arm is healthy. A stop that lasts at the
+    end is another one.
     """
     loop = IsolatingLoop(arm, mae, EXPLORATION_STREAM + 50 + seed)
     loop.run(1.0)

@@ -15,9 +15,9 @@ The whole system runs on an emulated arm, once for each seed. Each run has three
 Every command, tension and status is recorded and checked. The bench also reads hostile files and,
 unless `--quick`, kills a learner as in `kills`.
 
-Prints a table: promise, number of trials, number of violations. Exit status 1 if there is any
-violation. The hostile node never does what an open graph allows: command the modules within their
-limits, request a stop, or set a parameter to a legal value.
+The bench prints a table: promise, number of trials, number of violations. The exit status is 1 if
+there is any violation. The hostile node does not do what every node on an open graph may do:
+command the modules within their limits, request a stop, or set a parameter to a legal value.
 """
 
 import random
@@ -137,7 +137,7 @@ def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscle
 
 
 def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array:
-    """Return the longest uninterrupted time [s] for which each muscle was above `highest` [N].
+    """Return the longest uninterrupted time [s] for which each tension was above `highest` [N].
 
     `loads` are pairs of a time [s] and the tensions measured at that time [N], (M,). The result
     is (M,), or (0,) if `loads` is empty.

@@ -187,7 +187,7 @@ class Attack:
         self.life += name == 'controller'
 
     def start_second(self, name: str, node: str = '') -> None:
-        """Start a second process of the node `name`; `node` is its node name if it differs."""
+        """Start a second process of the node `name`, under the node name `node` if it is given."""
         remapping = ['-r', f'__node:={node}'] if node else []
         self.strangers.append(self.process(name, f'second_{name}', remapping))
 
@@ -220,7 +220,7 @@ class Attack:
         return Process(name, [*command, *remapping, *words], file)
 
     def found(self, promise: str, what: str) -> None:
-        """Record a violation of a promise."""
+        """Record a violation of a promise; `what` describes the violation."""
         self.findings.setdefault(promise, []).append(what)
 
     # -- watching -------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ class Scene:
     """Performs one known attack on an arm that holds or explores, and recovers the arm."""
 
     def __init__(self, attack: Attack) -> None:
-        """Attack the running system of `attack`, by the hostile node of that system."""
+        """Prepare attacks on the system that `attack` has started."""
         self.attack, self.rng = attack, attack.rng
         self.what = ''  # description of the present attack, for the reports of violations
 
@@ -94,7 +94,7 @@ class Scene:
         return True
 
     def recover(self, moment: str) -> None:
-        """Follow the advice until nothing is wrong and the arm is in its previous state."""
+        """Follow the advice until nothing is wrong and the arm is in the state `moment` again."""
         attack, end, trouble = self.attack, time.monotonic() + PATIENCE, ''
         longest = end + COOLING
         while time.monotonic() < end:

@@ -66,10 +66,10 @@ def calibration(
 
     Args:
         robot: The geometric model.
-        default: Initial network of preset `default`, which also makes the motion.
+        default: Initial network of preset `default`, which also commands the motion.
         paper: Initial network of preset `paper`.
         seeds: Seeds of the individuals.
-        minutes: Length of the motion.
+        minutes: Duration of the motion [min].
     """
     rows = []
     for seed in seeds:

@@ -126,7 +126,10 @@ class EagerSimulation:
         return self.state
 
     def _lengths(self, theta: Tensor, tension: Tensor) -> tuple[Tensor, Tensor]:
-        """Return l (N, M), and Gᵀ T (N, D), of the network."""
+        """Return the network's muscle lengths l [m] (N, M), and the products Gᵀ T [N·m] (N, D).
+
+        G = ∂l/∂θ is the muscle Jacobian.
+        """
         angles, muscles = theta.detach().requires_grad_(), tension.shape[1]
         inputs = torch.cat((angles, tension, torch.zeros_like(tension)), dim=1)
         mask = torch.zeros(len(theta), dtype=torch.long)
@@ -135,7 +138,7 @@ class EagerSimulation:
         return length.detach(), torch.autograd.grad(length, angles, tension)[0]
 
     def _hold(self, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the holding torque (N, D) and its derivative with respect to θ (N, D, D).
+        """Return the torque that holds the arm [N·m] (N, D), and its derivative by θ (N, D, D).
 
         `load.hold` computes the same.
         """

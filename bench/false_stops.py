@@ -114,7 +114,7 @@ class Process:
 
 
 class Result(NamedTuple):
-    """What happened to a healthy arm."""
+    """Results of one healthy arm: a false finding or stop, pauses, lost and late messages."""
 
     seconds: float  # simulated time [s]
     problem: str  # the false finding or stop that ended it, or ''
@@ -141,7 +141,7 @@ class BusyLoop:
     """An exploring arm with driver, estimator, controller and learner on one computer."""
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
-        """Connect an arm at rest; `load` is the number of other processes."""
+        """Connect an arm at rest to the nodes; `load` is the number of other processes."""
         robot, self.arm, self.now = arm.robot, arm, 0.0
         self.estimator, self.controller = (
             Estimator(robot),
@@ -161,7 +161,7 @@ class BusyLoop:
 
     @property
     def problem(self) -> str:
-        """The false finding or stop, or ''."""
+        """The false finding or stop as a text, or '' if there was none."""
         supervisor = self.controller.supervisor
         if self.estimator.cause:
             return f'finding: {self.estimator.cause}'

@@ -51,7 +51,7 @@ PATIENCE = 600.0  # longest wait for the start and for each event of the film [s
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
-    """Return the pictures of the film, and the indices, by name, of those for separate files."""
+    """Return the pictures of the film, and by file name the indices of those to save separately."""
     frames: list[Image.Image] = []
     browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports public robot models, compares muscle lengths with the source, and learns the robots.
+"""Imports public robot models, compares muscle lengths with the source, and trains networks.
 
     python -m bench importing FILE… [--out DIR] [--learn [--minutes 10]]
 
@@ -13,10 +13,10 @@ prints one row for each file:
 - the largest moment arm error over 200 postures, and the number of muscles with a wrong sign there,
 - the verdict of `check_robot` over 100 postures.
 
-With --learn, the experiments `online_learning` and `control` learn an individual of each robot. The
-row then continues with the estimation error on the held-out motion before and after learning, that
-of the oracle (mean norms over the joints), and the target error of `proposed`. If the arm cannot
-hold any posture, it has no targets, and the cell gives the reason.
+With --learn, the experiments `online_learning` and `control` run on an individual of each robot.
+The row then continues with the estimation error on the held-out motion before and after learning,
+that of the oracle (mean norms over the joints), and the target error of `proposed`. If the arm
+cannot hold any posture, it has no targets, and the cell gives the reason.
 """
 
 import tempfile
@@ -124,7 +124,10 @@ def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Compari
 
 
 def row(file: Path, out: Path, minutes: float | None) -> list[str]:
-    """Import one file, learn the robot if `minutes` is given, and return the cells of its row."""
+    """Import one file, and return the cells of its row.
+
+    If `minutes` is given, a network also learns an individual of the robot for this time.
+    """
     name = f'{file.parent.name}/{file.name}'
     try:
         robot, notes, comparison = import_robot(file, out)
@@ -143,7 +146,7 @@ def row(file: Path, out: Path, minutes: float | None) -> list[str]:
 
 
 def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
-    """Learn an individual, and return the cells of its results."""
+    """Let a network learn an individual of the robot, and return the cells with the results."""
     study = Study(robot, 'default', (INDIVIDUAL,), minutes, quick=False, folder=out)
     for preset in PRESETS:
         online_learning.train_initial(study, preset)

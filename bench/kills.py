@@ -4,9 +4,9 @@
 python -m bench kills [--kills 50] [--seed 0]
 
 A child process runs the `Learner` of the node, with its training process, on random samples. It
-reports each accepted sample and each published network. After a kill, the next child must have all
-accepted samples, and a network that is not older than the last published one. Exit status 1 if
-anything was lost.
+reports each accepted sample and each published network. After a kill, the next child must load all
+accepted samples, and a network that is not older than the last published one. The exit status is 1
+if anything was lost.
 """
 
 import argparse

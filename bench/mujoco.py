@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learns published MuJoCo models, and prints the results for each individual.
+"""Trains networks on published MuJoCo models, and prints the results for each individual.
 
     python -m bench mujoco NAME=FILE[:joints=A,B][:without=C,D][:end=E] … --out DIR [--minutes 10]
     python -m bench mujoco NAME=FILE … --out DIR --nodes [--seconds 30]
@@ -17,7 +17,7 @@ columns of a row are
 
 - the estimation error on the held-out motion before learning, after learning with preset `paper`,
   and after learning with preset `default` [rad, norm over the joints],
-- the numbers of ruptures that were detected, and attributed to the right muscle,
+- the number of ruptures that were detected, and the number attributed to the right muscle,
 - the error while the arm follows four trajectories of 2 s between holdable postures, the first of
   which is approached in 3 s [rad]. Only motions for which the individual's muscles are strong
   enough are measured, considering tendon friction, damping of the joints, and a reserve of 15 % of
@@ -28,7 +28,7 @@ columns of a row are
 - errors of moment arms [mm, median over the muscles]: of the exported model relative to the
   learned network, of the exported model relative to the individual, and of the file relative to
   the individual; then the size of these moment arms,
-- the number of seconds of the model that one core computes in a second, and
+- the speed of the emulated arm on one core, as a multiple of real time, and
 - the duration of the initial training on one core [s].
 
 With --nodes, the bench measures the running system instead, for the first individual of --seeds:
@@ -231,7 +231,7 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
 
 
 def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> str:
-    """Return an error of an individual, or the message of the exception that it raises."""
+    """Return an error of an individual as a text; if the function fails, the message of the exception."""
     try:
         return f'{error(study, seed):.4f}'
     except MusculoskeletalError as problem:

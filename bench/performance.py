@@ -3,8 +3,8 @@
 
     python -m bench performance [--seconds 20] [--late 600] [--flames] --out doc
 
-Times hold for the machine and the day that the page names; the machine should be idle otherwise.
-`--flames` draws a flame graph of each node at 200 Hz by py-spy, as OUT/flames/NODE.svg.
+The times are those of the machine and the day that the page names. The machine should be idle
+otherwise. `--flames` draws a flame graph of each node at 200 Hz by py-spy, as OUT/flames/NODE.svg.
 """
 
 import os

@@ -86,7 +86,7 @@ class Site:
         """Run shell lines on the host, or on the platform; return their output.
 
         Raises:
-            MusculoskeletalError: If a line fails; the end of the output is printed before.
+            MusculoskeletalError: If a line fails. The end of the output has then been printed.
         """
         print(f'   {title}', flush=True)
         script, command = ['set -e', *lines], ['bash', '-c']
@@ -157,7 +157,7 @@ def _wheels(version: str) -> Callable[[Site], None]:
 
 
 def _sourced(site: Site) -> None:
-    """Emulate Ubuntu 24.04 with /opt/ros/jazzy sourced, from the wheels.
+    """Emulate Ubuntu 24.04 with a sourced /opt/ros/jazzy, by means of the ROS wheels.
 
     The system's Python is a copy with the packages of Ubuntu. The wheels are unpacked into a
     prefix, which a setup.bash like that of ROS puts on the paths.
@@ -221,7 +221,10 @@ def _sourced_with_pinocchio(site: Site) -> None:
 
 
 def _debian_13(site: Site) -> None:
-    """Create a minimal Debian 13 (Python 3.13, no compiler, no libgomp, no venv), and enter it."""
+    """Create a minimal Debian 13, in which later commands of the platform run.
+
+    It has Python 3.13, but no compiler, no libgomp and no venv.
+    """
     root = site.folder / 'debian'
     if os.getuid() != 0 or shutil.which('debootstrap') is None:
         raise MusculoskeletalError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learns public recordings of other tendon-driven robots, and compares with polynomial fits.
+"""Trains models on public recordings of other tendon-driven robots, and compares their errors.
 
     python -m bench recordings --clones DIR [--out DIR] [--only NAME]
 
@@ -196,7 +196,10 @@ def observations(recording: Recording) -> dict[str, Any]:
 
 
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
-    """Return the path of the clone of a repository, or None; `fetch` clones a missing one."""
+    """Return the path of a repository's clone; None if there is none.
+
+    A missing clone is created first if `fetch` is true.
+    """
     owner, short = repository.name.split('/')
     for name in (f'{owner}+{short}', short):
         for path in (clones / name / 'repo', clones / name):
@@ -213,7 +216,7 @@ def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
 
 
 def main(argv: list[str]) -> int:
-    """Learn all repositories that have clones; return 1 if there is none."""
+    """Train and test models on all repositories that have clones; return 1 if there is none."""
     parser = Parser('recordings', "Learns public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')

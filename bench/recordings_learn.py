@@ -48,7 +48,7 @@ def joined(runs: list[Run]) -> Run:
 
 
 def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
-    """Return the least-squares polynomial of lengths, or of lengths and efforts."""
+    """Return the least-squares polynomial for θ, of lengths or of lengths and efforts."""
 
     def inputs(run: Run) -> Array:
         return np.hstack([run.length, run.effort]) if with_effort else run.length
@@ -92,7 +92,7 @@ def package(
     """Return a model that estimates θ by a network of this package.
 
     The body model is calibrated with the rest samples in `training`, and the network learns this
-    body model. With efforts, the model takes efforts for tensions. Without, tensions are unknown.
+    body model. With efforts, the model uses the efforts as tensions. Without, tensions are unknown.
     """
     robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
     tension = tensions(robot, training, with_effort)
@@ -112,10 +112,12 @@ class Statics:
 
         0 = g(θ) + K θ − λ m Jᵀ F₁ + G(θ)ᵀ T,     T = k max(0, f_geo(θ) − γ l + p)
 
-    F₁ is the weight of 1 kg. The lengths l are known, and the tensions T follow from them. The
-    spring K, the stiffness k of the tendons, the scale γ of the spools, the pretension p and the
-    share λ of the payload are fitted to rest samples with known payloads m. The orientation of the
-    IMU in each of these runs is fitted as well; in other runs it is taken to be 0.
+    g is the torque that holds the weight of the link, J the Jacobian of its tip, F₁ the weight of 1
+    kg, G the muscle Jacobian, and f_geo the length of the route. The lengths l are known, and the
+    tensions T follow from them. The spring K, the stiffness k of the tendons, the scale γ of the
+    spools, the pretension p and the share λ of the payload are fitted to rest samples with known
+    payloads m. The orientation of the IMU in each of these runs is fitted as well; in other runs it
+    is taken to be 0.
     """
 
     #: means and standard deviations of the prior of log K [N·m/rad], log k [N/m], log γ, p [m], λ

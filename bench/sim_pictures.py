@@ -3,8 +3,8 @@
 
     python -m bench sim_pictures --checkpoint FILE [--out doc]
 
-Writes sim_at_rest.png and sim_loaded.png. `render --topic sim/markers` draws a running simulator in
-the same way.
+The bench writes sim_at_rest.png and sim_loaded.png. `render --topic sim/markers` draws a running
+simulator in the same way.
 """
 
 from pathlib import Path

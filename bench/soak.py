@@ -66,19 +66,19 @@ class RareTrainer(Trainer):
     every, samples = 1, 0
 
     def begin(self, mae: Mae) -> None:
-        """Continue from a network."""
+        """Begin with a network, and discard the recorded times."""
         super().begin(mae)
         self.seconds: list[float] = []
 
     def submit(self, job: Job) -> None:
-        """Run an update."""
+        """Run an update, and record its CPU time."""
         begun, self.samples = time.process_time(), 0
         super().submit(job)
         self.seconds.append(time.process_time() - begun)
 
     @property
     def ready(self) -> bool:
-        """Whether enough samples have arrived."""
+        """Whether enough samples have arrived for the next update."""
         return self.samples >= min(self.every, 1 + len(self.seconds) // 4)
 
 
@@ -113,7 +113,7 @@ def failures_of(worst: float, filled: float, most: float, times: list[float]) ->
 
 
 def main(argv: list[str]) -> int:
-    """Run the soak."""
+    """Run the endurance test; return the exit status."""
     parser = Parser('soak', 'Learns for a day, and checks error, memory and update time.')
     parser.add_robot()
     parser.add_argument('--hours', type=float, default=24.0, help='robot time [h]')

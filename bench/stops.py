@@ -3,9 +3,9 @@
 
     python -m bench stops [--count 70] [--seed 0]
 
-Passes if every node ends with status 0 and without a traceback. Python reaches the first line of
-the package about 0.1 s after the start, or later on a busy machine. A signal before that ends the
-process, and Python may print a traceback; these cases are counted separately.
+The bench passes if every node ends with status 0 and without a traceback. Python reaches the first
+line of the package about 0.1 s after the start, or later on a busy machine. A signal before that
+ends the process, and Python may print a traceback; these cases are counted separately.
 """
 
 import os
@@ -29,7 +29,11 @@ SIGNS_OF_A_CRASH = ('Traceback', 'Exception ignored', 'error', 'Fatal')
 
 
 def stop(name: str, number: signal.Signals, moment: float, state: Path) -> tuple[int, float, str]:
-    """Start a node and stop it; return its exit status, the time to end [s], and its output."""
+    """Start a node, and send it a signal `moment` seconds later.
+
+    Returns:
+        The exit status of the node, the time from the signal to its end [s], and its output.
+    """
     folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
     process = subprocess.Popen(
         [str(folder / name), '--ros-args', '-p', 'robot:=arm26'],

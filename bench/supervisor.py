@@ -3,8 +3,9 @@
 
     python -m bench supervisor [--events 200000]
 
-It runs the stateful property test of `test/control/test_supervisor.py` for longer. Exit status 1 if
-an invariant was violated; hypothesis prints the shortest sequence of events that violates it.
+The bench runs the stateful property test of `test/control/test_supervisor.py` for longer. The exit
+status is 1 if an invariant was violated; hypothesis then prints the shortest sequence of events
+that violates it.
 """
 
 from control.test_supervisor import Arm

@@ -91,7 +91,7 @@ class Observed:
         self.shares: list[Array] = []
 
     def run(self, step: Callable[[], tuple[Array, ...]], seconds: float) -> None:
-        """Run the loop for a time [s]."""
+        """Call `step` for a time [s], and record the tensions after each call."""
         limit = self.loop.arm.robot.tension.limit
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.shares.append(step()[3] / limit)

@@ -115,7 +115,7 @@ def row_time(row: Row, function: Callable[[], object]) -> float:
 
 
 def mae_rows(robot: Robot, preset: str) -> list[Row]:
-    """Return rows for the steps of the network; the weights do not affect time."""
+    """Return rows for the steps of the network; their times do not depend on its weights."""
     mae = initial_mae(robot, preset, steps=1).mae
     eager = from_mae(mae)
     states = random_states(robot, 1, np.random.default_rng(0), robot.tension.limit)
@@ -154,7 +154,10 @@ def mae_rows(robot: Robot, preset: str) -> list[Row]:
 
 
 def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
-    """Return rows for the control methods at one posture; the weights do not affect time."""
+    """Return rows for the control methods at one posture.
+
+    Their times do not depend on the weights of the network.
+    """
     theta = 0.5 * (robot.lower + robot.upper)
     torque = robot.kinematics.holding_torque(theta)
     tension = np.full(robot.muscle_count, robot.tension.bias)
@@ -195,7 +198,10 @@ def _tensor(values: Array) -> Tensor:
 def eager_proposed(
     robot: Robot, network: Network, theta: Array, torque: Array, tension: Array
 ) -> Array:
-    """Return l_target [m] of preset `default`; arguments as for `control.proposed`."""
+    """Return the target lengths l_target [m] of preset `default`, computed in plain torch.
+
+    The arguments are those of `control.proposed`.
+    """
     muscles = network.muscles
     posture, bias = _tensor(theta), robot.tension.bias
 
@@ -216,7 +222,10 @@ def eager_proposed(
 def eager_proposed_paper(
     robot: Robot, network: Network, theta: Array, torque: Array, tension: Array
 ) -> Array:
-    """Return l_target [m] of preset `paper`; arguments as for `paper.control.proposed`."""
+    """Return the target lengths l_target [m] of preset `paper`, computed in plain torch.
+
+    The arguments are those of `paper.control.proposed`.
+    """
     joints, muscles, step = network.joints, network.muscles, 0.01
     with torch.no_grad():
         postures = _tensor(theta) + torch.cat([torch.zeros(1, joints), step * torch.eye(joints)])
@@ -288,7 +297,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
 
 
 def emulation_rows(robot: Robot) -> list[Row]:
-    """Return rows for one millisecond of the emulator models."""
+    """Return rows for one millisecond of emulation by each emulator model."""
     steps = 10
     return [
         Row(
@@ -334,7 +343,7 @@ def show(robot: Robot, preset: str, device: str | None = None) -> None:
 
 
 def main(argv: list[str]) -> None:
-    """Measure on one robot with one preset."""
+    """Measure the steps for one robot and one preset, and print the table."""
     parser = Parser('timings', 'Times each step of the core, and the same step in plain torch.')
     parser.add_robot()
     parser.add_preset()

@@ -286,9 +286,10 @@ def systems(
     seconds: float,
     emulator: Sequence[str] = (),
 ) -> Iterator[tuple[float, str, Wire]]:
-    """Measure one robot at all rates [Hz] and kinds; yield rate, kind and results.
+    """Measure one robot at all rates [Hz] with all sets of nodes; yield rate, set and results.
 
-    `emulator` lists further parameters of the emulator, each as NAME:=VALUE.
+    `kinds` are keys of KINDS, the sets of nodes. `emulator` lists further parameters of the
+    emulator, each as NAME:=VALUE.
     """
     with tempfile.TemporaryDirectory() as folder:
         network = Path(folder) / 'network.safetensors'

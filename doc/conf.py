@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The site of these pages, with a reference made from the docstrings.
+"""Configures Sphinx for the web site of these pages, with a reference made from the docstrings.
 
 .venv/bin/pip install -r doc/requirements.txt
 .venv/bin/python -m sphinx -W doc build/doc      # then open build/doc/index.html

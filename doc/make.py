@@ -182,7 +182,7 @@ def _printed(command: list[str]) -> str:
 
 
 def command_line() -> str:
-    """Return the page of all scripts and executables."""
+    """Return the page with the help of all scripts and executables."""
     from musculoskeletal_ae import executables
 
     usage = _printed([str(FOLDER.parent / 'bringup.sh'), '--help'])
@@ -329,7 +329,7 @@ PAGES = {
 
 
 def draw_series_elastic(file: Path) -> None:
-    """Draw the effects of force, rate and wire_stretch on L_e(T)."""
+    """Draw how the constants force, rate and wire_stretch change the elongation L_e(T)."""
     from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
     tension = np.linspace(0.0, 300.0, 200)

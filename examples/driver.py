@@ -78,7 +78,10 @@ class Driver(Node):
             self.target, self.by_tension, self.commanded_at = target, by_tension, time.monotonic()
 
     def tick(self) -> None:
-        """Read the sensors, regulate the tensions by the MSC law, and publish the states."""
+        """Read the sensors, regulate the tensions, and publish the states.
+
+        The tension of a muscle follows from its length and command by muscle stiffness control.
+        """
         angle, tension, temperature, theta = self.bus.read()
         length = -SPOOL * angle
         bias, most = self.robot.tension.bias, self.robot.tension.max

@@ -15,7 +15,7 @@ from numba.experimental import structref
 
 @structref.register
 class HandleType(types.StructRef):  # type: ignore[misc]
-    """numba's type of a Handle."""
+    """The numba type of a `Handle`."""
 
 
 class Handle(structref.StructRefProxy):  # type: ignore[misc]

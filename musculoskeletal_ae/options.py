@@ -113,7 +113,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def add_motors(self) -> None:
-        """Add `--params-file`, from which tools take the motor parameters."""
+        """Add `--params-file`: parameter files that state how the motors are connected."""
         self.add_argument(
             '--params-file',
             type=Path,

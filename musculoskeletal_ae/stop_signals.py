@@ -38,7 +38,7 @@ class Reaction(Enum):
 
 
 class StopSignals:
-    """Handler of both signals; the only instance, `STOP`, serves the whole process."""
+    """Handles SIGINT and SIGTERM; the only instance, `STOP`, serves the whole process."""
 
     def __init__(self) -> None:
         self.received = False

@@ -225,7 +225,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def _six(first: Any, second: Any, most: Array, what: str) -> Array:
-    """Return two vectors as one, (6,), checked to be finite and within ±`most`, (6,)."""
+    """Return two vectors as one array (6,), whose elements must be finite and within ±`most`."""
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
         raise MessageError('not finite', what)

@@ -60,7 +60,10 @@ class Hardware:
 
 
 class FakeRobot(Node):
-    """A controller_manager with joint_state_broadcaster and forward_command_controller."""
+    """A stand-in for a controller_manager with two controllers of ros2_controllers.
+
+    These are joint_state_broadcaster and forward_command_controller.
+    """
 
     def __init__(self) -> None:
         super().__init__('fake_robot')

@@ -145,7 +145,7 @@ def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
 
 
 class Springs(NamedTuple):
-    """Linear springs of M muscles, each (M,)."""
+    """Linear springs that represent M muscles; each field has the shape (M,)."""
 
     tension: Array  # T_mid [N]
     elongation: Array  # elongation at T_mid [m]

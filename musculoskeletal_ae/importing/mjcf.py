@@ -75,7 +75,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
 
 
 def open_mjcf(file: Path) -> Any:
-    """Return the MjSpec of an MJCF file, set to keep bodies that MuJoCo might fuse."""
+    """Return the MjSpec of an MJCF file, with the option that MuJoCo fuses no bodies."""
     spec = mujoco.MjSpec.from_file(str(file))
     spec.compiler.fusestatic = False
     return spec

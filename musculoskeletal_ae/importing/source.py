@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body that was read from another format: reduce it to a chain, write it, and compare it."""
+"""Reduces a body that was read from another format to a chain, writes it, and compares it."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -159,7 +159,7 @@ class Source:
         return link_placement(self.model, link)
 
     def span(self, joint: str) -> tuple[float, float]:
-        """Return the limits of a joint."""
+        """Return the limits of a joint [rad or m]."""
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
 
@@ -184,7 +184,7 @@ class Source:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names as a text, at most LISTED of them."""
+    """Return a text that lists names, at most LISTED of them."""
     more = f' and {len(names) - LISTED} more' if len(names) > LISTED else ''
     return ', '.join(names[:LISTED]) + more
 

@@ -95,7 +95,7 @@ def train(args: Namespace) -> None:
 
 
 def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:
-    """Learn from a recording and show the progress; return the warning of `learn`."""
+    """Learn from a recording and show the progress; return a warning, or ''."""
     total = round(recording.time[-1] - recording.time[0], 1)
     begun = reported = time.perf_counter()
     passed = 0.0

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Target lengths of all methods, on the geometric model with a known optimum and on a network."""
+"""Target lengths of all control methods, on the geometric model and on a network.
+
+On the geometric model, the optimum is known.
+"""
 
 from functools import partial
 
