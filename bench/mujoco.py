@@ -231,7 +231,7 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
 
 
 def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> str:
-    """Return an error of an individual as a text; if the function fails, the message of the exception."""
+    """Return an error of an individual as a text; if `error` raises an exception, its message."""
     try:
         return f'{error(study, seed):.4f}'
     except MusculoskeletalError as problem:

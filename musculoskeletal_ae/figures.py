@@ -9,7 +9,10 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 
 def save_plot(file: Path | None, draw: Callable[[], Any]) -> None:
-    """Save the figure that `draw` returns, and print the file's name; do nothing if it is None."""
+    """Save the figure that `draw` returns, and print the file's name.
+
+    If `file` is None, do nothing.
+    """
     if file is not None:
         save_figure(draw(), file)
         print(f'plot: {file}')

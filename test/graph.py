@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS graph for tests, over DDS: it runs nodes in this process or others, and every wait ends."""
+"""A ROS graph for tests, over DDS: it runs nodes in any process, and every wait has a deadline."""
 
 import os
 import signal

@@ -7,7 +7,9 @@ a solution of the equations of its rest,
 
     T = T_bias + max(0, K_stiff (l(θ, T) − l_target)),   g(θ) − JᵀF + Gᵀ T = τ_stop
 
-The equations are needed to hold joints at an angle, which the emulated arm cannot.
+g is the torque that holds the weight, F a wrench on the end effector, J the Jacobian of the end
+effector, G = ∂l/∂θ, and τ_stop the torque of the joint stops. The equations are needed to hold
+joints at an angle, which the emulated arm cannot.
 """
 
 from typing import NamedTuple

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Queries about processes that others have started."""
+"""Queries about processes that other code has started."""
 
 import os
 

@@ -29,7 +29,7 @@ def test_before_the_first_tick_all_time_counts():
 
 
 def test_a_node_that_is_always_late_still_notices_a_silent_stream():
-    """Without this, a stream could be silent for minutes on a busy machine and not be reported."""
+    """If late steps counted nothing, a stream could be silent for minutes without a report."""
     now, clock = 0.0, AwakeClock(0.3)
     reception = Reception(print, lambda: clock.at(now))
     clock.tick(now)

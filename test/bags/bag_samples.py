@@ -76,7 +76,7 @@ def _basic(name: str, rng: random.Random) -> Any:
 
 
 def samples(count: int, namespace: str = '', seed: int = 0) -> list[Sample]:
-    """Return `count` messages in order, over all topics of the interface in turn."""
+    """Return `count` messages in the order of time, on one topic of the interface after another."""
     rng = random.Random(seed)
     content = []
     for i, name in zip(range(count), list(TOPICS) * (count // len(TOPICS) + 1), strict=False):

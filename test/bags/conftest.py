@@ -24,7 +24,7 @@ def content():
 
 @pytest.fixture
 def bag(tmp_path, content):
-    """Return a valid bag that our writer has written."""
+    """Return a valid bag, written by the writer of this package."""
     samples.write_ours(tmp_path / 'bag', content, 'zstd', finish=True)
     return tmp_path / 'bag'
 
@@ -50,12 +50,12 @@ class Tool:
         raise AssertionError(f'{text!r} was never printed')
 
     def end(self, number: int = signal.SIGINT) -> str:
-        """Send a signal and return the rest of the output."""
+        """Send the tool a signal; return the rest of its output after its end."""
         self.process.send_signal(number)
         return self.output()
 
     def output(self) -> str:
-        """Wait for the end and return the rest of the output."""
+        """Wait for the end of the tool; return the rest of its output."""
         return self.process.communicate(timeout=DEADLINE)[0]
 
 

@@ -232,7 +232,7 @@ def has_learned(output):
 
     In several runs with different seeds, an error of 0.05 to 0.13 rad fell to between a tenth and a
     third of its initial value within 20 s. With few samples, the error may rise again for some
-    seconds where the arm has not been before.
+    seconds in postures that the arm has not reached before.
     """
     before, after = errors(output, INITIAL), errors(output, LEARNED)[-5:]
     return len(after) == 5 and np.mean(after) < 0.7 * np.mean(before)

@@ -83,7 +83,7 @@ class Loop:
         """Repair the arm, and call the services that a user would call.
 
         Returns:
-            The stop cause because of which the controller refuses the reset; None if it resumes.
+            The stop cause that made the controller refuse the reset; None if the reset succeeded.
         """
         self.arm.faults.set([])
         self.arm.reset(self.arm.theta)

@@ -39,7 +39,11 @@ class FollowingBench:
         self.bench.core.trajectory(points, delay)
 
     def run(self, steps=1000, moves=True):
-        """Step until the goal has a result; return the result and the number of steps."""
+        """Step until the goal has a result, at most `steps` times.
+
+        Returns:
+            The result (None if there was none) and the number of steps.
+        """
         for step in range(steps):
             if outcome := self.goal.outcome():
                 return outcome, step

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No message makes the controller move the arm dangerously, for example false or late data."""
+"""Distorted, false or late messages never make the controller move the arm dangerously."""
 
 from dataclasses import replace
 

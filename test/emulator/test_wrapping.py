@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Routes of emulated individuals: their Jacobian is the derivative, and individuals differ."""
+"""Routes of emulated individuals.
+
+The muscle Jacobian is the derivative of the lengths, and each individual has other routes.
+"""
 
 import numpy as np
 import pytest

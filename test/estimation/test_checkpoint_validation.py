@@ -47,7 +47,7 @@ def body(count=60, seed=0):
 
 
 def send_healthy_messages(gate, start=0.0):
-    """Validate six seconds of messages of a healthy arm; return the time at their end [s]."""
+    """Send a validator six seconds of messages of a healthy arm; return the time at the end [s]."""
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
         gate.message(tension, length, start + 0.1 * k)
     return start + 6.0

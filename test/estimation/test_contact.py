@@ -162,7 +162,7 @@ def test_the_observer_is_stable_at_any_rate(dt):
 
 @dataclass
 class StatedPosture:
-    """A network with exact muscle lengths, whose estimate of the posture is the one stated."""
+    """A network with exact muscle lengths, whose estimate is always the posture `theta` [rad]."""
 
     theta: np.ndarray
     touch: TouchStatistics

@@ -81,7 +81,7 @@ class Loop:
         self.rng, self.length = np.random.default_rng(0), healthy.length
 
     def step(self, message, times=1):
-        """Process a message `times` times; the lengths approach it as fast as is plausible."""
+        """Process a message `times` times, while its lengths change as fast as is plausible."""
         for _ in range(times):
             self.now += DT
             self.core.commanded(self.now, length=self.command)

@@ -157,7 +157,10 @@ def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arr
 
 @pytest.fixture(params=[True, False], ids=['joint sensors', 'no joint sensors'])
 def ruptured(request, robot, mae):
-    """An arm that has latched the rupture of muscle 2; its module has wound in the tendon."""
+    """An arm whose estimator has latched the rupture of muscle 2.
+
+    The module has wound in the ruptured tendon.
+    """
     arm = MovingArm(robot, mae)
     arm.has_sensors = request.param
     arm.go(8.0)

@@ -26,7 +26,7 @@ def test_proposed_is_nearer_than_first_and_needs_about_the_bound(ended):
 
 
 def test_a_posture_at_the_target_needs_the_bound(ended):
-    """If the reached posture is near the target, both need about the same least tension."""
+    """If the arm ends near its target, the least tensions for the two postures are about equal."""
     assert ended.bound_there['proposed'].item() == pytest.approx(ended.bound.item(), rel=0.1)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""result.json combines several individuals, also if the experiment failed on some of them."""
+"""result.json combines several individuals, even if the experiment failed on some of them."""
 
 import json
 import os

@@ -43,9 +43,9 @@ def learned(tmp_path_factory):
 
 
 def differences(one, other):
-    """Return the difference between two muscle Jacobians (N, M, D) of each muscle.
+    """Return by how much two muscle Jacobians (N, M, D) differ, for each muscle (M,).
 
-    It is the root mean square over N postures of the norm over the joints, (M,).
+    The difference is the norm over the joints, as a root mean square over N postures.
     """
     return np.sqrt(((one - other) ** 2).sum(axis=2).mean(axis=0))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint fit of body and postures, with any combination of sensors."""
+"""The body and the postures are fitted together, with any combination of sensors."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -35,11 +35,10 @@ def run(detector, seconds, theta=lambda _: 0.0, length=lambda _: 0.0, measured=l
 
 
 def each_some(t, still=True):
-    """Return joint readings of which only one is not NaN, in turn, as of two publishing nodes.
+    """Return the readings of two joint sensors at the time `t` [s], one of which is NaN.
 
-    Args:
-        t: Time [s].
-        still: Whether both joints stand still.
+    The sensors take turns, as if two nodes published one joint each. With `still`, the joints do
+    not move.
     """
     angles = np.array([0.3, 0.3 if still else 0.3 + 0.05 * t])
     angles[round(t / 0.01) % 2] = np.nan

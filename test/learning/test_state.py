@@ -44,9 +44,9 @@ def written(directory, robot, stage, count, network=None):
 
 
 def read(directory, robot):
-    """Return samples and network that a learner reads, and why an older state was not used.
+    """Return the samples and the network that a learner reads, and a text about unusable files.
 
-    The reason is '' if the newest state was used.
+    The text is '' if all files were usable.
     """
     store = SampleStore()
     with closing(StateStore(directory, robot)) as state:

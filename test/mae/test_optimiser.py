@@ -17,7 +17,7 @@ def test_orthogonalised_matrix_has_singular_values_near_one(shape):
 def stepped(muon):
     """Return by how much one optimiser step of size 0.01 reduces a layer's weight and bias.
 
-    `muon` selects the optimiser of the weight.
+    With `muon`, the optimiser uses the Muon method for the weight.
     """
     layer = torch.nn.Linear(3, 2)
     before = [parameter.detach().clone() for parameter in layer.parameters()]

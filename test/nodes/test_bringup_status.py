@@ -226,7 +226,7 @@ REPAIR_STEPS = ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore
 
 
 def with_silent_estimates(report):
-    """Change the report of a controller: it also states that usable estimates are missing."""
+    """Add to the report of a controller that usable estimates are missing; return the report."""
     status = report.status[0]
     steps = next(value for value in status.values if value.key == 'remedy steps')
     steps.value += ', check_estimator'

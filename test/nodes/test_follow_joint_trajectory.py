@@ -102,7 +102,7 @@ def test_without_control_msgs_there_is_no_action(graph, arm26, trained_file, mon
 
 
 class FakeServer(Waitable):
-    """An object that an executor waits for like an action server, with requests by the test."""
+    """A stand-in for an action server: an executor waits for it, and the test sends requests."""
 
     def __init__(self, node):
         super().__init__(ReentrantCallbackGroup())

@@ -72,7 +72,7 @@ class Arm:
         self.muscles.publish(array_message(rows, 'quantity', 'muscle'))
 
     def step(self):
-        """Publish once, and handle messages for 10 ms."""
+        """Publish once, and process messages for 10 ms."""
         self.publish()
         self.graph.spin(DT)
 
@@ -122,12 +122,12 @@ class HostedLearner:
             self.graph.executor.spin_once(LOOK)
 
     def run(self, seconds):
-        """Advance the time."""
+        """Advance the time by `seconds` [s]."""
         for _ in range(round(seconds / DT)):
             self.step()
 
     def learn(self, condition, what):
-        """Advance the time until a condition holds."""
+        """Advance the time until a condition holds; fail with the text `what` at the deadline."""
         deadline = time.monotonic() + DEADLINE
         while not condition():
             assert time.monotonic() < deadline, f'timeout: {what}'

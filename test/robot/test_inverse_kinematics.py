@@ -30,7 +30,10 @@ def test_an_estimate_that_agrees_with_the_pose_is_not_changed():
 
 
 def test_noise_of_the_camera_turns_joints_by_less_than_0_2_rad():
-    """The search ends when camera noise exceeds its gain; otherwise, θ could change by 0.41 rad."""
+    """The search ends when a better fit would only follow the noise of the camera.
+
+    Without this rule, θ could change by 0.41 rad.
+    """
     rng = np.random.default_rng(1)
     theta = ARM.random_postures(400, rng)
     observed = [camera_reading(ARM.kinematics.end_effector_pose(each), rng) for each in theta]

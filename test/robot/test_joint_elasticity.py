@@ -49,7 +49,7 @@ SPRINGS = [
 
 
 def one_sided(document):
-    """Remove the muscles that straighten the bend."""
+    """Remove from a muscles.yaml the muscles that straighten the joint `bend`."""
     muscles = document['muscles']
     muscles[:] = [m for m in muscles if not m['name'].startswith('straightener')]
 

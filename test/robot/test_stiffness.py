@@ -12,9 +12,9 @@ def nominal(robot, theta, tension, stiffness):
 
 
 def test_joint_stiffness_is_the_slope_of_restoring_torque_with_the_motors_held(robot):
-    """K_θ = −∂τ/∂θ of the torque τ = −Gᵀ T.
+    """K_θ = −∂τ/∂θ of the torque τ = −Gᵀ T, which pulls the joints back.
 
-    T(θ) follows from muscle stiffness control and the series elastic element, one after the other.
+    T(θ) is the tension of muscle stiffness control and the series elastic element in series.
     """
     rng = np.random.default_rng(0)
     theta = robot.random_postures(1, rng)[0]

@@ -38,7 +38,7 @@ def wire(start, end, radius, axis=(0, 0, 0), side=NONE):
 
 @pytest.fixture(scope='module', params=WRAPS)
 def robot(request, tmp_path_factory):
-    """Return an arm whose straightener wraps at the elbow."""
+    """Return an arm whose muscle `straightener` wraps around an object at the elbow."""
     directory = write_robot(tmp_path_factory.mktemp('wraps'))
     document = read_muscles(directory)
     route = next(m['route'] for m in document['muscles'] if m['name'] == 'straightener')

@@ -36,7 +36,7 @@ TEXT = 'document.body ? document.body.innerText : ""'
 
 
 def find_chromium() -> str | None:
-    """Return the path of an installed Chromium."""
+    """Return the path of an installed Chromium; None if there is none."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 

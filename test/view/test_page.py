@@ -367,7 +367,7 @@ def entering(arm26, graph):
 
 
 def follow(page: Page, elbow: float) -> None:
-    """Let the page follow an estimate."""
+    """Show an estimate on the page, with the elbow at an angle [rad] and the shoulder at 0."""
     theta = np.array([0.0, elbow])
     page.draw({'estimated': theta}, np.full(6, 30.0), np.zeros(6, dtype=int))
     page.follow(0.0, None)
