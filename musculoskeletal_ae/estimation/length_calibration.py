@@ -47,7 +47,7 @@ class LengthCalibration:
     """Collects readings and fits the offsets, with a small amount of work at every message.
 
     Attributes:
-        posture: θ [rad] (D,) in which the arm stands, or None if it moves gently.
+        posture: Joint angles in which the arm stands [rad], (D,), or None if it moves gently.
         offsets: The newest estimate of the offsets, which may still be unreliable; None before the
             first estimate.
     """
@@ -110,10 +110,10 @@ class LengthCalibration:
         """Record the readings of one message, and continue or begin a fit if one is due.
 
         Args:
-            tension: T [N], (M,).
-            length: Raw l [m], (M,).
+            tension: Tensions [N], (M,).
+            length: Muscle lengths as read, with their unknown offsets [m], (M,).
             dt: Time since the previous message [s].
-            theta: Measured θ [rad], (D,), or None.
+            theta: Measured joint angles [rad], (D,), or None without joint sensors.
         """
         has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
         if self.is_done or has_failed:
@@ -149,7 +149,7 @@ class LengthCalibration:
             self._judge(ended.value, moments)
 
     def _judge(self, fit: Fit, moments: Moments) -> None:
-        """Use a fit as the newest estimate, and decide whether it is reliable."""
+        """Make a fit the newest estimate of the offsets, and decide whether it is reliable."""
         muscle_count, used = self._robot.muscle_count, self._fit.used
         expected = self._mae.lengths(fit.theta, moments.tension)
         # An isolated muscle still receives commands and needs an offset, however uncertain.
@@ -168,7 +168,7 @@ class LengthCalibration:
         self.offsets = LengthOffsets(offset, deviation)
 
     def _problem_of(self, fit: Fit, residual: Array) -> str:
-        """Return why a fit is not reliable, or ''.
+        """Return why a fit is not reliable, as a text for users, or '' if it is reliable.
 
         Args:
             fit: The fit.
@@ -191,15 +191,15 @@ class LengthCalibration:
 
 
 def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
-    """Check a stated posture.
+    """Check the posture that a user has stated for a length calibration.
 
     Args:
         robot: The nominal body.
-        posture: θ [rad], (D,); () means no posture and is legal.
+        posture: Joint angles [rad], (D,); () means no posture and is legal.
 
     Raises:
-        MusculoskeletalError: If the posture has not one value for each joint, or is outside the
-            joint limits; the text names the legal ranges.
+        MusculoskeletalError: If the posture does not have one value for each joint, or is outside
+            the joint limits; the text names the legal ranges.
     """
     if not posture:
         return

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the lengths that a network predicts, and whether they explain a measured length.
 
-The lengths l(θ, T) of a network have errors with the covariance Σ. A posture is fitted to the
-lengths of some muscles (generalised least squares with a prior of θ, index o), and then predicts
-the length of every muscle:
+The lengths l(θ, T) that a network computes have errors with the covariance Σ. A posture θ is fitted
+to the measured lengths l_o of some muscles, which the index o denotes (generalised least squares
+with a prior of θ). The network then predicts the length of every muscle in this posture. d is the
+predicted minus the measured length:
 
     θ = argmin eᵀ W e + (θ − θ̄)ᵀ P (θ − θ̄),   e = l_o − l_o(θ, T),   W = (Σ + N)_oo⁻¹
     d = l(θ, T) − l,   covariance of d = A (Σ + N) Aᵀ + G H P H Gᵀ
     A = I − G H G_oᵀ W,   H = (G_oᵀ W G_o + P)⁻¹
 
 N is the variance of the elongation and of the sensor noise. θ̄ and P are mean and precision of θ in
-the training data. If few tendons are taut, θ is uncertain and so is d.
+the training data, and G = ∂l/∂θ. If few tendons are taut, θ is uncertain and so is d.
 
-Errors of a network vary smoothly with the posture, and errors of an elastic constant persist. If d₀
-was known at another moment, when the tendon was taut, a part of the error of d is therefore known:
+Errors of a network vary smoothly with the posture, and errors of an elastic constant persist. If d
+had the value d₀ at an earlier moment, when the tendon was taut (index 0), a part of the present
+error of d is therefore known:
 
     d | d₀ has the mean c d₀ / s₀² and the variance s² − c² / s₀²
     c = ρ aᵀ Σ a₀ + Σ_j a_j a₀_j ε_j ε₀_j,   ρ = exp(−‖(θ − θ₀) / range‖² / (2 SMOOTHNESS²))
@@ -21,10 +23,11 @@ was known at another moment, when the tendon was taut, a part of the error of d 
 s² is the variance of d, a the row of A that belongs to the muscle, and ε_j the standard deviation
 of the elongation of muscle j. `range` is the range of each joint.
 
-Σ. Without learning, it is the variance of the geometric model (`robot/model_errors.py`). After
-learning, it is the second moment of the residuals on the healthy arm, plus the variance by which
-the error of θ displaces each length, g C gᵀ on average over random postures. C is the covariance of
-the estimate. Residuals alone are too small, because the network has learned from the same messages.
+Before learning, Σ is the variance of the geometric model (`robot/model_errors.py`). After learning,
+Σ is the second moment of the residuals on the healthy arm, plus the variance by which the error of
+θ displaces each length: g C gᵀ on average over random postures, where g is the muscle's row of G
+and C the covariance of the estimated θ. The residuals alone would be too small, because the network
+has learned from the same messages.
 """
 
 from __future__ import annotations
@@ -51,7 +54,7 @@ HALVINGS = 6  # number of times that a step is halved if it does not lower the c
 
 
 class Prediction(NamedTuple):
-    """Lengths of all muscles, as predicted from some of them."""
+    """Lengths of all muscles, predicted from the measured lengths of some muscles."""
 
     theta: Array  # the fitted posture [rad], (D,)
     excess: Array  # d, predicted minus measured length [m], (M,)
@@ -60,7 +63,7 @@ class Prediction(NamedTuple):
     elastic: Array  # ε, standard deviation of the elongations [m], (M,)
 
     def limit(self, muscle: int, sigmas: float) -> float:
-        """Return `sigmas` standard deviations of the d of one muscle [m]."""
+        """Return `sigmas` standard deviations of the predicted minus the measured length [m]."""
         return sigmas * math.sqrt(self.variance[muscle])
 
 
@@ -68,7 +71,7 @@ class LengthErrors:
     """Predicts lengths with a network, and states how uncertain each prediction is.
 
     Attributes:
-        covariance: Σ [m²], (M, M).
+        covariance: Covariance of the network's length errors [m²], (M, M).
     """
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
@@ -103,9 +106,9 @@ class LengthErrors:
         """Fit a posture to the lengths of some muscles, and predict the lengths of all.
 
         Args:
-            length: l [m], (M,).
-            tension: T_end at which the lengths are predicted [N], (M,).
-            spread: Standard deviation of T_end [N], (M,) or scalar.
+            length: Measured lengths [m], (M,).
+            tension: Bone-side tensions at which the lengths are predicted [N], (M,).
+            spread: Standard deviation of these tensions [N], (M,) or scalar.
             used: The muscles to whose lengths the posture is fitted, (M,).
             start: Posture with which the fit starts [rad], (D,).
         """
@@ -155,13 +158,13 @@ class LengthErrors:
     def given(self, now: Prediction, taut: Prediction, muscle: int) -> Prediction:
         """Correct the prediction for one muscle by the error that it had while it was taut.
 
-        The correction also reduces the variance of the prediction. Both effects become smaller the
-        farther the arm has moved from the posture at that time.
+        The correction also reduces the variance of the prediction. The farther the arm has moved
+        since then, the smaller are the correction and the reduction.
 
         Args:
-            now: The prediction to correct.
-            taut: The prediction by the same muscles when this muscle was taut.
-            muscle: Index of the muscle; other muscles keep their values.
+            now: The present prediction, which is corrected.
+            taut: The prediction from the same muscles at the time when this muscle was taut.
+            muscle: Index of the muscle. The values of other muscles do not change.
         """
         distance = np.square((now.theta - taut.theta) / self._range).sum()
         correlation = math.exp(-0.5 * distance / SMOOTHNESS**2)

@@ -4,16 +4,19 @@
     l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
     0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more equations while the arm moves slowly
 
-o are the offsets, g is the torque of the weight, and K and b describe the springs of the joints.
-The network computes l and G = ∂l/∂θ through ①. If the joint angles were measured, o is the mean
-residual of the first line. Otherwise o and the postures of all moments are estimated together, by
-maximum likelihood with noise of Student's distribution. Because muscles outnumber joints and G
-changes with the posture, only one o explains all moments of a moving arm. The second line already
-restricts the posture at the first moment, when the lengths alone do not.
+A moment is the mean of the readings over a short window. l_read are the lengths as read, o the
+offsets, T the tensions, and θ the joint angles. g is the torque of the weight, and K and b describe
+the springs of the joints. The network computes the lengths l and G = ∂l/∂θ.
+
+If the joint angles were measured, o is the mean residual of the first line. Otherwise the offsets
+and the postures of all moments are estimated together, by maximum likelihood with noise of
+Student's distribution. Because muscles outnumber joints and G changes with the posture, only one
+set of offsets explains all moments of a moving arm. The second line already restricts the posture
+at the first moment, when the lengths alone do not.
 
 The fit is a damped Gauss–Newton method that eliminates the postures. It starts from the best of
-many random postures of the first moment. Besides o it estimates the friction μ of every tendon, the
-offset of every tension sensor, and the Coulomb friction torque of every joint.
+many random postures of the first moment. Besides the offsets it estimates the friction of every
+tendon, the offset of every tension sensor, and the Coulomb friction torque of every joint.
 """
 
 from __future__ import annotations
@@ -78,8 +81,8 @@ class Fit(NamedTuple):
     Attributes:
         cost: −2 times the logarithm of the posterior, up to a constant; 0 if the joint angles were
             measured.
-        constants: o [m], μ of the tendons, offsets of the tension sensors [N], Coulomb torques of
-            the joints [N·m], (3M + D,).
+        constants: Length offsets [m], friction coefficients of the tendons, offsets of the tension
+            sensors [N], and Coulomb friction torques of the joints [N·m], (3M + D,).
         theta: Postures [rad], (K, D).
     """
 
@@ -123,18 +126,20 @@ class LengthFit:
         self._noise = np.concatenate((length_noise, self._torque_noise, LIMIT_NOISE * radian))
 
     def known_angles(self, moments: Moments) -> Fit:
-        """Return the fit to moments whose angles were measured."""
+        """Return the fit to moments whose joint angles were measured."""
         residual = moments.length - self._mae.lengths(moments.theta, moments.tension)
         muscle_count = self._robot.muscle_count
         constants = np.concatenate([residual.mean(axis=0), self._prior_mean[muscle_count:]])
         return Fit(0.0, constants, moments.theta)
 
     def unknown_angles(self, moments: Moments, before: Fit | None) -> Steps:
-        """Fit moments whose angles were not measured, in short pieces of work.
+        """Fit the offsets to moments whose joint angles were not measured.
+
+        The generator yields after each short piece of work, and returns the fit at the end.
 
         Args:
             moments: The moments.
-            before: An earlier fit, whose constants serve as a second start, or None.
+            before: An earlier fit, from whose constants the fit starts a second time, or None.
         """
         rows = np.unique(np.linspace(0, len(moments.length) - 1, FEW_MOMENTS).astype(np.int64))
         few = moments.rows(rows)
@@ -147,7 +152,7 @@ class LengthFit:
         return (yield from self._best(candidates, moments, ROUNDS))
 
     def cost_per_residual(self, fit: Fit) -> float:
-        """Return the cost of a fit divided by its number of residuals of length and torque."""
+        """Return the cost of a fit, divided by the number of its length and torque residuals."""
         return fit.cost / (len(fit.theta) * (len(self._noise) - self._robot.joint_count))
 
     # -- search for a start ---------------------------------------------------------------------
@@ -163,11 +168,17 @@ class LengthFit:
         return min(fits, key=lambda fit: fit.cost)
 
     def _guesses(self, moments: Moments, few: Moments) -> Generator[None, None, list[Array]]:
-        """Return guesses of the constants, from the likeliest of many postures at the first moment.
+        """Search for initial values of the constants by drawing postures of the first moment.
+
+        Each posture of the first moment implies offsets. The search compares how well the offsets
+        explain the other moments. It yields after each short piece of work.
 
         Args:
             moments: All moments.
-            few: The moments with which the search compares postures.
+            few: The moments on which the search compares postures.
+
+        Returns:
+            The best initial values, each an array of all constants, (3M + D,).
         """
         mae = self._mae
         tension = np.tile(moments.tension[0], (FITTED_POSTURES, 1))
@@ -209,7 +220,16 @@ class LengthFit:
         return theta - np.clip(theta, self._robot.lower, self._robot.upper)
 
     def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return the unbalanced torque [N·m], (K, D), and G [m/rad], (K, M, D)."""
+        """Return the unbalanced joint torque and the muscle Jacobian in K postures.
+
+        Args:
+            theta: Postures [rad], (K, D).
+            tension: Tensions [N], (K, M).
+
+        Returns:
+            The torque of weight, springs and muscles together [N·m], (K, D), and the muscle
+            Jacobian ∂l/∂θ [m/rad], (K, M, D).
+        """
         jacobian = self._mae.muscle_jacobian(theta, tension)
         by_muscles = np.einsum('kmd,km->kd', jacobian, tension)
         return self._robot.kinematics.holding_torque(theta) + by_muscles, jacobian
@@ -335,12 +355,12 @@ def _turning(theta: Array, sticking: Array) -> Array:
 
 
 def _noise_factors(mae: Mae) -> Array:
-    """Return the factor of LENGTH_NOISE for each muscle, (M,).
+    """Return the assumed length error of each muscle, relative to that of a typical muscle, (M,).
 
-    It is the variance of the muscle's length residual, relative to the median variance. For
+    The factor is the variance of the muscle's length residual, divided by the median variance. For
     independent errors, the ratio of standard deviations would be correct. But the errors of a
-    network in neighbouring postures are correlated. With that ratio, a muscle with large errors
-    would therefore bias the offsets of all other muscles. The ratio of variances gives such a
+    network in neighbouring postures are correlated, so with standard deviations, a muscle with
+    large errors would bias the offsets of all other muscles. The ratio of variances gives such a
     muscle less weight.
     """
     if mae.anomaly is None:

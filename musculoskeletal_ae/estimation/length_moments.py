@@ -3,8 +3,8 @@
 
 Tendon friction changes its sign with the direction of motion. The moments therefore have to cover
 many postures, reached from different sides. A moment of a moving arm counts only if the arm has
-moved since the previous one, but not so fast that inertial forces matter. The moments of an arm
-that stands in a stated posture count until it moves.
+moved since the previous moment, but not so fast that inertial forces matter. The moments of an arm
+that stands in a stated posture count until the arm moves.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class Moments(NamedTuple):
     """Means of K short windows.
 
     Attributes:
-        tension: T [N], 0 for isolated muscles, (K, M).
-        length: Raw l [m], 0 for isolated muscles, (K, M).
-        sliding: Direction s in which each tendon slid last, (K, M): 1 when wound in, −1 when paid
+        tension: Tensions [N], 0 for isolated muscles, (K, M).
+        length: Muscle lengths as read [m], 0 for isolated muscles, (K, M).
+        sliding: Direction in which each tendon slid last, (K, M): 1 when wound in, −1 when paid
             out.
-        read: Raw l of all muscles, including isolated ones [m], (K, M).
-        theta: Measured or stated θ [rad], NaN where it is unknown, (K, D).
+        read: Lengths of all muscles as read, including isolated muscles [m], (K, M).
+        theta: Measured or stated joint angles [rad], NaN where they are unknown, (K, D).
     """
 
     tension: Array
@@ -83,10 +83,10 @@ class MomentCollector:
         """Add the readings of one message to the present window; a full window becomes a moment.
 
         Args:
-            tension: T [N], (M,).
-            length: Raw l [m], (M,).
+            tension: Tensions [N], (M,).
+            length: Muscle lengths as read [m], (M,).
             dt: Time since the previous message [s].
-            theta: Measured θ [rad], (D,), or None.
+            theta: Measured joint angles [rad], (D,), or None.
         """
         used_length = length * self._used
         sliding = self._direction.step(used_length)

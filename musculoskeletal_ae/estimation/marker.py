@@ -14,15 +14,15 @@ MARKER_ANGLE = 0.3  # largest error of the orientation [rad]
 
 
 def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
-    """Return a posture in which the end effector has a given pose.
+    """Return a posture in which the end effector has the pose of a marker.
 
     Args:
         robot: The nominal body.
-        pose: Pose in the frame of the root link.
-        start: θ at which the search starts [rad], (D,).
+        pose: Pose of the marker in the frame of the root link.
+        start: Joint angles at which the search starts [rad], (D,).
 
     Returns:
-        θ [rad], (D,), with NaN for joints that do not move the end effector.
+        Joint angles [rad], (D,), with NaN for joints that do not move the end effector.
 
     Raises:
         MessageError: If the end effector cannot reach the pose.

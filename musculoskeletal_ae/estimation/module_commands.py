@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores the newest command to the muscle modules while it is up to date."""
+"""Stores the newest command to the muscle modules, until it is out of date."""
 
 import math
 
@@ -22,14 +22,19 @@ class ModuleCommands:
         self._length, self._tension, self._time = length, tension, now
 
     def length(self, now: float) -> Array | None:
-        """Return l_target [m] (M,), or None without an up-to-date length command."""
+        """Return the target lengths [m], (M,), or None without an up-to-date length command."""
         return self._length if now - self._time <= COMMAND_AGE else None
 
     def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
-        """Return the tension [N] (M,) that the newest command demands of the modules, or None.
+        """Return the tensions that the newest command demands of the modules [N], (M,).
 
-        A length command demands a tension that depends on l; `length` is l [m] (M,). The result
-        is None if the command is out of date, or if the modules follow positions.
+        The tensions that a length command demands depend on the measured lengths. The result is
+        None if the command is out of date, or if the modules follow positions.
+
+        Args:
+            robot: The robot.
+            length: Measured lengths [m], (M,).
+            now: The present time on the same clock as in `note` [s].
         """
         if now - self._time > COMMAND_AGE:
             return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of anomaly detection: one table for the core and the parameters of the node."""
+"""Settings of anomaly detection, from which the node `estimator` also makes its parameters."""
 
 from dataclasses import dataclass
 

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimates the joint angles from one sample of muscle length and tension.
 
-(T_end, l) ─② of the MAE→ θ, T_est, l_est      (paper, §III-D)
-e = (T_est − T, l_est − l),   A = ‖T_est − T‖₂ + ‖l_est − l‖₂          scaled units
+    (T_end, l) → θ, T_est, l_est      by the network with mask ② (paper, §III-D)
+    e = (T_est − T_end, l_est − l)
+    A = ‖T_est − T_end‖₂ + ‖l_est − l‖₂
+
+From the bone-side tensions T_end and the lengths l, the network estimates the joint angles θ and
+restores tensions and lengths. e is the residual and A the anomaly score, both in scaled units.
 """
 
 import math
@@ -20,10 +24,12 @@ class Estimate:
     """The network's estimate for one sample.
 
     Attributes:
-        state: θ [rad] (D,), and T [N] and l [m] (M,) as the network restores them.
-        residual: e, 0 for isolated muscles, (2M,).
-        anomaly: A.
-        covariance: Covariance of θ [rad²], (D, D); None if the network has none.
+        state: Joint angles [rad], (D,), and tensions [N] and lengths [m], (M,), as the network
+            restores them.
+        residual: Restored minus measured tensions and lengths in scaled units, 0 for isolated
+            muscles, (2M,).
+        anomaly: Anomaly score A, the size of the residual.
+        covariance: Covariance of the joint angles [rad²], (D, D); None if the network has none.
     """
 
     state: State
@@ -45,18 +51,30 @@ class StateEstimator:
         self.complete_mae: Mae | None = None
 
     def use(self, mae: Mae, isolated: Iterable[int]) -> None:
-        """Use another network, and isolate the muscles with the indices `isolated` in it."""
+        """Use another network, and isolate these muscles (indices) in it."""
         self.complete_mae, self.mae = mae, mae.without(isolated)
 
     def step(self, bone_tension: Array, length: Array) -> Estimate:
-        """Return the estimate from T_end [N] and l [m], (M,); call `use` first."""
+        """Return the estimate for one sample; `use` must have been called before.
+
+        Args:
+            bone_tension: Bone-side tensions [N], (M,).
+            length: Muscle lengths [m], (M,).
+        """
         assert self.mae is not None
         state = self.mae.estimate(bone_tension, length)
         return estimate_of(self.mae, state, bone_tension, length)
 
 
 def estimate_of(mae: Mae, state: State, bone_tension: Array, length: Array) -> Estimate:
-    """Return the estimate for a state that a network restored from T_end [N] and l [m], (M,)."""
+    """Complete the state that a network restored by its residual, anomaly score and covariance.
+
+    Args:
+        mae: The network.
+        state: The state that it restored from the readings.
+        bone_tension: Bone-side tensions from the readings [N], (M,).
+        length: Muscle lengths from the readings [m], (M,).
+    """
     error = residuals(state, bone_tension, length, mae.isolated)
     tension_error, length_error = error[: len(length)], error[len(length) :]
     anomaly = math.sqrt(tension_error @ tension_error) + math.sqrt(length_error @ length_error)

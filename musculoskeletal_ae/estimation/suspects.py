@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handles the suspect of a finding, from its detection to the end of the anomaly.
+"""Decides what follows from a finding: from the isolation of a muscle to the end of the anomaly.
 
 The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
 
@@ -14,22 +14,22 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
     over, and the controller resumes after a verification (`control/stops.py`).
 
 With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
-`estimator/reset`. The same applies if ACQUITTALS suspects were verified as healthy within WITHIN
-seconds, because there must be a fault that a verification does not reveal. Some kinds of findings
-differ:
+`estimator/reset`. The same applies if two suspects were verified as healthy within the last 60 s,
+because there must be a fault that a verification does not reveal. Some kinds of findings have other
+consequences:
 
-    values_missing          never latched; with `on_anomaly: isolate` the muscle is isolated without
-                            a verification, because a sensor without numbers is faulty
+    values_missing          is never latched. With `on_anomaly: isolate` the muscle is isolated
+                            without a verification, because a sensor that reports NaN is faulty.
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
-    lengths_disagree        are revoked, and the finding stays latched until the next length
+    lengths_disagree        become unreliable, and the finding stays latched until the next length
                             calibration, or until a reset while joint sensors agree with the
                             lengths. The same applies to a `length_jump` of a muscle that is not
                             isolated.
-    joint_sensors_disagree  concerns no muscle, so none is isolated
+    joint_sensors_disagree  concerns no muscle, so none is isolated.
 
-While a finding is latched whose remedy is the repair of a muscle, the repair may make the length of
-this muscle jump. Therefore a jump of this length alone neither replaces the finding nor revokes the
-length offsets. `Estimator.reset` then checks whether the length agrees with the rest of the arm.
+A muscle may be repaired while its finding is latched, and the repair may make its length jump. A
+jump of this length alone therefore neither replaces the finding nor makes the length offsets
+unreliable. `Estimator.reset` then checks whether the length agrees with the rest of the arm.
 """
 
 from collections.abc import Iterable
@@ -100,15 +100,15 @@ class SuspectHandling:
         return f'{self._robot.muscles[muscle]}: {verdict}'
 
     def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
-        """Latch a finding and isolate its suspect, as far as the settings and its kind require.
+        """Latch a finding and isolate its muscle, if the settings and the kind of finding say so.
 
         Args:
             finding: The finding of a detector.
-            isolated: The muscles isolated so far.
+            isolated: Indices of the muscles isolated so far.
             now: Time of a steady clock [s].
 
         Returns:
-            The muscles that are isolated from now on.
+            Indices of the muscles that are isolated from now on.
         """
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE
@@ -134,7 +134,11 @@ class SuspectHandling:
         return (*isolated, muscle)
 
     def explains(self, finding: Finding) -> bool:
-        """Return whether a finding is a jump that the repair of the suspect explains."""
+        """Return whether a finding is a length jump that comes from repairing the suspect muscle.
+
+        Args:
+            finding: A new finding, while an earlier one may be latched.
+        """
         suspected = self.finding
         if suspected is None or suspected.remedy != REPAIR:
             return False
@@ -150,7 +154,10 @@ class SuspectHandling:
         )
 
     def conclude(self, verdict: Verdict, isolated: Iterable[int], now: float) -> tuple[int, ...]:
-        """End the verification with a verdict; return the muscles that are isolated from now on."""
+        """End verification and anomaly; return the indices of the muscles isolated from now on.
+
+        A healthy suspect is restored, a faulty one stays isolated.
+        """
         assert self.verification is not None
         self.last_verdict = self.verification.muscle, verdict
         if verdict.outcome is Outcome.HEALTHY:
@@ -161,7 +168,7 @@ class SuspectHandling:
         return self.clear(isolated)
 
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:
-        """End the anomaly; return the muscles that are isolated from now on.
+        """End the anomaly; return the indices of the muscles that are isolated from now on.
 
         A suspect that is being verified is restored, because a reset declares it healthy.
         """
@@ -171,9 +178,9 @@ class SuspectHandling:
         return tuple(muscle for muscle in isolated if muscle != suspect)
 
     def on_isolated(self, isolated: Iterable[int]) -> None:
-        """Forget verdicts on muscles that are no longer isolated, and stop verifying them.
+        """Discard the verdicts on muscles that are no longer isolated, and stop verifying them.
 
-        The finding stays latched.
+        The finding stays latched. `isolated` are the indices of the muscles isolated from now on.
         """
         isolated = tuple(isolated)
         self.faults = {m: verdict for m, verdict in self.faults.items() if m in isolated}

@@ -2,18 +2,21 @@
 """Verifies whether a suspect muscle is faulty, by its response to being wound in slightly.
 
 The arm has stopped, and the estimate does not use the suspect. The controller lowers the length
-command of the suspect by a few millimetres. Its readings T and l are compared with the tension that
-muscle stiffness control demands, and with the length l' estimated from the other muscles:
+command l_target of the suspect by a few millimetres. The tension T of the suspect is compared with
+the tension T_ref that muscle stiffness control demands, and its length l with the length l' that is
+estimated from the other muscles:
 
     T_ref = T_bias + K (l − l_target)
 
 Position-controlled modules do not regulate tension. Their T_ref is the tension that follows from
-the additional stretch of the series elastic element:
+the stretch x of the series elastic element with the elongation L_e(T). T_0 and x_0 are tension and
+stretch before winding in:
 
-    L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T),   T_0, x_0: before winding in
+    L_e(T_ref) = L_e(T_0) + x − x_0,   x = l' − l + L_e(T)
 
 Their tendons may be slack at first. The suspect is wound in until it has tension, or until it is so
-short that a healthy one would have tension. For these modules, the first row that applies decides:
+short that a healthy tendon would have tension. For position-controlled modules, the first row that
+applies decides:
 
     l does not change at all                     length_sensor_frozen
     l does not follow l_target                   jammed
@@ -37,7 +40,7 @@ Under muscle stiffness control, the first row that applies decides:
     otherwise                                    jammed
 
 The noise of a working sensor changes every reading. Therefore readings that never change come from
-a broken one. A suspect that is not wound in within PATIENCE seconds stays isolated.
+a broken sensor. A suspect that is not wound in within 8 s (PATIENCE) stays isolated.
 """
 
 import math
@@ -131,30 +134,41 @@ class _Row(NamedTuple):
 
 
 class ModuleLaw:
-    """Computes T_ref of one module under muscle stiffness control."""
+    """Computes the tension that a command demands of a module under muscle stiffness control."""
 
     def __init__(self, bias: float, stiffness: float) -> None:
-        """Describe a module with T_bias [N] and K [N/m]."""
+        """Describe a module with a tension bias [N] and a control stiffness [N/m]."""
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return by how much l', which the other muscles indicate, exceeds the measured l [m].
+        """Return by how much the length that the other muscles indicate exceeds the measured [m].
 
-        Only the verdict on position-controlled modules uses the result, and for these,
-        `PositionLaw` overrides this method.
+        The verdict on modules under muscle stiffness control does not use the result. For
+        position-controlled modules, `PositionLaw` overrides this method.
         """
         return row.likely - row.length
 
     def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
-        """Return T_ref [N]; `is_reference` states that the suspect has not been wound in yet."""
+        """Return the tension that the command demands of the suspect's module [N].
+
+        Args:
+            row: Readings of the suspect, and its command.
+            is_reference: Whether the suspect has not been wound in yet.
+        """
         return self.bias + max(0.0, self._stiffness * (row.length - row.command))
 
 
 class PositionLaw(ModuleLaw):
-    """Computes T_ref of one position-controlled module from the stretch of its elastic element."""
+    """Computes the tension of a healthy position-controlled muscle from its measured stretch."""
 
     def __init__(self, bias: float, elongation: Callable[[float], float]) -> None:
-        """Describe a module with T_bias [N] and the function L_e(T) [m] of T [N]."""
+        """Describe a muscle with a position-controlled module.
+
+        Args:
+            bias: Tension bias [N].
+            elongation: Function that returns the elongation of the series elastic element [m] at a
+                tension [N].
+        """
         super().__init__(bias, math.inf)
         self._elongation = elongation
         self._reference = 0.0  # x_0 − L_e(T_0) [m]
@@ -162,11 +176,21 @@ class PositionLaw(ModuleLaw):
         self.stretched = STRETCHED * elongation(bias)
 
     def stretch(self, row: _Reading) -> float:
-        """Return the stretch x [m]."""
+        """Return the stretch of the suspect's series elastic element [m].
+
+        It is the length that the other muscles indicate, minus the measured length, plus the
+        elongation that the measured tension explains.
+        """
         return row.likely - row.length + self._elongation(row.tension)
 
     def demand(self, row: _Reading, is_reference: bool) -> float:
-        """Return T_ref [N]; if `is_reference` is true, first store x and T as x_0 and T_0."""
+        """Return the tension that a healthy muscle would have at the present stretch [N].
+
+        Args:
+            row: Readings of the suspect, and its command.
+            is_reference: Whether the suspect has not been wound in yet. The stretch and tension in
+                `row` are then stored, as those from which later changes are measured.
+        """
         stretch = self.stretch(row)
         if is_reference:  # for a slack tendon, x_0 − L_e(T_0) is unknown and assumed to be 0
             is_slack = row.tension < LIMITS.slack_share * self.bias
@@ -186,7 +210,7 @@ class Verification:
 
         Args:
             muscle: Index of the suspect.
-            law: Computes T_ref of the suspect's module.
+            law: Computes the tension that the suspect would have if it were healthy.
         """
         bias = self._bias = law.bias
         self.muscle, self._law = muscle, law
@@ -200,17 +224,17 @@ class Verification:
     def step(
         self, tension: float, length: float, command: float | None, likely: float, dt: float
     ) -> Verdict | None:
-        """Process the readings of one message.
+        """Add the readings of one message to the evidence, and classify the suspect when complete.
 
         Args:
-            tension: T [N].
-            length: l [m].
-            command: l_target [m]; None if no length is commanded.
-            likely: l', the length of the suspect estimated from the other muscles [m].
+            tension: Tension of the suspect [N].
+            length: Length of the suspect [m].
+            command: Target length of the suspect [m]; None if no length is commanded.
+            likely: Length of the suspect, estimated from the other muscles [m].
             dt: Time since the previous message [s].
 
         Returns:
-            The verdict once the verification is complete, else None.
+            The verdict when the verification is complete, None before.
         """
         self._time += dt
         demand = math.inf

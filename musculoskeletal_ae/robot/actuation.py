@@ -4,8 +4,9 @@
     StiffnessControl   T = T_bias + max(0, K_stiff (l − l_target))   (paper, §III-E, eq. 5)
     PositionControl    l → l_target; T results from the stretch of the series elastic elements
 
-Control, safe stop and detectors call `Robot.actuation` wherever the two kinds of modules differ.
-They never ask which kind the arm has.
+l is the muscle length and T its tension, l_target the commanded length, and K_stiff the control
+stiffness. Control, safe stop and detectors call `Robot.actuation` wherever the two kinds of modules
+differ. They never ask which kind the arm has.
 """
 
 from __future__ import annotations
@@ -84,8 +85,8 @@ class Actuation(ABC):
     def assumed_tension(self) -> Array:
         """Tension that models and plans assume where none is measured [N], (M,).
 
-        It is DESIRED_SHARE of T_limit, but at least T_bias. `check_robot` judges each posture at
-        the tensions nearest to the same share of T_limit that hold the arm.
+        It is 30 % of T_limit (DESIRED_SHARE), but at least T_bias. `check_robot` also prefers
+        tensions near this share of T_limit.
         """
         return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
 
@@ -108,60 +109,80 @@ class Actuation(ABC):
 
     @abstractmethod
     def demanded(self, length: Array, command: Array) -> Array | None:
-        """Return the tensions [N] (M,) that a length command demands, not limited to T_max.
+        """Return the tensions that a length command demands [N], (M,), not limited to T_max.
 
         Return None if the modules follow positions, because a position demands no tension.
 
         Args:
-            length: l [m], (M,).
-            command: l_target [m], (M,).
+            length: Measured lengths [m], (M,).
+            command: Target lengths [m], (M,).
         """
 
     @abstractmethod
     def tension_per_length(self, tension: Array) -> Array:
-        """Return the change of the tension T [N] per change of a length command [N/m], (M,)."""
+        """Return how much tension one metre of a shorter length command adds [N/m], (M,).
+
+        Args:
+            tension: The present tensions [N], (M,).
+        """
 
     @abstractmethod
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
-        """Return the length command [m] (M,) that changes T to T_wanted in the same posture.
+        """Return the length command [m], (M,), that produces wanted tensions in the same posture.
 
         Args:
-            length: l [m], (M,).
-            tension: T at the length l [N], (M,).
-            wanted: T_wanted [N], (M,).
+            length: Present lengths [m], (M,).
+            tension: Present tensions [N], (M,).
+            wanted: The wanted tensions [N], (M,).
         """
 
     @abstractmethod
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
-        """Return the kind and the value of a command that moves T towards T_wanted.
+        """Return a command that moves the tensions towards the wanted tensions.
 
-        The arguments are those of `length_for`.
+        Args:
+            length: Present lengths [m], (M,).
+            tension: Present tensions [N], (M,).
+            wanted: The wanted tensions [N], (M,).
+
+        Returns:
+            LENGTH and target lengths [m], or TENSION and target tensions [N], (M,).
         """
 
     @abstractmethod
     def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the length command [m] (M,) that keeps the tension T [N] at the length l [m]."""
+        """Return the length command that does not change lengths and tensions [m], (M,).
+
+        Args:
+            length: Present lengths [m], (M,).
+            tension: Present tensions [N], (M,).
+        """
 
     @abstractmethod
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:
-        """Return the tension command [N] (M,) that replaces a length command without a jump.
+        """Return the tension command that can replace a length command without a jump [N], (M,).
 
         Args:
-            length: l [m], (M,).
-            command: l_target [m], (M,).
-            tension: T [N], (M,).
+            length: Measured lengths [m], (M,).
+            command: Target lengths of the length command [m], (M,).
+            tension: Measured tensions [N], (M,).
         """
 
     @abstractmethod
     def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return a mask (M,) of the modules that follow l_target instead of keeping T_bias."""
+        """Return which modules follow their target length instead of maintaining T_bias, (M,).
+
+        Args:
+            length: Measured lengths [m], (M,).
+            command: Target lengths [m], (M,).
+        """
 
     @abstractmethod
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return the tension above T_bias [N] (M,) that makes each module pay out at `speed`.
+        """Return the tension above T_bias that makes each module pay out at a speed [N], (M,).
 
         Args:
-            lag: λ, time by which the modules lag behind [s].
+            lag: Time by which the modules lag behind their commands [s].
             speed: Speed at which the modules pay out [m/s], (M,); not negative.
         """
 
@@ -183,17 +204,22 @@ class Actuation(ABC):
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
         """Return by how much a command may be shorter than the measured length [m], (M,).
 
-        The value is negative where the muscle has to be paid out.
+        A tension that is about to exceed its limit makes the value small. The value is negative
+        where the muscle has to be paid out.
 
         Args:
-            tension: T [N], (M,); NaN where it is not known.
-            rate: dT/dt [N/s], (M,).
-            limit: T_limit [N], (M,).
+            tension: Tensions [N], (M,); NaN where they are not known.
+            rate: Rates of change of the tensions [N/s], (M,).
+            limit: Tension limits [N], (M,).
         """
 
     @abstractmethod
     def largest_depth(self, limit: Array) -> Array:
-        """Return the largest possible `depth` [m], (M,), where `limit` is T_limit [N], (M,)."""
+        """Return the largest value that `depth` can have at any tension [m], (M,).
+
+        Args:
+            limit: Tension limits [N], (M,).
+        """
 
     @abstractmethod
     def usable_lead(self, lead: Array | float) -> Array | float:
@@ -205,7 +231,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def recovered(self, shortest: Array, dt: float) -> Array:
-        """Return the shortest lengths [m] (M,) that may be commanded after T exceeded its limit.
+        """Return the shortest permitted commands after a tension exceeded its limit [m], (M,).
 
         Args:
             shortest: Shortest lengths that were permitted at the last call [m], (M,).
@@ -232,11 +258,11 @@ class Actuation(ABC):
 
         Args:
             last: The last length command [m], (M,).
-            start: Length at which the release started [m], (M,).
-            length: l [m], (M,).
-            tension: T [N], (M,).
+            start: Lengths at which paying out started [m], (M,).
+            length: Measured lengths [m], (M,).
+            tension: Measured tensions [N], (M,).
             longest: Length at which each muscle is slack in any posture [m], (M,).
-            is_fresh: Whether l and T are up to date.
+            is_fresh: Whether the measured lengths and tensions are up to date.
         """
 
     @abstractmethod
@@ -245,9 +271,9 @@ class Actuation(ABC):
 
         Args:
             muscle: Index of the muscle.
-            length: l [m].
-            command: l_target [m].
-            tension: T [N].
+            length: Measured length [m].
+            command: Target length [m].
+            tension: Measured tension [N].
         """
 
     @abstractmethod
@@ -256,66 +282,79 @@ class Actuation(ABC):
 
 
 class StiffnessControl(Actuation):
-    """Modules under muscle stiffness control, which keep T_bias by themselves."""
+    """Modules under muscle stiffness control, which maintain T_bias by themselves."""
 
     follows_tensions = True
     largest_relief = RELIEF
 
     def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:  # noqa: ARG002
-        """Return `by_stiffness`."""
+        """Return `by_stiffness`, the value for modules under muscle stiffness control."""
         return by_stiffness
 
     @property
     def kept_tension(self) -> Array:
-        """T_bias [N], (M,)."""
+        """Tension bias of each module [N], (M,), which muscle stiffness control maintains."""
         return self._bias
 
     def demanded(self, length: Array, command: Array) -> Array:
-        """Return T_bias + max(0, K_stiff (l − l_target)) [N], (M,)."""
+        """Return the tensions that a length command demands [N], (M,).
+
+            T = T_bias + max(0, K_stiff (l − l_target))
+
+        Args:
+            length: Measured lengths l [m], (M,).
+            command: Target lengths l_target [m], (M,).
+        """
         demand: Array = self._bias + np.maximum(0.0, self._stiffness * (length - command))
         return demand
 
     def tension_per_length(self, tension: Array) -> Array:  # noqa: ARG002
-        """Return K_stiff [N/m], (M,)."""
+        """Return the control stiffness of each module [N/m], (M,), which is constant."""
         return self._stiffness
 
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:  # noqa: ARG002
-        """Return l − (T_wanted − T_bias)/K_stiff [m], (M,)."""
+        """Return the length command that demands the wanted tensions at `length` [m], (M,).
+
+        Each command is shorter than the length by (wanted tension − T_bias) / control stiffness.
+        """
         return length - (wanted - self._bias) / self._stiffness
 
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:  # noqa: ARG002
-        """Return TENSION and `wanted`, because these modules follow tension commands."""
+        """Return a tension command of `wanted` [N], (M,), because these modules follow tensions."""
         return TENSION, wanted
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the command that demands T [N], or T_bias where T is lower, at l [m], (M,)."""
+        """Return the length command [m], (M,), that demands T_bias or a higher present tension."""
         return self.length_for(length, tension, np.maximum(tension, self._bias))
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return the demanded tensions [N], (M,)."""
+        """Return the tensions that the length command demands [N], (M,)."""
         return self.demanded(length, command)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return a mask (M,) of the muscles whose l is larger than l_target."""
+        """Return which muscles are longer than commanded, (M,); these demand more than T_bias."""
         pulling: Bools = length > command
         return pulling
 
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return K_stiff λ dl/dt [N], (M,)."""
+        """Return control stiffness times lag times speed [N], (M,).
+
+        A module that pays out at a speed lags behind its command by `lag` times this speed.
+        """
         tension: Array = self._stiffness * lag * speed
         return tension
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
-        """Return (T_limit − T_bias)/K_stiff [m], (M,)."""
+        """Return how much shorter than the length a command is that demands T_limit [m], (M,)."""
         return self.largest_depth(limit)
 
     def largest_depth(self, limit: Array) -> Array:
-        """Return (T_limit − T_bias)/K_stiff [m], (M,)."""
+        """Return how much shorter than the length a command is that demands `limit` [m], (M,)."""
         depth: Array = (limit - self._bias) / self._stiffness
         return depth
 
     def usable_lead(self, lead: Array | float) -> Array | float:
-        """Return the whole lead, because a module winds in only while its demand exceeds T."""
+        """Return the whole lead [m], because a module stops winding in at the demanded tension."""
         return lead
 
     def recovered(self, shortest: Array, dt: float) -> Array:  # noqa: ARG002
@@ -326,9 +365,11 @@ class StiffnessControl(Actuation):
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,  # noqa: ARG002
         is_fresh: bool,
     ) -> Array:  # fmt: skip
-        """Return the measured lengths [m] (M,), at which only T_bias is demanded.
+        """Return the lengths to which a stop pays the muscles out [m], (M,).
 
-        If they are out of date, return `longest` where it is longer.
+        These are the measured lengths, because a command equal to the length demands only T_bias.
+        If the measured lengths are out of date, `longest` is returned where it is longer. Isolated
+        muscles are paid out to `longest` at most.
         """
         # If the length is out of date, the muscle is paid out to its largest possible length.
         end = length if is_fresh else np.maximum(length, longest)
@@ -336,28 +377,28 @@ class StiffnessControl(Actuation):
         return np.where(self._robot.used, end, np.minimum(end, longest))
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:
-        """Return the larger of measured and demanded rise [N]."""
+        """Return by how much the higher of measured and demanded tension exceeds T_bias [N]."""
         measured = tension - self._whole.bias[muscle]
         return float(max(measured, self._stiffness[muscle] * (length - command)))
 
     def winding_depth(self, muscle: int) -> float:  # noqa: ARG002
-        """Return DEPTH [m]."""
+        """Return the length by which any suspect may be wound in [m]: DEPTH, 15 mm."""
         return DEPTH
 
 
 class PositionControl(Actuation):
-    """Position-controlled modules, which keep no tension by themselves."""
+    """Position-controlled modules, which maintain no tension by themselves."""
 
     follows_tensions = False
     largest_relief = SLACK
 
     def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:  # noqa: ARG002
-        """Return `by_position`."""
+        """Return `by_position`, the value for position-controlled modules."""
         return by_position
 
     @property
     def kept_tension(self) -> Array:
-        """0 N, (M,)."""
+        """0 N for each module, (M,), because position control maintains no tension."""
         return np.zeros_like(self._bias)
 
     def demanded(self, length: Array, command: Array) -> None:  # noqa: ARG002
@@ -365,24 +406,27 @@ class PositionControl(Actuation):
         return
 
     def tension_per_length(self, tension: Array) -> Array:
-        """Return the stiffness [N/m] (M,) of series elastic elements and tendons at T [N]."""
+        """Return the stiffness of series elastic element and tendon of each muscle [N/m], (M,)."""
         at_zero = self._robot.routes.length_at_zero
         stiffness: Array = 1.0 / self._robot.series_elastic.compliance(at_zero, tension)
         return stiffness
 
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
-        """Return l + L_e(T) − L_e(T_wanted) [m], (M,)."""
+        """Return the length command [m], (M,), that produces wanted tensions in the same posture.
+
+        The length changes by as much as the elongation of series elastic element and tendon.
+        """
         elongation = self._robot.elongation
         return length + elongation(tension) - elongation(wanted)
 
     def command_for(self, length: Array, tension: Array, wanted: Array) -> Kinded:
-        """Return LENGTH and the lengths that correct the fraction ADMITTANCE of T_wanted − T."""
+        """Return a length command [m], (M,), that corrects half of the error of each tension."""
         measured = np.maximum(tension, 0.0)
         goal = measured + ADMITTANCE * (wanted - measured)
         return LENGTH, self.length_for(length, measured, goal)
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return l [m], (M,)."""
+        """Return the present lengths [m], (M,)."""
         return length.copy()
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
@@ -394,14 +438,16 @@ class PositionControl(Actuation):
         return np.ones(np.shape(length), dtype=bool)
 
     def tension_of_lag(self, lag: float, speed: Array) -> Array:  # noqa: ARG002
-        """Return 0 N, (M,), because a position-controlled drive turns without tension."""
+        """Return 0 N for each module, (M,): position-controlled drives pay out without tension."""
         return np.zeros_like(speed)
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
-        """Return SHARE (L_e(T_limit) − L_e(T + AHEAD dT/dt)) [m], (M,), but not less than 0.
+        """Return by how much a command may be shorter than the measured length [m], (M,).
 
-        If T exceeds the limit, return the negative L_e(T_limit) − L_e(T). If T is not known, return
-        `release`.
+        This is a part (SHARE) of the elongation that is left until the tension reaches its limit. A
+        rising tension is first extrapolated by 0.04 s (AHEAD). Where the tension exceeds its limit,
+        the value is negative: the elongation by which the muscle has to be paid out. Where the
+        tension is not known (NaN), the value is `release`.
         """
         elongation = self._robot.elongation
         depth = elongation(limit) - elongation(tension)
@@ -410,7 +456,7 @@ class PositionControl(Actuation):
         return np.where(np.isfinite(tension), depth, self.release)
 
     def largest_depth(self, limit: Array) -> Array:  # noqa: ARG002
-        """Return `release` [m], (M,)."""
+        """Return `release` [m], (M,): the value of `depth` where no tension is known."""
         return self.release
 
     def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
@@ -418,7 +464,7 @@ class PositionControl(Actuation):
         return 0.0
 
     def recovered(self, shortest: Array, dt: float) -> Array:
-        """Return `shortest` − RECOVERY · `dt` [m], (M,).
+        """Return the shortest permitted length commands [m], (M,), which decrease by 10 mm/s.
 
         Paying out reverses the friction of the tendon, so the tension falls by far more than the
         elastic elements explain. If the module wound in again at full speed, the tension would
@@ -430,9 +476,10 @@ class PositionControl(Actuation):
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,
         is_fresh: bool,
     ) -> Array:  # fmt: skip
-        """Return the lengths [m] (M,) at which T falls to T_bias, at most `longest`.
+        """Return the lengths to which a stop pays the muscles out [m], (M,), at most `longest`.
 
-        Where T does not exceed T_bias, return `last`. If T is not known or out of date, return
+        At these lengths, the tension falls to T_bias. A muscle whose tension does not exceed T_bias
+        keeps its command `last`. Where the tension is not known or out of date, the result is
         `start` plus `release`.
         """
         robot, bias = self._robot, self._whole.bias
@@ -448,11 +495,14 @@ class PositionControl(Actuation):
         return np.minimum(end, longest)
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:  # noqa: ARG002
-        """Return the measured rise [N]."""
+        """Return by how much the measured tension of the muscle exceeds T_bias [N]."""
         return float(tension - self._whole.bias[muscle])
 
     def winding_depth(self, muscle: int) -> float:
-        """Return `release` [m]; by default, it raises the tension from T_bias to T_limit."""
+        """Return the length by which a suspect may be wound in [m].
+
+        It is as long as `release`, which by default changes the tension between T_bias and T_limit.
+        """
         return float(self.release[muscle])
 
 

@@ -8,12 +8,13 @@ For postures drawn uniformly within the joint limits, the check computes
 - the moment arms r(θ) = −G(θ) [m], the joint torque for one newton of tension. A muscle with r > 0
   moves the joint in its positive direction.
 
-To give all joints the same unit, a prismatic joint is treated as if a pinion of radius RACK moved
-it: a tendon parallel to its axis has r = RACK. doc/explanation/method.md ("An arm must be
-holdable") defines a sound arm. A joint with a spring of its own may have muscles on one side only,
-if these muscles can hold the joint. The report also shows the one-sided stiffness, in which muscles
-at the tension that their modules maintain (T_bias, or 0 for position-controlled modules) count as
-slack. The one-sided stiffness is not a criterion.
+To give all joints the same unit, the check assumes that a pinion of radius RACK moves each
+prismatic joint. A tendon parallel to the axis of the joint then has r = RACK.
+
+doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring of
+its own may have muscles on one side only, if these muscles can hold the joint. The report also
+shows the one-sided stiffness, for information only. In it, muscles at the tension that their
+modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ COLUMNS = ['muscle', 'joint', 'sign']
 
 
 class FindingTexts(Strict, frozen=True, array_like=True):
-    """An entry of findings.yaml."""
+    """Message and remedy for one kind of finding, as findings.yaml contains them."""
 
     message: str
     remedy: str
@@ -93,7 +94,8 @@ class Finding(NamedTuple):
 class Setting(NamedTuple):
     """A robot in N postures, with the quantities that determine holding and stiffness.
 
-    All quantities but θ treat a prismatic joint as if a pinion of radius RACK moved it.
+    For a prismatic joint, all quantities except `theta` are those of a pinion of radius RACK that
+    moves the joint.
     """
 
     robot: Robot
@@ -106,7 +108,7 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
-        """Return the setting of a robot in postures θ (N, D)."""
+        """Compute the quantities of a robot in postures θ [rad] or [m], (N, D)."""
         jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
         hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
         weight = radian * robot.kinematics.weight_torque(theta)
@@ -118,7 +120,7 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """Results of the check in N postures."""
+    """Results of `check_robot` in N postures."""
 
     setting: Setting
     moment_arms: Array  # r [m], (N, M, D)
@@ -134,12 +136,12 @@ class RobotCheck:
 
     @property
     def held(self) -> Bools:
-        """Whether each posture is held, shape (N,)."""
+        """Whether the muscles hold the arm in each posture, shape (N,)."""
         return np.isfinite(self.stiffness)
 
     @property
     def stiff(self) -> Bools:
-        """Whether each posture is held and stiff enough, shape (N,)."""
+        """Whether the arm is held and stiff enough in each posture, shape (N,)."""
         return self.stiffness >= self.required
 
 
@@ -170,7 +172,10 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 
 
 def judge(setting: Setting) -> RobotCheck:
-    """Check the muscles of a robot in the postures of a setting.
+    """Check whether the muscles of a robot hold and stiffen it in given postures.
+
+    Args:
+        setting: The robot and the postures.
 
     Raises:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
@@ -240,7 +245,14 @@ def arm_terms(robot: Robot, joint: int) -> ArmTerms:
 
 
 def required_stiffness(robot: Robot, required: float) -> str:
-    """Return a text with the required eigenvalue [N·m/rad], and [N/m] for prismatic joints."""
+    """Return the required joint stiffness as a text, such as '5 N·m/rad'.
+
+    If the robot has prismatic joints, the text also states the value in N/m.
+
+    Args:
+        robot: The robot.
+        required: Smallest permitted eigenvalue of the joint stiffness [N·m/rad].
+    """
     text = f'{required:.2g} N·m/rad'
     if robot.kinematics.slides.any():
         text += f' ({required / RACK**2:.0f} N/m for prismatic joints)'
@@ -264,9 +276,9 @@ def rounded_text(value: float, least: int = 1, largest: float | None = None) -> 
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
-    """Return the signs (±1) that `moment_arms.csv` declares, by (muscle, joint).
+    """Return the signs of moment arms (±1) that `moment_arms.csv` declares.
 
-    The result is empty if there is no such file.
+    The keys are pairs of indices (muscle, joint). The result is empty if there is no such file.
 
     Raises:
         RobotDescriptionError: If the file is invalid; the message names the line and the legal
@@ -297,14 +309,17 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
 
 
 def _finding(key: str, **fields: object) -> Finding:
-    """Return the finding with this key in FINDINGS, with the fields of its texts filled in."""
+    """Return a finding with the texts that findings.yaml has under a key.
+
+    `fields` are the values of the placeholders in these texts.
+    """
     texts = FINDINGS[key]
     kind = key.partition(',')[0]
     return Finding(kind, texts.message.format(**fields), texts.remedy.format(**fields))
 
 
 def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Yield a fault for each declared sign that too many postures contradict."""
+    """Yield a fault for each moment arm whose declared sign is wrong in too many postures."""
     for (muscle, joint), sign in read_declared_actions(robot.description).items():
         arm, terms = moment_arms[:, muscle, joint], arm_terms(robot, joint)
         against = np.mean(arm * sign <= 0.0)
@@ -363,11 +378,11 @@ def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
     """Return the joint on which each muscle acts most, and how often its action is reversed there.
 
     Args:
-        moment_arms: r [m] in N postures, (N, M, D).
+        moment_arms: Moment arms in N postures [m], (N, M, D).
 
     Returns:
-        Index of the joint, (M,), and the share of the postures in which r has the sign opposite to
-        that of its median, (M,).
+        Index of the joint, (M,), and the share of the postures in which the moment arm at this
+        joint has the opposite sign of its median, (M,).
     """
     median, muscles = np.median(moment_arms, axis=0), np.arange(moment_arms.shape[1])
     main = np.abs(median).argmax(axis=1)
@@ -385,7 +400,10 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _millimetres(moment_arms: Array) -> Iterator[Finding]:
-    """Yield a fault if most points are in millimetres, from which all other faults would follow."""
+    """Yield a fault if most route points seem to be in millimetres instead of metres.
+
+    All other faults would then be consequences of this one.
+    """
     typical = float(np.median(np.abs(moment_arms).max(axis=(0, 2))))
     if typical > MILLIMETRES:
         yield _finding('other_units, points', arm=typical)
@@ -405,7 +423,7 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 
 def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
-    """Yield a warning about the joints at which all moment arms are shorter than SHORT_ARM."""
+    """Yield a warning about the joints at which all moment arms are shorter than 15 mm."""
     # Skip joints without muscles, which are reported as one-way joints.
     longest = np.abs(moment_arms).max(axis=(0, 1))
     small = np.flatnonzero((longest > LEAST_COUNTED_ARM) & (longest < SHORT_ARM)).tolist()
@@ -448,14 +466,15 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
 def _holding_faults(
     robot: Robot, stiffness: Array, least: float, softest: Ints, missing: Array
 ) -> Iterator[Finding]:
-    """Yield a fault if the muscles hold the arm in too few postures, or it is stiff in too few.
+    """Yield a fault if the arm is held in too few postures, and one if it is stiff in too few.
 
     Args:
         robot: The robot.
-        stiffness: Smallest stiffness eigenvalue [N·m/rad], NaN where not held, (N,).
+        stiffness: Smallest eigenvalue of the joint stiffness [N·m/rad], (N,); NaN in postures that
+            the muscles do not hold.
         least: Required stiffness [N·m/rad].
-        softest: Softest joint of each posture that is held but not stiff.
-        missing: Missing torque [N·m], (N, D).
+        softest: Index of the softest joint in each posture that is held but not stiff.
+        missing: Torque that the muscles lack to hold each posture [N·m], (N, D).
     """
     held, stiff = np.isfinite(stiffness), stiffness >= least
     required, worst = 100 * REQUIRED_SHARE, -1

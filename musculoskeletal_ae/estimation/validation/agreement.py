@@ -3,9 +3,9 @@
 
 Three quantities are compared:
 
-    θ         the estimate through ② on the recent messages
-    lengths   l through ① at the same posture
-    shape     the change of l through ① from posture to posture, on the fixed states
+    θ         the joint angles that the network estimates on the recent messages (mask ②)
+    lengths   the muscle lengths that the network computes at the same posture (mask ①)
+    shape     the change of these lengths from posture to posture, on fixed random states
 
 If joint sensors measured the postures, they are the reference. The limit of the median error of
 each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
@@ -15,7 +15,7 @@ larger than that of the network in use.
 Without joint sensors, the network in use is the reference. The limits of the median differences are
 ANGLE_MOVED and LENGTH_MOVED, and that of the relative difference in shape is SHAPE_MOVED. If there
 are too few messages, they are replaced by the fixed states with lengths that the network in use
-computes.
+computes. The names in capitals are constants of this file.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Comparison(NamedTuple):
     source: str  # source of the reference
 
     def faults(self) -> Iterator[str]:
-        """Yield a text on the error that exceeds its limit most, if there is one."""
+        """Yield one text on the error that exceeds its limit most, or nothing if none does."""
         excess = self.error / self.limit
         if not excess.max() <= 1.0:
             worst = int(excess.argmax())
@@ -76,7 +76,7 @@ class AgreementCheck:
 
     Args:
         robot: The geometric model.
-        postures: The fixed states.
+        postures: Fixed random states of the geometric model.
         messages: The recent messages.
         in_use: The network in use.
         isolated: Indices of the isolated muscles, which are ignored.
@@ -113,9 +113,9 @@ class AgreementCheck:
 
         Args:
             mae: The candidate.
-            new: θ that the candidate estimates [rad], (N, D).
-            old: θ that the network in use estimates [rad], (N, D).
-            tension: T_end [N], (N, M).
+            new: Joint angles that the candidate estimates [rad], (N, D).
+            old: Joint angles that the network in use estimates [rad], (N, D).
+            tension: Bone-side tensions [N], (N, M).
         """
         angle = ANGLE_MOVED if self._has_learned else ANGLE_MOVED_INITIAL
         limit = angle * self._robot.kinematics.radian
@@ -132,8 +132,8 @@ class AgreementCheck:
 
         Args:
             mae: The candidate.
-            new: θ that the candidate estimates [rad], (N, D).
-            old: θ that the network in use estimates [rad], (N, D).
+            new: Joint angles that the candidate estimates [rad], (N, D).
+            old: Joint angles that the network in use estimates [rad], (N, D).
             rows: Indices of the messages in which all joints were measured.
         """
         measured = self._messages.theta[rows]
@@ -161,9 +161,9 @@ class AgreementCheck:
         return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
 
     def _shape(self, mae: Mae) -> Comparison:
-        """Compare the change of l over the fixed states between `mae` and the network in use.
+        """Compare how muscle lengths change from posture to posture by two networks.
 
-        Both networks compute l through ①.
+        `mae` and the network in use compute the lengths at the same fixed states.
         """
         theta, tension = self._postures.theta, self._postures.tension
         used = np.delete(np.arange(self._robot.muscle_count), self._isolated)
@@ -176,13 +176,16 @@ class AgreementCheck:
         )
 
     def _length_error(self, mae: Mae, theta: Array, tension: Array, length: Array) -> Array:
-        """Return the median error [m] (M,) of l through ①, which is 0 for isolated muscles.
+        """Return the median error of the lengths that a network computes at known postures.
 
         Args:
             mae: A network.
-            theta: Postures at which the network computes lengths [rad], (N, D).
-            tension: T_end [N], (N, M).
-            length: Lengths with which the network's lengths are compared [m], (N, M).
+            theta: The postures [rad], (N, D).
+            tension: Bone-side tensions [N], (N, M).
+            length: Lengths with which those of the network are compared [m], (N, M).
+
+        Returns:
+            The error of each muscle's length [m], (M,); 0 for isolated muscles.
         """
         error = _median(mae.lengths(theta, tension) - length)
         error[list(self._isolated)] = 0.0

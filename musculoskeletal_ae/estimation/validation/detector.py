@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks the calibrated detector of a candidate network, or gives it the detector in use.
+"""Checks the calibrated anomaly detector of a candidate network, or replaces a missing one.
 
-A calibrated detector must stay below its threshold on the recent messages, and must respond to
-a ruptured muscle. The measure is the median over the messages of d divided by its threshold.
+A calibrated detector must stay below its threshold on the recent messages, and must respond to a
+ruptured muscle. The ratio of the residual distance d to its threshold, as the median over the
+messages, measures both. A candidate without a calibrated detector inherits the detector in use.
 """
 
 import math
@@ -23,9 +24,10 @@ WIDENED = 3.5  # smallest ratio of an inherited threshold to the highest d of th
 
 
 def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Iterator[float]:
-    """Yield the measure of the messages, and then of the messages with each muscle ruptured.
+    """Yield ratios of the residual distance d to its threshold, each as the median over messages.
 
-    A rupture is imitated by setting the tension of the muscle to 0.
+    The first ratio is that of the messages as they are. Each following ratio is that of the same
+    messages with one muscle ruptured, which is imitated by setting its tension to 0.
 
     Nothing is yielded for a network without a calibrated detector, or with too few messages.
     """
@@ -49,7 +51,7 @@ def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Ite
 
 
 def faults(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Iterator[str | None]:
-    """Yield each fault of a candidate's detector, or None after each piece of work."""
+    """Yield a text for each fault of a candidate's detector, and None after each piece of work."""
     values = list[float]()
     for value in measures(mae, messages, isolated):
         values.append(value)
@@ -69,13 +71,14 @@ def faults(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Itera
 def with_detector_of(
     statistics: AnomalyStatistics, mae: Mae, messages: RecentMessages, isolated: tuple[int, ...]
 ) -> Mae:
-    """Return the network that takes over, with the detector of the network in use.
+    """Return a network with the detector of the network that it replaces.
 
-    The threshold is at least WIDENED times the highest d of the recent messages.
+    The threshold is raised, if necessary, to 3.5 times (WIDENED) the highest residual distance of
+    the new network on the recent messages.
 
     Args:
         statistics: The calibrated detector of the network in use.
-        mae: The network that takes over.
+        mae: The new network.
         messages: The recent messages.
         isolated: Indices of the isolated muscles.
     """

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks how well a candidate network explains recent messages of the arm.
+"""Checks how exactly a candidate network restores the readings of recent messages.
 
-Three errors are compared: T and l through ②, and l through ① at the θ that ② estimates. The limit
-of the median error of each muscle is WORSE times that of the network in use, but at least FLOOR.
+Three errors are compared: those of the tensions and lengths that the network restores from both
+(mask ②), and that of the lengths that it computes at the joint angles estimated by ② (mask ①).
+The limit of the median error of each muscle is WORSE times that of the network in use, but at least
+FLOOR.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,9 +21,11 @@ FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
 
 
 def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:
-    """Return the median errors of T [N] and l [m] of each muscle, (M,) each, by the names in FLOOR.
+    """Return the median errors with which a network restores the readings of recent messages.
 
-    The errors of isolated muscles are 0. The result is empty if there are too few messages.
+    Returns:
+        By each name in FLOOR, such as 'T by ②', the error of every muscle [N] or [m], (M,). The
+        errors of isolated muscles are 0. The result is empty if there are too few messages.
     """
     if not messages.are_enough:
         return {}
@@ -43,7 +47,7 @@ def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) 
 def faults(
     errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
 ) -> Iterator[str]:
-    """Yield each fault of a candidate.
+    """Yield a text for each kind of error that exceeds its limit, on the worst muscle.
 
     Args:
         errors: Errors of the candidate.

@@ -4,6 +4,9 @@
     ①         restores θ, T and l of the geometric model, and its G
     ②, ③      restore θ, T and l, where l is computed by ①
 
+①, ② and ③ are the masks of the network: with ① it computes the muscle lengths l from joint angles
+θ and tensions T, with ② θ from T and l, and with ③ T from θ and l. G is the muscle Jacobian ∂l/∂θ.
+
 The lengths of a real arm differ from the model's by centimetres, so ② and ③ are compared with the
 lengths of ① rather than with the model's. Most of the difference is elongation, because a series
 elastic element may be much softer than its model. ① is therefore compared with softened lengths of
@@ -11,19 +14,19 @@ the model: the elongation of each muscle is multiplied by one factor, which is f
 differences between ① and the model. Differences that are the same in all states do not change the
 factor.
 
-A further check is the *scale*. It removes the elongations and fits one factor between all route
-lengths by ① and those of the model. Errors of single muscles average out: the scale was 0.84 to
-1.11 for healthy networks of both presets, on arm26 and musashi_left_arm, with both emulator models.
-The error of the scale is its distance from 1.
+A further check is the *scale*: the factor by which all route lengths of ① differ from those of the
+model, after the elongations have been removed. Errors of single muscles average out: the scale was
+0.84 to 1.11 for healthy networks of both presets, on arm26 and musashi_left_arm, with both emulator
+models. The error of the scale is its distance from 1.
 
 The relative error of a joint or muscle is its root mean square error divided by the standard
 deviation of the true values. A network with a constant output has a relative error of 1. The *mean
 error* of a joint is the magnitude of its mean difference, divided by the same standard deviation.
 LIMITS holds the largest permitted values.
 
-Where muscles determine a joint only poorly, for example because several postures have the same
-lengths, a relative error of θ up to UNDETERMINED times the error of the best affine map of (T, l)
-is permitted. This does not apply to the mean error.
+The muscles may determine a joint only poorly, for example because several postures have the same
+lengths. For such a joint, the permitted relative error of θ is UNDETERMINED times that of the best
+affine map from T and l to θ. This does not apply to the mean error.
 """
 
 from collections.abc import Iterator
@@ -68,12 +71,12 @@ AFFINE = 1000
 
 
 class PostureCheck:
-    """The fixed states of one robot, and the errors of networks on them.
+    """Fixed random states of one robot, and the errors of networks on them.
 
     Attributes:
-        theta: θ [rad], (N, D).
-        tension: T [N], (N, M).
-        length: l of the geometric model [m], (N, M).
+        theta: Joint angles [rad], (N, D).
+        tension: Tensions [N], (N, M).
+        length: Muscle lengths of the geometric model [m], (N, M).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -85,7 +88,7 @@ class PostureCheck:
         self._jacobian = robot.routes.muscle_jacobian(self.theta) * (1.0 - slope)
 
     def faults(self, mae: Mae) -> Iterator[str | None]:
-        """Yield each fault of a network, or None after each piece of work."""
+        """Yield a text for each fault of a network, and None after each piece of work."""
         for item in self.errors(mae):
             yield None
             if item is None:
@@ -107,9 +110,10 @@ class PostureCheck:
                 )
 
     def errors(self, mae: Mae) -> Iterator[tuple[str, Array] | None]:
-        """Yield pairs of a name in LIMITS and the relative error of each joint or muscle.
+        """Yield the name of each error in LIMITS with its values, one for each joint or muscle.
 
-        After some pieces of work, None is yielded instead.
+        The values are relative to the standard deviation of the true values. Between pairs, None
+        may be yielded, so that the caller can do other work.
         """
         own_length = mae.lengths(self.theta, self.tension)
         for mask, symbol in zip(Mask, '①②③', strict=True):
@@ -136,25 +140,38 @@ class PostureCheck:
         yield 'G by ①', size / np.maximum(moment_arm, LEAST_ARM)
 
     def _slope_over_elongation(self, length: Array) -> Array:
-        """Return the regression slope of each length (N, M) over the muscle's elongation, (M,)."""
+        """Return how much each length changes per metre of the muscle's elongation, (M,).
+
+        This is the slope of a linear regression over the fixed states.
+
+        Args:
+            length: Lengths at the fixed states [m], (N, M).
+        """
         products = (length * self._centred).sum(axis=0)
         squares = np.square(self._centred).sum(axis=0)
         slope: Array = products / np.maximum(squares, INELASTIC)
         return slope
 
     def _softened(self, length: Array) -> Array:
-        """Return the model's l [m] (N, M) with elongations multiplied by fitted factors.
+        """Return the lengths of the geometric model with softer or stiffer elastic elements.
 
-        The factors are fitted to the lengths [m] (N, M) of a network.
+        The elongation of each muscle is multiplied by a factor, which is fitted to a network.
+
+        Args:
+            length: Lengths that the network computes at the fixed states [m], (N, M).
+
+        Returns:
+            The lengths of the model with these elongations [m], (N, M).
         """
         factor = 1.0 - self._slope_over_elongation(length - self.length)
         factor = np.clip(factor, STIFFEST, SOFTEST)
         return self.length - (factor - 1.0) * self._elongation
 
     def _scale(self, length: Array) -> float:
-        """Return the scale: the factor between a network's route lengths and those of the model.
+        """Return the factor by which a network's route lengths differ from those of the model.
 
-        `length` are the lengths that the network computes [m], (N, M).
+        Args:
+            length: Lengths that the network computes at the fixed states [m], (N, M).
         """
         routes, read = (
             part - part.mean(axis=0) - self._slope_over_elongation(part) * self._centred
@@ -163,7 +180,11 @@ class PostureCheck:
         return float((routes * read).sum() / np.square(routes).sum())
 
     def _states(self, count: int) -> tuple[Array, Array, Array]:
-        """Return θ, T and l of random states of the geometric model."""
+        """Draw random states of the geometric model, always the same for the same `count`.
+
+        Returns:
+            Joint angles [rad], (N, D); tensions [N], (N, M); muscle lengths [m], (N, M).
+        """
         robot, rng = self._robot, np.random.default_rng(0)
         theta = robot.random_postures(count, rng)
         share = rng.uniform(size=(count, robot.muscle_count))
@@ -172,7 +193,10 @@ class PostureCheck:
 
     @cached_property
     def _undetermined(self) -> Array:
-        """Permitted relative error of each joint, derived from the best affine map, (D,)."""
+        """Permitted relative error of a joint that the muscles determine only poorly, (D,).
+
+        It follows from the error of the best affine map from tensions and lengths to joint angles.
+        """
         theta, tension, length = self._states(2 * AFFINE)
         ones = np.ones((2 * AFFINE, 1))
         inputs = np.hstack([ones, tension / tension.std(), length / length.std()])

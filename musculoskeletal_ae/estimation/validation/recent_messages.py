@@ -26,7 +26,7 @@ class _Message(NamedTuple):
 
 
 class RecentMessages:
-    """The last healthy messages, thinned out. All times are of one steady clock [s]."""
+    """The healthy messages of the last 10 s, thinned out. All times are of one steady clock [s]."""
 
     def __init__(self, joint_count: int) -> None:
         self._unmeasured = np.full(joint_count, np.nan)
@@ -38,25 +38,25 @@ class RecentMessages:
 
     @property
     def are_enough(self) -> bool:
-        """Whether a network can be validated on the messages."""
+        """Whether there are enough messages to validate a network on them."""
         return len(self._messages) >= LEAST
 
     @property
     def theta(self) -> Array:
-        """Measured θ [rad], with NaN where it was not measured, (N, D)."""
+        """Measured joint angles [rad], (N, D); NaN where they were not measured."""
         return np.array([message.theta for message in self._messages])
 
     def note(
         self, tension: Array, length: Array, now: float, theta: Array | None, is_healthy: bool
     ) -> None:
-        """Keep a message if the arm is healthy and the last kept message is old enough.
+        """Store a message if the arm is healthy and the last stored message is at least 0.1 s old.
 
         Args:
-            tension: T_read [N], (M,).
-            length: l [m], (M,).
+            tension: Tensions as read [N], (M,).
+            length: Muscle lengths [m], (M,).
             now: Time of the message [s].
-            theta: Measured θ [rad], (D,), or None.
-            is_healthy: Whether no anomaly is detected.
+            theta: Measured joint angles [rad], (D,), or None.
+            is_healthy: Whether the arm is healthy, that is, no anomaly is detected.
         """
         period, self._time = now - self._time, now
         if not 0.0 <= period < LONGEST_PERIOD:
@@ -71,9 +71,9 @@ class RecentMessages:
             self._messages.popleft()
 
     def readings(self, mae: Mae) -> tuple[Array, Array]:
-        """Return T_end [N] and l [m] of the messages, (N, M) each.
+        """Return bone-side tensions [N] and muscle lengths [m] of the messages, (N, M) each.
 
-        T_end is computed with the friction that the network `mae` has learned.
+        The bone-side tensions are computed with the tendon friction that the network has learned.
         """
         tension = np.array([message.tension for message in self._messages])
         length = np.array([message.length for message in self._messages])
