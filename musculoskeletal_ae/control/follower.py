@@ -58,7 +58,7 @@ HELD_BACK = 1e-4
 
 
 class HeldPosture(NamedTuple):
-    """The plan for the end of a trajectory, which is computed once and then held."""
+    """The plan with which the follower holds the end of a trajectory; it is computed only once."""
 
     length: Array  # l_target without feedback [m], (M,)
     jacobian: Array  # G [m/rad], (M, D)

@@ -89,7 +89,9 @@ class Hand:
         return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
-        """Return the trajectory to a received pose, which may continue a path of earlier poses.
+        """Return the trajectory to a received pose.
+
+        If poses arrive in quick succession, the trajectory continues the path of the earlier ones.
 
         Args:
             start: Setpoint from which the trajectory starts.

@@ -183,7 +183,8 @@ class CommandLimiter:
             tension_limit: Momentary limit of each tension [N], (M,); the lower one of this and
                 the robot's `tension.limit` applies.
             dt: Time since the last command [s].
-            lead: λ max(0, −dl/dt) of each muscle [m], (M,).
+            lead: Length by which each command may lead the measured length while the muscle winds
+                in, λ max(0, −dl/dt) [m], (M,).
             rejected: l [m] and T [N], (2, M), as in `RejectionError.pull`, if the newest message
                 was rejected; else None.
 

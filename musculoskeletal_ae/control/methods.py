@@ -210,10 +210,10 @@ def stiffness_command(
     These three come from the network's prediction l(θ, T) of the muscle lengths (paper, §III-E,
     variable stiffness control).
 
-    Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. T_low lies
-    above T_bias by the largest of MARGINS with which the torque is possible, because a muscle that
-    muscle stiffness control (MSC) holds at T_bias is stiff in one direction only. K is nearly
-    linear in T, so a few quadratic programmes around the last solution suffice.
+    Tensions in the null space of Gᵀ keep the posture and stiffen the elastic elements. A muscle
+    that muscle stiffness control (MSC) holds at T_bias is stiff in one direction only. Therefore
+    T_low lies above T_bias, by the largest of MARGINS with which the torque is possible. K is
+    nearly linear in T, so a few quadratic programmes around the last solution suffice.
 
     Args:
         robot: The body, in which isolated muscles have no tension.

@@ -138,7 +138,7 @@ class Limits:
         Args:
             jacobian: G [m/rad], (M, D).
             at: The moment of the motion.
-            lag: λ of the muscle modules [s].
+            lag: Time λ by which the muscle modules lag behind their commands [s].
             slower: Factor by which the motion is slowed; ∞ for a very slow motion.
         """
         robot, radian = self._robot, self._radian
@@ -150,9 +150,10 @@ class Limits:
 
 
 class PathCost:
-    """Computes the cost of straight paths, which rises with the missing torque.
+    """Computes the cost of straight paths between postures.
 
-    The missing torque is the one that neither muscles nor joint stops provide.
+    The cost of a path grows with its length, and with the missing torque, which neither the muscles
+    nor the joint stops provide.
     """
 
     def __init__(self, robot: Robot, mae: Mae) -> None:

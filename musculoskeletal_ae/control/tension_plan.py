@@ -155,7 +155,7 @@ class TensionPlan:
             trajectory: The trajectory.
             time: Time since the start of the trajectory [s].
             shift: Shift of θ by the feedback [rad], (D,).
-            lag: λ of the muscle modules [s].
+            lag: Time λ by which the muscle modules lag behind their commands [s].
             inputs: The present inputs.
         """
         robot, mae, dt = self._robot, inputs.mae, inputs.dt

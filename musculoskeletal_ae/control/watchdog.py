@@ -2,10 +2,11 @@
 """The watchdog: detects stop causes from load, temperature, and the age of data.
 
 `now` is the time of a steady clock [s], by which ages are measured. `time` is the time of the
-messages' clock [s], by whose steps commands advance. If the messages' clock runs at a fraction of
-real time, as in a slow simulator, the allowed age is divided by this fraction, but by no less than
-`SLOWEST`. A fast clock does not shorten the allowed age. Pauses of the controller itself do not
-count as age (`AwakeClock`).
+messages' clock [s], by whose steps commands advance.
+
+In a slow simulator, the messages' clock runs at a fraction of real time. The allowed age is then
+divided by this fraction, but by no less than `SLOWEST`. A fast clock does not shorten the allowed
+age. Pauses of the controller itself do not count as age (`AwakeClock`).
 """
 
 from __future__ import annotations

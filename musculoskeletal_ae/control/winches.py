@@ -40,7 +40,7 @@ class Winches:
 
     @property
     def lag(self) -> float:
-        """The present estimate of λ [s]."""
+        """The present estimate of the lag λ [s]."""
         return min(max(self._products / self._squares, 0.0), LARGEST_LAG)
 
     @property
@@ -51,7 +51,7 @@ class Winches:
     def step(
         self, length: Array, tension: Array, command: Array, dt: float, delay: float = 0.0
     ) -> None:
-        """Update λ and the speeds of the muscles.
+        """Update the lag λ and the speeds of the muscles.
 
         Args:
             length: l [m], (M,).
@@ -79,6 +79,6 @@ class Winches:
         self._squares += float(speed[is_usable] @ speed[is_usable])
 
     def forget(self) -> None:
-        """Discard the last length after a pause; λ is kept."""
+        """Discard the last length after a pause; the estimate of the lag remains."""
         self._length, self._since = None, 0.0
         self._speed = np.zeros_like(self._speed)

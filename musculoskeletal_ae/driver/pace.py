@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure the rate at which a driver publishes, which can differ from the rate of reception.
+"""Measure the rate at which a driver publishes.
 
-Source time and sequence number of a message give the rate of publication. Without them, the time of
-reception is used. A busy computer may delay or lose messages, or block the driver. An
-`AwakeClock` therefore tells whether this process itself was blocked.
+Source time and sequence number of the messages give the rate of publication. Without them, the rate
+of reception is used instead. It may be lower, because a busy computer may delay or lose messages,
+or block this process. An `AwakeClock` shows whether this process was blocked.
 """
 
 import os

@@ -10,12 +10,12 @@ inwards until the law
 demands a low tension at the measured l. The target then returns, and moves beyond l, where T must
 stay at T_bias.
 
-Signs and order of commands are unknown before the test. Until a muscle has passed the test, it
-never gets a target for which the law would demand more than the highest test tension at the
-measured l. Before the first muscle is tested, the arm is held. In this phase, the law demands at
-most the fraction HELD of the test tension, and all muscles are released as soon as a tension
-exceeds the fraction ALARM. Both fractions refer to the range from T_bias to the highest test
-tension.
+Signs and order of commands are unknown before the test. Until a muscle has passed the test, its
+target is limited: at the measured l, the law never demands more than the highest test tension.
+
+Before the first muscle is tested, the arm is held. In this phase, the law demands at most the
+fraction HELD of the test tension. All muscles are released as soon as a tension exceeds the
+fraction ALARM. HELD and ALARM are fractions of the range from T_bias to the highest test tension.
 
 An error of l (LENGTH_ERROR) becomes an error of T, which is K times as large. If K exceeds 50 kN/m,
 this error of T exceeds TENSION_TOLERANCE and replaces the tolerance. The detection thresholds and

@@ -38,7 +38,11 @@ class AnomalyLatch:
         self._timer.cancel()
 
     def take(self, detected: bool) -> None:
-        """Process the value of a message of `anomaly_detected`."""
+        """Latch an anomaly, or ask the estimator whether a latched anomaly has ended.
+
+        Args:
+            detected: Value of a message of `anomaly_detected`.
+        """
         if detected:
             self._give_up()
             if not self._is_latched:
@@ -51,7 +55,8 @@ class AnomalyLatch:
     def _ask(self) -> None:
         """Ask the estimator whether the anomaly has ended.
 
-        An earlier request without an answer is dropped: a restarted estimator never answers it.
+        An earlier request that has not been answered is abandoned, because an estimator that has
+        restarted in the meantime would never answer it.
         """
         if self._future is not None:
             self._client.remove_pending_request(self._future)

@@ -4,10 +4,12 @@
     mae_checkpoint (learner) ─► validation ─► accepted_checkpoint (estimator) ─► controller, sim
 
 Candidates arrive on the topic `mae_checkpoint`, or from the file that the parameter `checkpoint`
-names. The estimator uses an accepted network and publishes it latched. If an anomaly is detected
-soon after a network was accepted, the estimator returns to the newest network that was in use long
-enough without an anomaly, and publishes this network again. As soon as there is an accepted
-network, controller and simulator use only accepted networks.
+names. The estimator uses an accepted network and publishes it on a latched topic. As soon as there
+is an accepted network, controller and simulator use only accepted networks.
+
+An anomaly that is detected soon after a network was accepted may be due to this network. The
+estimator then returns to the newest network that was in use long enough without an anomaly, and
+publishes it again.
 """
 
 import time
@@ -30,7 +32,7 @@ class Candidates:
 
     Attributes:
         validator: Validation rules, and the recent messages that networks are validated on.
-        queue: Queue of the candidates from the topic, which are validated in small steps.
+        queue: Queue in which the candidates from the topic wait; it validates them in small steps.
     """
 
     def __init__(

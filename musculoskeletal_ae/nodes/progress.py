@@ -10,9 +10,9 @@ A native call that never returns and holds Python's global interpreter lock bloc
 thread as well. For this case, the watching thread restarts a timer at each check. After 10 s of CPU
 time without a restart, the timer sends SIGVTALRM, which dumps the stacks and ends the process.
 
-The watching thread does not count the time in which the process was suspended, or in which the main
-thread was ready to run but an overloaded computer gave it no processor. It does not end a process
-whose main thread is in a debugger or in numba's compiler.
+The watching thread does not count the time in which the process was suspended. Nor does it count
+the time in which the main thread waited for a processor of an overloaded computer. It does not end
+a process whose main thread is in a debugger or in numba's compiler.
 """
 
 import faulthandler
@@ -77,7 +77,7 @@ class ProgressWatch:
         self._thread = threading.Thread(target=self._watch, name='progress', daemon=True)
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Start watching."""
         faulthandler.register(signal.SIGVTALRM, all_threads=True, chain=True)
         # Set the timer here as well as in the thread, because a native call may take Python's lock,
         # and never release it, before the thread runs for the first time.

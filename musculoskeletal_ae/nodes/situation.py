@@ -129,7 +129,7 @@ class Situation:
         self._other_networks: dict[str, tuple[str, int]] = {}
 
     def tick(self) -> None:
-        """Forget nodes that have ended.
+        """Remove the reports of nodes that have ended.
 
         Call this about once a second, because longer intervals count as pauses of this process.
         """
@@ -144,7 +144,7 @@ class Situation:
         return self._awake.at(self._clock())
 
     def diagnosed(self, message: DiagnosticArray) -> None:
-        """Process a message of /diagnostics."""
+        """Store the reports that a message of /diagnostics contains."""
         for status in message.status:
             full_name, _, _ = status.name.partition(':')
             namespace, _, name = full_name.rpartition('/')

@@ -13,10 +13,9 @@ c₂ is measured, c₁ is not. While the arm operates, an extended Kalman filter
 the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a. Process noise lets the constants
 change slowly. The ratio r = R₁/R₂ cannot be estimated (doc/explanation/control_and_safety.md).
 
-The highest permitted tension of a muscle is the tension that brings the winding to the temperature
-limit when this tension is held for a certain time. If κ or τ₂ departs from its first known value by
-the factor CHANGED, the module has changed: its motor drags, its housing is covered, or its tension
-sensor is faulty.
+If the highest permitted tension of a muscle is held for a certain time, the winding just reaches
+the temperature limit. If κ or τ₂ departs from its first known value by the factor CHANGED, the
+module has changed: its motor drags, its housing is covered, or its tension sensor is faulty.
 """
 
 import numpy as np
@@ -53,8 +52,10 @@ def flow(state: Array, square: Array, dt: float) -> Array:
     """Return the state of the thermal model after a time in which the tension is constant.
 
     Args:
-        state: c₁ − c₂ [K], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C] at the beginning, (6, ...).
-        square: T² [N²], (...).
+        state: The state at the beginning, (6, ...): temperature of the winding minus that of the
+            housing [K], temperature of the housing [°C], the logarithms of the thermal constants κ,
+            τ₁ and τ₂, and temperature of the air [°C].
+        square: Squared tension [N²], (...).
         dt: The time [s].
 
     Returns:

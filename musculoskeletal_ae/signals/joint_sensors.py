@@ -12,8 +12,8 @@ of c, the fit does not depend on length offsets. For a correct sensor a_j is abo
 (jackknife).
 
 A sign cannot be judged from lengths if the joint hardly moves, or if the lengths of its muscles are
-the same at θ and −θ. In the second case, a wrong sign is found only if the limits of the joint are
-on one side of 0, because readings with the wrong sign are then beyond the limits.
+the same at θ and −θ. In the second case, a wrong sign is found only if both limits of the joint
+have the same sign. Readings with the wrong sign are then beyond the limits.
 """
 
 from collections.abc import Iterator
@@ -119,8 +119,9 @@ def stuck_sensors(
 ) -> list[JointFault]:
     """Return the joint sensors that repeat one reading although the lengths show another angle.
 
-    During the repeated reading, the lengths either show that the joint moves, or differ from the
-    model by more than they do in the rest of the recording, as if the joint were elsewhere.
+    A sensor is stuck if, during the repeated reading, the lengths show that its joint moves. It is
+    also stuck if the lengths then show an angle that is far from the reading, in comparison with
+    the rest of the recording.
 
     Args:
         robot: The geometric model.

@@ -99,8 +99,8 @@ class PresumedRupture:
 
     A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, the length
     of this tendon appears to jump. A rupture is presumed if exactly one tendon is slack and has
-    become shorter, by no more than the motor can have wound in since the last message. The muscle
-    then does not count as displaced, and the detectors of ruptures decide.
+    become shorter. The change must not exceed the length that the motor can have wound in since the
+    last message. The muscle then does not count as displaced, and the detectors of ruptures decide.
 
     If the tendon pulls again, it has not ruptured. Its module may then have lost its length offset,
     so the muscle counts as displaced after all.

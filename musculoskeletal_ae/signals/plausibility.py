@@ -85,7 +85,10 @@ class TemperatureCheck:
         self._last_at = math.nan
 
     def step(self, read: Array, now: float) -> Array:
-        """Process readings at `now` [s]; return the accepted temperatures [°C], (M,), or NaN."""
+        """Check the readings [°C] of all modules at `now` [s]; return accepted temperatures, (M,).
+
+        A temperature is NaN if its reading is impossible, or if none has been accepted yet.
+        """
         elapsed = max(now - self._last_at, 0.0) if math.isfinite(self._last_at) else 0.0
         self._last_at = now
         possible = (read >= LIMITS.lowest_temperature) & (read <= LIMITS.highest_temperature)
