@@ -3,8 +3,9 @@
 
 Paper (§IV-A). The figure shows the muscle length l against the shoulder pitch S-p from −120° to 30°
 at T = 0, and against the tension T from 0 to 500 N at θ = 0. Learning changes the lengths by up to
-40 mm, most of all those of muscles #2, #3 and #7. Some tension curves change from linear to
-strongly curved. The paper attributes this to wear of #2’s elastic unit and to high friction in #6.
+about 40 mm, most of all those of muscles #2, #3 and #7. After learning, the tension curves of some
+muscles are nearly linear, and others are strongly nonlinear. The paper explains this by a change of
+#2’s elastic unit, and by high friction in #6, whose nonlinearity vanishes.
 
 Here. The figures show l(θ) at T = 0 over −120…30° of the shoulder, and l(T) over 0…T_max at θ = 0.
 They compare the lengths that the networks of both presets predict, before and after learning, with

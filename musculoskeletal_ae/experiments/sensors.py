@@ -91,7 +91,7 @@ def sighted(learner: Learner) -> bool:
 
 
 def ellipsoid_share(mae: Mae, recording: Recording) -> float:
-    """Return the share of messages whose true θ lies within the 95 % confidence ellipsoid."""
+    """Return the share of messages whose true θ lies in the 95 % ellipsoid around the estimate."""
     assert mae.covariance is not None  # checked by the caller
     tension = end_tensions(mae, recording)
     error = mae.estimate(tension, recording.length).theta - recording.theta

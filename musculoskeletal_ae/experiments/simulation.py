@@ -56,7 +56,10 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motion:
-    """Let a network's simulator follow the commands of a recording, from the first posture on."""
+    """Let a network's simulator follow the commands of a recording, and return its motion.
+
+    The simulator starts in the first posture of the recording.
+    """
     simulated, rows = Simulation(robot, mae, preset), []
     simulated.start_from(recording.theta[:1])
     for command in recording.command:

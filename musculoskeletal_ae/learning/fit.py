@@ -177,7 +177,7 @@ class MuscleFit:
         return MusclePoint(parameters, (observed.length[:, m] - length)[:, None], jacobian)
 
     def weigh(self, point: MusclePoint) -> None:
-        """Compute noise and weights from the residuals at a point."""
+        """Compute the noise of the lengths and the robust weights from the residuals at a point."""
         self._noise, weight = noise_and_weight(
             point.residual, self._known, self._noise, self._determined, self._least_noise
         )
@@ -201,7 +201,7 @@ class MuscleFit:
         return RightSides.of_common(by_samples + by_prior)
 
     def moved(self, point: MusclePoint, step: Step) -> MusclePoint:
-        """Return the point after a step."""
+        """Return the parameters after a step of the solver, with residuals and derivatives."""
         return self.point(point.parameters + step.common)
 
 

@@ -59,7 +59,7 @@ class Publication:
 
 
 class CheckpointKeeper:
-    """Manages the network of one learner.
+    """Validates, stores and publishes the networks of one learner.
 
     Attributes:
         mae: The network in use; None before the first.

@@ -229,7 +229,7 @@ class Learner:
 
     @property
     def samples(self) -> SampleStore:
-        """The samples that are learned from."""
+        """The store of the samples from which the learner learns."""
         return self.collector.samples
 
     @property
@@ -358,7 +358,7 @@ class Learner:
             self.keeper.use(mae)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
-        """Mark a muscle as unknown in all but the last `newest` samples, and schedule an update.
+        """Record that only the last `newest` samples describe a muscle, and schedule an update.
 
         All messages of the healthy arm are discarded.
         """
@@ -446,7 +446,7 @@ class Learner:
 
     @property
     def last_update(self) -> Update | None:
-        """The last finished update, if any."""
+        """The last finished update; None before the first."""
         return self.scheduler.last_update
 
     @property

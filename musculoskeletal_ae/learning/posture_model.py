@@ -114,7 +114,7 @@ class PostureModel:
 
     @property
     def parameter_count(self) -> int:
-        """The size of w."""
+        """Number of parameters of all muscles of the group, which is the size of w."""
         return self.columns[-1].stop
 
     def residuals(self, at: Unknowns) -> Residuals:

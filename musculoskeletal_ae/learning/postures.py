@@ -189,11 +189,11 @@ class GroupFit:
             self.noise[m] = np.hypot(self.noise[m], np.sqrt(variance.mean()))
 
     def point(self, unknowns: Unknowns) -> Point:
-        """Return a point with its residuals."""
+        """Return these values of the unknowns with their residuals."""
         return Point(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: Point) -> None:
-        """Compute noise, robust weights and stops at a point."""
+        """Compute the length noise, the robust weights and the joints at their stops at a point."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise
@@ -303,7 +303,7 @@ class GroupFit:
         return unknowns.springs[:, self.model.sprung].ravel()
 
     def moved(self, point: Point, step: Step) -> Point:
-        """Return the point after a step."""
+        """Return the unknowns after a step of the solver, with their residuals."""
         theta, zero, parameters, springs = point.unknowns
         joints, size = self.model.joints, self.model.parameter_count
         after_zero, sprung = size + len(joints), self.model.sprung

@@ -124,5 +124,5 @@ class GroupPrior:
         )
 
     def deviation(self, parameters: list[Array]) -> Array:
-        """Return w̄ − w, (W,)."""
+        """Return the difference w̄ − w between the prior mean and given parameters, (W,)."""
         return self.mean - np.concatenate(parameters)

@@ -170,7 +170,7 @@ class SampleStore:
         return [*self.samples, *(each.sample for each in self.held)]
 
     def forget(self, muscle: int, newest: int = 0) -> None:
-        """Mark a muscle as unknown in all samples except the `newest` ones."""
+        """Record that only the last `newest` samples still describe a muscle."""
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
         for held in self.held:

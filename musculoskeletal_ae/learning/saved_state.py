@@ -149,7 +149,7 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
 
 
 def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
-    """Add the saved samples to an empty store, and hold back those that were held back.
+    """Add the saved samples to an empty store; those that were held back remain held back.
 
     The saved samples do not describe muscles that were added to the robot after the save.
     """
@@ -184,7 +184,7 @@ def _restored(saved: SavedSample, state: SavedState, robot: Robot) -> StoredSamp
 
 
 def restore_network(state: SavedState, robot: Robot) -> Mae | None:
-    """Return the saved network, if there is one.
+    """Return the saved network, or None if none was saved.
 
     Raises:
         StateError: If the saved network lacks muscles of the robot or is not a valid checkpoint.

@@ -24,7 +24,7 @@ class UpdateScheduler:
     Attributes:
         least_samples: Number of samples required for an update.
         updates: Number of finished updates.
-        last_update: The last finished update, if any.
+        last_update: The last finished update; None before the first.
         statistics_hold: Whether the detector's statistics are valid for the present arm. After a
             muscle has changed, they are invalid until the detector has been calibrated again.
     """

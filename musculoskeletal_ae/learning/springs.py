@@ -24,7 +24,7 @@ LARGEST_LOG = 2.0  # largest |α|
 
 
 def none_learned(joint_count: int) -> Array:
-    """Return the α and β of springs that have not been learned, which are 0, (2, D)."""
+    """Return the corrections α and β of springs that have not been learned: zeros, (2, D)."""
     return np.zeros((2, joint_count))
 
 

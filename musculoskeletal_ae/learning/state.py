@@ -101,7 +101,7 @@ class StateStore:
     # -- reading --------------------------------------------------------------------------------
 
     def load(self, samples: SampleStore) -> Mae | None:
-        """Load the saved samples into an empty store; return the saved network, if there is one.
+        """Load the saved samples into an empty store; return the saved network, or None.
 
         An unusable state is renamed to a backup, and the previous state is used. Only the samples
         are used if the saved network is unusable, or if muscles were added to the robot after the
@@ -208,7 +208,7 @@ class StateStore:
 
         Args:
             samples: The samples.
-            network: The network as the content of a checkpoint, if there is one.
+            network: The network as the content of a checkpoint, or None.
             reason: Why a saved network is not used, for `not_used`.
 
         Raises:

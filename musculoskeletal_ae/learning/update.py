@@ -59,7 +59,7 @@ def learned_steps(mae: Mae) -> int:
 
 
 class BodyUpdater(Updater):
-    """Fits the calibrated body, and trains the network on it."""
+    """Updater of preset `default`: fits the calibrated body, and trains the network on it."""
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Continue from a network, and from a body fitted to it if it has learned a real arm."""

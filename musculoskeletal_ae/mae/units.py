@@ -37,7 +37,10 @@ class State(NamedTuple):
 
 
 class Mask(Enum):
-    """The two of (θ, T, l) that enter the network: ①, ②, ③ (paper, §III-A)."""
+    """Selects the two quantities of (θ, T, l) that enter the network (paper, §III-A).
+
+    The paper numbers the masks ①, ② and ③ in this order.
+    """
 
     THETA_TENSION = (1, 1, 0)
     TENSION_LENGTH = (0, 1, 1)

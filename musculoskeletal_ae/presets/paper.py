@@ -75,7 +75,7 @@ class PaperPreset:
         return AnomalyNorm(robot, settings), []
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
-        """Return all four methods (§III-E)."""
+        """Return the paper's four control methods (§III-E)."""
         from musculoskeletal_ae.paper.control import METHODS
 
         return METHODS
