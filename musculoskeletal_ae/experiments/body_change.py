@@ -155,10 +155,10 @@ def _by_muscle(robot: Robot, change: Array) -> dict[str, float]:
 
 
 def nonlinearity(curve: Array) -> Array:
-    """Return how much each of M curves deviates from a straight line, (M,).
+    """Return how much the length curve of each muscle deviates from a straight line, (M,).
 
-    The deviation is the largest distance of the curve (points, M) from the straight line between
-    its ends, relative to the range of the curve.
+    `curve` [m] has the shape (points, M). The deviation is the largest distance of a curve from the
+    straight line between its ends, relative to the range of the curve.
     """
     share = np.linspace(0.0, 1.0, len(curve))[:, None]
     chord = curve[0] + share * (curve[-1] - curve[0])

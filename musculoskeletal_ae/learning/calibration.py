@@ -76,14 +76,15 @@ class Reservoir:
         capacity: int = CAPACITY,
         radian: Array | float = 1.0,
     ) -> None:
-        """Start empty.
+        """Create an empty reservoir.
 
         Args:
             muscles: Number of muscles.
             seed: Seed of the random selection.
             settings: Thresholds by which rests count as distinct.
             capacity: Largest number of messages.
-            radian: Displacement of each joint that counts as one radian [rad or m], (D,).
+            radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
+                counts as 1 rad, (D,).
         """
         self._rng = np.random.default_rng([seed, 0x4E])
         self._muscles, self._capacity = muscles, capacity
@@ -96,7 +97,7 @@ class Reservoir:
     def step(self, reading: Sample, dt: float) -> None:
         """Add a message to the selection with a probability that keeps the selection uniform.
 
-        Messages that come less than SPACING after the last considered one are ignored.
+        Only one message in SPACING [s] is considered; all others are ignored.
 
         Args:
             reading: The message, with NaN for unmeasured θ.

@@ -57,7 +57,8 @@ def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tupl
         read: Sensor readings at rest, (N, D); NaN where nothing was measured.
         lower: Lower limits, (D,).
         upper: Upper limits, (D,).
-        radian: Displacement of each joint that counts as one radian, (D,).
+        radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
+            counts as 1 rad, (D,).
     """
     theta, lower, upper = (read / radian).T, lower / radian, upper / radian
     apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)

@@ -121,7 +121,8 @@ class RestDetector:
         Args:
             settings: Thresholds for rest.
             blind: Whether the arm has no joint sensors.
-            radian: Displacement of each joint that counts as one radian [rad or m], (D,).
+            radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
+                counts as 1 rad, (D,).
         """
         self.settings, self.blind, self._radian = settings, blind, radian
         self._window = ReadingWindow()

@@ -126,12 +126,13 @@ class SampleStore:
         capacity: int = CAPACITY,
         radian: Array | float = 1.0,
     ) -> None:
-        """Start empty.
+        """Create an empty store.
 
         Args:
-            settings: Thresholds for new samples.
+            settings: Thresholds above which a sample differs from the stored ones.
             capacity: Largest number of samples.
-            radian: Displacement of each joint that counts as one radian [rad or m], (D,).
+            radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
+                counts as 1 rad, (D,).
         """
         self._settings, self._radian = settings, radian
         self.capacity = capacity

@@ -33,7 +33,8 @@ def prior_spread(nominal: JointElasticity, radian: Array) -> Array:
 
     Args:
         nominal: The springs that muscles.yaml states.
-        radian: Displacement of each joint that counts as one radian [rad or m], (D,).
+        radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
+            counts as 1 rad, (D,).
     """
     stiffness = np.diag(nominal.stiffness)
     return np.stack([np.full(len(stiffness), STIFFNESS_SPREAD), stiffness * REST_SPREAD * radian])
