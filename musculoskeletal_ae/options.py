@@ -43,12 +43,12 @@ def _type(
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """Return a type for whole numbers within [low, high]."""
+    """Return an argparse type that accepts whole numbers from `low` to `high`."""
     return _type(int, lambda value: low <= value <= high, f'{low} to {high}')
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """Return a type for numbers within [low, high]."""
+    """Return an argparse type that accepts numbers from `low` to `high`."""
     return _type(float, lambda value: low <= value <= high, f'{low:g} to {high:g}')
 
 
@@ -215,7 +215,10 @@ def _is_stdout_closed() -> bool:
 
 
 def _versions(out: Path | None) -> dict[Path, int]:
-    """Return the modification time of a file, or of each file in a directory [ns]."""
+    """Return the modification time [ns] of a file, or of each file in a directory.
+
+    The result is {} if `out` is None or cannot be read.
+    """
     if out is None:
         return {}
     with suppress(OSError):

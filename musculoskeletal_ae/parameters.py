@@ -67,7 +67,7 @@ class Parameter:
         return field(default=self.default, metadata={'parameter': self})
 
     def checked(self, value: Any) -> Any:
-        """Return a value if it is legal; a list becomes a tuple without empty names.
+        """Return a value if it is legal; a list is returned as a tuple, without empty names.
 
         The type and the range of a single number are not checked here, because ROS checks them.
 

@@ -3,9 +3,9 @@
 
 A sourced ROS may provide its own pinocchio (apt package ros-jazzy-pinocchio), compiled for NumPy 1.
 In a virtual environment with NumPy 2, the pinocchio of ROS crashes the process with a segmentation
-fault. Without this module it would be imported instead of the wheel: PYTHONPATH lists its bindings
-before those of the wheel, and LD_LIBRARY_PATH lists its libraries before the libraries of the
-wheel, which have the same names.
+fault. Without this module, Python would import the pinocchio of ROS instead of the wheel:
+PYTHONPATH lists its bindings before those of the wheel, and LD_LIBRARY_PATH lists its libraries
+before the libraries of the wheel, which have the same names.
 """
 
 import ctypes
@@ -27,8 +27,8 @@ LIBRARIES = (
 def prefer_wheel() -> None:
     """Make `import pinocchio` load the wheel with its own libraries.
 
-    Without the wheel this does nothing. The system's pinocchio is then imported and requires the
-    NumPy for which it was compiled.
+    If there is no wheel, the function does nothing. Python then imports the system's pinocchio,
+    which requires the NumPy for which it was compiled.
     """
     bindings = next((entry for entry in sys.path if _is_wheel(Path(entry))), None)
     if bindings is None:

@@ -78,6 +78,6 @@ def parse(value: str) -> tuple[Step, ...]:
 
 
 def table() -> str:
-    """Return the steps as a Markdown table."""
+    """Return all steps of remedies as a Markdown table."""
     rows = [f'| `{step.identifier}` | {step.text} |' for step in Step]
     return '\n'.join(['| identifier | step |', '|---|---|', *rows])

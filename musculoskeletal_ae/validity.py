@@ -195,7 +195,7 @@ def read_names(message: Any) -> list[str]:
 
 
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
-    """Return the link that carries the IMU and the acceleration [m/s²], (3,), of an Imu message.
+    """Return the link that carries an IMU, and the acceleration [m/s²], (3,), of an Imu message.
 
     The frame of the message names the link, after `prefix`.
     """
@@ -329,7 +329,10 @@ def read_twist(message: Any, frame: str) -> Array:
 
 
 def without_orientation(message: Any) -> bool:
-    """Return whether a PoseStamped commands only a position: its quaternion is then all zeros."""
+    """Return whether a PoseStamped commands only a position.
+
+    Its quaternion is then (0, 0, 0, 0).
+    """
     turn = message.pose.orientation
     return not any((turn.x, turn.y, turn.z, turn.w))
 

@@ -64,7 +64,15 @@ def fit(args: Namespace) -> None:
 
 
 def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array) -> SeriesElastic:
-    """Return the constants, each of shape (1,), that fit T [N], l_abs [m] and L_e [m], (N,) each.
+    """Fit the constants of a series elastic element to N rows of measurements.
+
+    Args:
+        tension: T [N], (N,).
+        absolute_length: l_abs [m], (N,).
+        elongation: L_e [m], (N,).
+
+    Returns:
+        The constants, each of shape (1,).
 
     Raises:
         ValueError: If there are fewer than four rows, if a number is not finite, or if the rows do

@@ -80,7 +80,7 @@ def _suggested(robot: Robot, args: Namespace) -> int:
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
-    """Return the part of the report on the shares of postures that are held and stiff enough."""
+    """Return the part of the report on how many postures are holdable and stiff enough."""
     count, held = len(result.setting.theta), result.held
     share = f'{100 * REQUIRED_SHARE:.0f} %'
     need = (

@@ -57,7 +57,7 @@ REST_SHARE = 0.02
 
 
 def with_buttons(text: str) -> str:
-    """Return a text in which buttons of the page replace the calls of their services."""
+    """Replace services that a text advises to call by the buttons of the page that call them."""
     for calls, button in BUTTONS.items():
         text = text.replace(calls, f'press "{button}"')
     return text
@@ -214,7 +214,7 @@ class Controls:
             self._ball.position = self._robot.kinematics.end_effector_pose(theta).translation
 
     def send_entries(self) -> None:
-        """Request the values that visitors have finished entering at sliders."""
+        """Send the requests for the values that visitors have finished entering at sliders."""
         for key, value in self._entries.take(monotonic()).items():
             (what, label), slider = key, self._sliders[key]
             if slider.min <= value <= slider.max:

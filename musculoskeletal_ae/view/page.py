@@ -163,7 +163,7 @@ class Page:
         return [dict(zip(columns, row)) for row in zip(*columns.values())]
 
     def with_buttons(self, text: str) -> str:
-        """Return a text in which buttons of the page replace the calls of their services."""
+        """Replace services that a text advises to call by the buttons of the page."""
         return text if self.controls is None else with_buttons(text)
 
     def notify(self, text: str, good: bool) -> None:
@@ -188,6 +188,6 @@ class Page:
             self.controls.follow(self.scene.posture.get('estimated'), payload, played)
 
     def send_entries(self) -> None:
-        """Request the values that visitors have finished entering; see `Controls`."""
+        """Send the requests for the values that visitors have finished entering; see `Controls`."""
         if self.controls is not None:
             self.controls.send_entries()

@@ -69,8 +69,8 @@ class History:
         """Return the curves since the last gap: times relative to now [s], then the values.
 
         `values` are the indices of the values to return. Rows in which the first of them is unknown
-        are left out. Others that are unknown are replaced by the first value of their row, so that
-        the first line hides them.
+        are left out. Other unknown values are replaced by the first value of their row, so that the
+        first line hides them.
         """
         table = np.array(self._rows)
         if not len(table):

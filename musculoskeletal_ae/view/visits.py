@@ -27,7 +27,7 @@ LOCAL = ('localhost', '127.0.0.1', '::1')
 
 
 class Visit(server.ServerConnection):
-    """A connection that drops messages which would change anything of a control but its value."""
+    """A connection on which a browser can change the value of a control, but nothing else of it."""
 
     async def recv(self, *arguments: Any, **options: Any) -> Any:
         """Return the next legal message of the browser."""
