@@ -316,7 +316,7 @@ class Attack:
         return True
 
     def call(self, kind: Any, service: str, request: Any = None) -> Any:
-        """Call a service; return its response, or None after the deadline."""
+        """Call a service; return its response, or None if no response arrives in time."""
         client, futures = self._client(kind, service), []
 
         def answered() -> bool:
@@ -562,7 +562,7 @@ def digest(message: Any) -> int:
 
 
 def filled(message: Any, rng: random.Random) -> Any:
-    """Fill a message's fields with extreme values of their types."""
+    """Fill a message's fields with extreme values of their types; return the message."""
     for name, kind in message.get_fields_and_field_types().items():
         base = kind.split('[')[0].removeprefix('sequence<').split(',')[0].removesuffix('>')
         count = None

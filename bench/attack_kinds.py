@@ -366,7 +366,7 @@ def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae
 
 
 def without(name: str, is_paused: bool) -> Callable[[Scene], None]:
-    """Return an attack that suspends the node `name`, or kills it if not `is_paused`."""
+    """Return an attack that suspends the node `name` if `is_paused`, and kills it otherwise."""
 
     def attack(scene: Scene) -> None:
         # The attack itself ends or suspends the process, which is no violation. `recover` restarts

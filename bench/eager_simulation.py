@@ -81,7 +81,7 @@ class EagerSimulation:
             self.limbs.append((*map(torch.as_tensor, (joints, muscles, pairs)), *tables))
 
     def step(self, h: float) -> ArmState:
-        """Simulate `h` [s], at most `simulation.LONGEST_STEP`."""
+        """Simulate the time `h` [s], at most `simulation.LONGEST_STEP`; return the new state."""
         body, (theta, tension, length, followed, _, slid) = self.body, self.state
         passed = torch.exp(-body.friction * slid)
         end = passed * tension

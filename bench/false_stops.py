@@ -63,14 +63,17 @@ AHEAD = 1.7e9
 
 
 class Message(NamedTuple):
-    """A message and when it was sent by the steady clock [s]."""
+    """A message, and the time on the steady clock at which it was sent [s]."""
 
     sent_at: float
     content: Any
 
 
 class Process:
-    """A simulated process that waits for the processor of a busy computer before it reads."""
+    """A simulated process of a busy computer.
+
+    It waits for the processor before it reads messages.
+    """
 
     def __init__(self, load: float, seed: list[int]) -> None:
         """Share the computer with `load` other processes, on average."""

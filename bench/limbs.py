@@ -204,7 +204,7 @@ class Body:
 
 
 def write_body(name: str, out: Path) -> Path:
-    """Write one of BODIES as a robot directory, and return it."""
+    """Write one of BODIES as a robot directory, and return the path of the directory."""
     body, arms = Body(out.name, find_robot('musashi_left_arm')), 0
     for limb in BODIES[name]:
         if limb == 'neck':

@@ -138,7 +138,7 @@ def can_exert(limits: reach.Limits, muscle_jacobian: MuscleJacobian, planned: Tr
 def exertable_path(study: Study, seed: int) -> list[Array]:
     """Return MOTIONS + 1 holdable postures (D,) that the arm can reach one after another.
 
-    Between two of them the arm moves from rest to rest, as far as its muscles are strong enough.
+    The muscles are strong enough to move the arm from each of them to the next, from rest to rest.
 
     Raises:
         MusculoskeletalError: If too few of the random postures qualify.

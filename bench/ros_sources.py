@@ -104,7 +104,7 @@ class Builder:
                 file.write_text(BUILD_PATHS.sub('', text), 'utf-8')
 
     def build(self, name: str, version: str) -> Path:
-        """Return a new wheel of a package."""
+        """Build a package, and return the path of its wheel."""
         print(f'-- {name} {version}', flush=True)
         tag, url = self.tag(name, version), RELEASES[name].url()
         stem = f'ros_{name}-{version}'

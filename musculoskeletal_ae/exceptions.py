@@ -70,8 +70,8 @@ class MessageError(MusculoskeletalError):
 class BagError(MusculoskeletalError):
     """A recording cannot be used as requested.
 
-    It is damaged, lacks what is needed, or does not fit the request. The text names the problem and
-    a remedy.
+    It is damaged, lacks required content, or does not fit the request. The text names the problem
+    and a remedy.
     """
 
     def __init__(self, file: Path, problem: str, remedy: str) -> None:

@@ -48,10 +48,11 @@ def _run_node(name: str) -> int:
 
 
 def _end_process(status: int) -> None:
-    """Exit without garbage collection; nodes, ROS context and child processes must have ended.
+    """End the process without garbage collection.
 
-    An ordinary exit would garbage-collect the objects of torch, numba and pinocchio. On a
-    busy machine that takes up to ten seconds, during which the node appears to hang.
+    The nodes, the ROS context and the child processes must have ended before. An ordinary exit
+    would garbage-collect the objects of torch, numba and pinocchio. On a busy machine that takes up
+    to ten seconds, during which the node appears to hang.
     """
     sys.stdout.flush()
     sys.stderr.flush()

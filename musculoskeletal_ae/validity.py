@@ -340,8 +340,7 @@ def without_orientation(message: Any) -> bool:
 def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
     """Return the pose of a PoseStamped, whose frame must be `frame`.
 
-    With `position_only`, the rotation in the message is ignored, and that of the result is the
-    identity.
+    With `position_only`, the rotation in the message is ignored, and the result has none.
     """
     if message.header.frame_id != frame:
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Late messages are dropped, and rejections are counted by reason; without a graph."""
+"""Late messages are dropped, and rejections are counted by reason. The tests need no graph."""
 
 import pytest
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for the validity and the order of messages, without a graph."""
+"""Rules for the validity and the order of messages. The tests need no graph."""
 
 import math
 

@@ -30,7 +30,10 @@ SPOOL_RADIUS = 0.012  # radius of the spools [m]
 
 
 class Hardware:
-    """An emulated hardware component: motors with encoders and torque sensors, joint sensors."""
+    """An emulated hardware component with motors and joint sensors.
+
+    Each motor has an encoder and a torque sensor.
+    """
 
     def __init__(self, robot: str) -> None:
         self.robot = Robot.load(robot)

@@ -107,7 +107,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
     """Write `model.xml` and `report.txt` of a learned body into a new or empty directory.
 
     Raises:
-        MusculoskeletalError: If the directory is in use, or MuJoCo does not load the model.
+        MusculoskeletalError: If the directory is not empty, or MuJoCo does not load the model.
     """
 
     def refuse(file: Path, problem: str) -> MusculoskeletalError:

@@ -243,12 +243,12 @@ def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.In
 
 
 def safe_name(text: str | None, fallback: str) -> str:
-    """Return a legal name for URDF and YAML, derived from the name in the source."""
+    """Return a legal name for URDF and YAML, made from `text`, or `fallback` if none remains."""
     return re.sub(r'[^\w.+-]+', '_', text or '').strip('_')[:100] or fallback
 
 
 def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return unique names, made by appending underscores to repeated or taken ones."""
+    """Return unique names, made by appending underscores to names that are repeated or taken."""
     result, used = [], {*taken}
     for name in names:
         while name in used:

@@ -83,7 +83,9 @@ def link_solids(robot: Robot) -> tuple[list[Solid], list[str]]:
 
 
 def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
-    """Return the mesh of a <mesh>: package://, file:// or relative to the robot's directory.
+    """Return the mesh that a <mesh> element of the URDF names.
+
+    The name begins with package:// or file://, or is a path relative to the robot's directory.
 
     Raises:
         RobotDescriptionError: If the file cannot be drawn.

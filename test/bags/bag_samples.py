@@ -112,7 +112,7 @@ def write_ours(
 def write_mcap(
     path: Path, content: list[Sample], with_definitions: bool = True, **options: Any
 ) -> None:
-    """Write an mcap file without a bag directory by the mcap library, as other recorders do."""
+    """Write a single file with the mcap library, as recorders of other projects do."""
     with path.open('wb') as file:
         writer = Writer(file, **({'chunk_size': 2000, 'enable_data_crcs': True} | options))
         writer.start(profile='ros2')
@@ -132,7 +132,7 @@ def write_mcap(
 def write_rosbags(
     path: Path, content: list[Sample], storage: StoragePlugin = StoragePlugin.MCAP
 ) -> None:
-    """Write a directory with the rosbags library, which computes no checksums."""
+    """Write a bag directory with the rosbags library, which computes no checksums."""
     with RosbagsWriter(path, version=9, storage_plugin=storage) as writer:
         connections: dict[str, Any] = {}
         for topic, kind, log_time, _, data in content:

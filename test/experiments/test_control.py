@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's control protocol on arm26 without mismatch: errors and tensions."""
+"""The paper's control protocol on an arm that equals its model: errors and tensions."""
 
 import numpy as np
 import pytest

@@ -98,5 +98,8 @@ def learned_once(arm26, initial, other_body):
 
 @pytest.fixture
 def learned(learned_once):
-    """Return a network that has learned from 20 samples, its updater, store and stage."""
+    """Return a network that has learned from 20 samples.
+
+    Its updater, the store of the samples, and the stage that generated them are returned as well.
+    """
     return copy.deepcopy(learned_once)
