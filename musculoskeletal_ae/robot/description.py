@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read and check a robot description: a directory with `robot.urdf` and `muscles.yaml`.
 
-All faults of the two files are detected here or by `muscle_file` and `urdf`, with the file, the
-entry and the legal values in the message. Later code relies on this.
+All faults of the two files are detected here or by `muscle_file` and `urdf`. The error message
+names the file, the entry and the legal values. Code that uses a description does not check it
+again.
 """
 
 import math
@@ -88,7 +89,7 @@ class Wrap(NamedTuple):
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:
-    """Return an item of a route in the format of muscles.yaml."""
+    """Return a via point or wrap object as the entry of a route in muscles.yaml."""
     entry = {key: value for key, value in item._asdict().items() if value is not None}
     entry = {k: v if isinstance(v, str) else np.round(v, 10).tolist() for k, v in entry.items()}
     if isinstance(item, Wrap):
@@ -148,18 +149,18 @@ class RobotDescription:
 
     @property
     def end_effector(self) -> str:
-        """The link for poses, external wrenches and the marker."""
+        """The link to which poses, external wrenches and the marker refer."""
         return self.end_effectors[0]
 
     @property
     def held_joints(self) -> tuple[str, ...]:
-        """Movable joints of the URDF that are held fixed: all that are neither in θ nor coupled."""
+        """Movable joints of the URDF that are held fixed, as they are neither in θ nor coupled."""
         known = {*self.couplings, *self.joints}
         return tuple(name for name in self.model.names[1:] if name not in known)
 
     @property
     def joint_notes(self) -> list[str]:
-        """Lines about coupled joints, the kind of muscle modules, and joints held fixed."""
+        """Texts for users on coupled joints, the kind of muscle modules, and joints held fixed."""
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if self.actuation == POSITION:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
@@ -185,7 +186,7 @@ class RobotDescription:
 
 
 def refusal(file: Path, problem: str) -> RobotDescriptionError:
-    """Return the error for a file of a robot directory that cannot be read."""
+    """Return an error which states that a file of a robot directory cannot be read, and why."""
     remedy = 'a robot directory contains robot.urdf and muscles.yaml'
     return RobotDescriptionError(f'{file}: {problem}; {remedy}')
 
@@ -257,7 +258,7 @@ def _with_muscle_name(problem: str, document: Any) -> str:
 
 
 def _entries(entry: Strict | None) -> dict[str, float]:
-    """Return the values of the keys that an entry of the file contains."""
+    """Return the numbers that an entry of muscles.yaml states, by key; {} if it is omitted."""
     entries: dict[str, float] = {} if entry is None else to_builtins(entry)
     return entries
 
@@ -279,7 +280,10 @@ def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
 
 
 def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None:
-    """Raise an error for joints that cannot be in θ."""
+    """Raise an error if a joint in `joints` of muscles.yaml is not legal.
+
+    It has to be a revolute or prismatic joint of robot.urdf with finite limits.
+    """
     for i, name in enumerate(joints):
         if problem := _joint_problem(name, model):
             raise fail(f'$.joints[{i}]: {problem}')
@@ -294,7 +298,7 @@ def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None
 
 
 def _joint_problem(name: str, model: pin.Model) -> str:
-    """Return why a joint can neither be in θ nor be coupled to a joint in θ, or ''."""
+    """Return why a joint can be used neither in `joints` nor in a coupling, or '' if it can."""
     movable = list(model.names)[1:]
     if name not in movable:
         return f'unknown joint {name!r}; movable joints of robot.urdf: {", ".join(movable)}'
@@ -309,7 +313,18 @@ def _joint_problem(name: str, model: pin.Model) -> str:
 def _read_couplings(
     content: MuscleFile, mimics: dict[str, Coupling], model: pin.Model, urdf: Path, fail: Fail
 ) -> dict[str, Coupling]:
-    """Return the coupling of each coupled joint to a master that follows no other joint."""
+    """Return the coupling of each coupled joint, by its name.
+
+    Couplings come from muscles.yaml and from <mimic> elements of robot.urdf. If a master follows
+    another joint itself, its coupling is replaced by one to that joint.
+
+    Args:
+        content: The content of muscles.yaml.
+        mimics: The couplings of robot.urdf.
+        model: The pinocchio model of robot.urdf.
+        urdf: Path of robot.urdf, for messages.
+        fail: Function that returns the error for a problem in muscles.yaml.
+    """
     listed = {
         c.joint: Coupling.of_terms(c.master, c.polynomial or (c.offset, c.ratio))
         for c in content.couplings
@@ -454,7 +469,10 @@ def _read_end_effectors(
     order: list[str],
     fail: Fail,
 ) -> tuple[str, ...]:
-    """Return the end effectors in muscles.yaml, by default the link that most joints move."""
+    """Return the links that muscles.yaml names as end effectors.
+
+    If it names none, return the link that the largest number of joints move.
+    """
     links = _joints_above(model, {*content.joints})
     moved = _joints_above(model, {*content.joints, *couplings})
     places = {f'$.end_effectors[{i}]': n for i, n in enumerate(content.end_effectors or ())}

@@ -32,7 +32,10 @@ class Line(NamedTuple):
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:
-    """Return (T − T_bias) / (T_limit − T_bias), clipped to [0, 1], for T [N] (M,); 0 for NaN."""
+    """Return where each tension [N] lies between T_bias (0) and T_limit (1), (M,).
+
+    Values beyond this range are clipped. An unknown tension (NaN) gives 0.
+    """
     limits = robot.tension
     known = np.nan_to_num(tension)
     return np.clip((known - limits.bias) / (limits.limit - limits.bias), 0.0, 1.0)
@@ -43,12 +46,13 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
     Args:
         robot: The geometric model.
-        theta: θ [rad], (D,).
-        tension: T [N], (M,), which determines the colours.
-        points: Route points [m], (P, 3); by default those of the geometric model.
+        theta: Joint angles [rad], (D,).
+        tension: Tensions [N], (M,), which determine the colours.
+        points: Route points in the root link's frame [m], (P, 3); by default those of the geometric
+            model.
 
     Returns:
-        One line for each bone longer than SHORTEST_BONE and for each branch of a tendon.
+        One line for each bone longer than 1 mm, and for each branch of a tendon.
     """
     kin = robot.kinematics
     origins = kin.tree.joint_poses(theta[None]).translation[0]
@@ -71,7 +75,10 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
 
 def _within(line: Line, middle: Array, reach: float) -> Line:
-    """Return the part of a bone inside the cube `middle` ± `reach` [m]; muscles are unchanged."""
+    """Return the part of a bone inside the cube `middle` ± `reach` [m]; without points if outside.
+
+    The line of a muscle is returned unchanged.
+    """
     if line.kind != 'bones':
         return line
     start, end = line.points[[0, -1]]

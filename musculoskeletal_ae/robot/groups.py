@@ -11,7 +11,7 @@ from musculoskeletal_ae.arrays import Bools, Ints
 
 
 class Group(NamedTuple):
-    """Joints and muscles that are independent of all others, such as a limb."""
+    """Joints and the muscles that cross them, such as a limb; no muscle crosses two groups."""
 
     joints: tuple[int, ...]  # indices in θ
     muscles: tuple[int, ...]  # indices in T and l
@@ -22,13 +22,21 @@ class Group(NamedTuple):
         return cls(tuple(range(joints)), tuple(range(muscles)))
 
     def columns(self, joints: int, muscles: int) -> Ints:
-        """Return the indices of the group's entries in the vector (θ, T, l) of the whole body."""
+        """Return the indices of the group's entries in the vector (θ, T, l) of the whole body.
+
+        Args:
+            joints: Number of joints of the whole body.
+            muscles: Number of muscles of the whole body.
+        """
         own = joints + np.array(self.muscles)
         return np.concatenate([self.joints, own, muscles + own])
 
 
 def groups(crossed: Bools) -> tuple[Group, ...]:
-    """Return the groups: connected components of the graph of muscles and joints.
+    """Divide the joints and muscles of a body into independent groups.
+
+    A group is a connected component of the graph in which a muscle links the joints that it
+    crosses.
 
     A muscle that crosses no joint is assigned to the first joint. A joint without muscles is
     assigned to the first group.

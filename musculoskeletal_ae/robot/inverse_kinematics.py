@@ -3,11 +3,15 @@
 
     θ = IK(P_marker, θ_initial = θ_est):  min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R²
 
-(paper, §II-A) within the joint limits, by damped least squares (Levenberg–Marquardt) with
-pinocchio's Jacobian. Near a singular posture the pose determines some joints poorly, and camera
-noise would move them arbitrarily. Every step is therefore damped, and the search ends when a step
-reduces the sum by less than `LEAST_GAIN`, a change that noise alone can cause. A robot without
-joint sensors learns online from the resulting θ.
+(paper, §II-A) within the joint limits. p and R are the measured position and orientation of the end
+effector, p(θ) and R(θ) those at the joint angles θ, and σ_p and σ_R the standard deviations of the
+measurement. The sum is minimised by damped least squares (Levenberg–Marquardt) with pinocchio's
+Jacobian.
+
+Near a singular posture the pose determines some joints poorly, and camera noise would move them
+arbitrarily. Every step is therefore damped, and the search ends when a step reduces the sum by less
+than `LEAST_GAIN`, a change that noise alone can cause. A robot without joint sensors learns online
+from the resulting θ.
 """
 
 from typing import NamedTuple
@@ -47,8 +51,8 @@ def inverse_kinematics(
     Args:
         robot: The geometric model.
         pose: The pose in the root link's frame.
-        start: θ_est [rad], (D,), at which the search starts.
-        spreads: Standard deviations of the pose, σ_p [m] and σ_R [rad], (6,).
+        start: Joint angles at which the search starts [rad], (D,).
+        spreads: Standard deviations of the measured position [m] and orientation [rad], (6,).
     """
     kin, lower, upper = robot.kinematics, robot.lower, robot.upper
     theta, damping = np.clip(start, lower, upper), 1e-2
@@ -79,7 +83,14 @@ def inverse_kinematics(
 
 
 def _error(robot: Robot, pose: pin.SE3, theta: Array, spreads: Array) -> Array:
-    """Return the errors of position and orientation at θ, divided by `spreads`, (6,)."""
+    """Return the errors of the end effector's position and orientation in a posture, (6,).
+
+    Args:
+        robot: The geometric model.
+        pose: The pose to reach, in the root link's frame.
+        theta: Joint angles [rad], (D,).
+        spreads: Values [m] and [rad] by which the errors are divided, (6,).
+    """
     here = robot.kinematics.end_effector_pose(theta)
     turn = here.rotation @ pin.log3(here.rotation.T @ pose.rotation)
     error: Array = np.concatenate([pose.translation - here.translation, turn]) / spreads

@@ -3,9 +3,11 @@
 
     τ_passive = −K (θ − θ_0) − diag(d) θ̇ = b − K θ − diag(d) θ̇,    b = K θ_0
 
-K is symmetric. An off-diagonal entry couples two joints, like a ligament or a soft link that
-both of them bend. K has no negative eigenvalue, because passive parts only store energy. The
-muscles therefore have to exert g(θ) + K θ − b to hold a posture (`Kinematics.holding_torque`).
+K is the stiffness matrix, d the damping of each joint, and θ_0 the posture in which the springs are
+at rest. K is symmetric. An off-diagonal entry couples two joints, like a ligament or a soft link
+that spans both joints. K has no negative eigenvalue, because passive parts only store energy. To
+hold a posture, the muscles have to exert the torque g(θ) + K θ − b, where g(θ) holds the weight
+(`Kinematics.holding_torque`).
 """
 
 from __future__ import annotations
@@ -49,12 +51,16 @@ class JointElasticity:
         return rest
 
     def holding_torque(self, theta: Array) -> Array:
-        """Return K θ − b [N·m], the torque that holds the joints at θ (..., D) against springs."""
+        """Return the torque K θ − b that holds the joints against their springs [N·m], (..., D).
+
+        Args:
+            theta: Joint angles θ [rad], (..., D).
+        """
         torque: Array = theta @ self.stiffness - self.preload
         return torque
 
     def deviating(self, factor: Array, shift: Array) -> JointElasticity:
-        """Return a copy in which the springs of the joints deviate.
+        """Return a copy whose springs deviate in stiffness and in the posture where they rest.
 
         Args:
             factor: Factor of the stiffness of each joint, (D,).
@@ -65,6 +71,6 @@ class JointElasticity:
         return JointElasticity(stiffness, stiffness @ (self.rest + shift), self.damping)
 
     def of_joints(self, joints: Ints) -> JointElasticity:
-        """Return the elasticity of the joints in `joints`, while all others are held at 0."""
+        """Return the elasticity of some joints (indices), while all other joints are held at 0."""
         rows = np.ix_(joints, joints)
         return JointElasticity(self.stiffness[rows], self.preload[joints], self.damping[joints])

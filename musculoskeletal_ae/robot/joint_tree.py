@@ -5,12 +5,14 @@ The pose of a revolute joint in its parent is its fixed placement times (Rodrigu
 
     exp([a]ₓ θ) = 1 + sin θ [a]ₓ + (1 − cos θ) [a]ₓ²
 
-and the pose of a prismatic joint is its fixed placement times the translation θ a. Both are sums of
-constant matrices with scalar factors, so that all joints are computed by the same operation.
+where a is the joint axis. The pose of a prismatic joint is its fixed placement times the
+translation θ a. Both are sums of constant matrices with scalar factors, so that all joints are
+computed by the same operation.
 
-The position of a coupled joint is a polynomial of its master, q = Σ c_k θ_masterᵏ, usually a linear
-one. With A(θ) = ∂q/∂θ, pinocchio's gravity g, inertia M and Jacobian J of all joints of the tree
-become Aᵀ g, Aᵀ M A and J A for θ.
+The position q of a coupled joint is a polynomial of the position of its master, Σ c_k θ_masterᵏ,
+which is usually linear. θ are the positions of the joints that are not coupled, and q those of all
+joints of the tree. With A(θ) = ∂q/∂θ, pinocchio's gravity g, inertia M and Jacobian J with respect
+to q become Aᵀ g, Aᵀ M A and J A with respect to θ.
 """
 
 from __future__ import annotations
@@ -28,7 +30,10 @@ PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismati
 
 
 class JointPoses(NamedTuple):
-    """Poses of pinocchio's joints in the root link's frame for N postures; index 0 is that link."""
+    """Poses of pinocchio's joints in the root link's frame in N postures.
+
+    Index 0 along the axis of J joints is the root link itself.
+    """
 
     rotation: Array  # rotation matrices, (N, J, 3, 3)
     translation: Array  # joint origins [m], (N, J, 3)
@@ -73,7 +78,7 @@ class Coupling(NamedTuple):
 
 
 def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
-    """Return chained couplings as direct ones, whose masters are not coupled themselves.
+    """Replace chained couplings by direct couplings, whose masters are not coupled themselves.
 
     Raises:
         ValueError: If a joint follows itself, or if a polynomial has too many terms.
@@ -96,7 +101,10 @@ def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:
 
 
 def polyval(x: Array, terms: Array) -> Array:
-    """Return Σ c_k xᵏ by Horner's rule; the last axis of `terms` holds c_k, the constant first."""
+    """Evaluate polynomials at x by Horner's rule.
+
+    The last axis of `terms` holds the coefficients of each polynomial, the constant first.
+    """
     result = np.broadcast_to(terms[..., -1], x.shape)
     for k in range(terms.shape[-1] - 2, -1, -1):
         result = result * x + terms[..., k]
@@ -104,7 +112,10 @@ def polyval(x: Array, terms: Array) -> Array:
 
 
 def derivative(terms: Array) -> Array:
-    """Return the coefficients (..., K) of the derivatives of polynomials; the last one is 0."""
+    """Return the coefficients of the derivatives of polynomials, the constant first, (..., K).
+
+    There are as many coefficients as in `terms`, so the last coefficient is 0.
+    """
     result = np.zeros_like(terms)
     result[..., :-1] = terms[..., 1:] * np.arange(1, terms.shape[-1])
     return result
@@ -210,29 +221,52 @@ class JointTree:
         return JointPoses(rotation, poses[..., :3, 3], axis)
 
     def angles(self, theta: Array) -> Array:
-        """Return q (..., J−1) of the tree's joints in pinocchio's order at θ (..., D)."""
+        """Return the positions of all joints of the tree, including coupled joints, (..., J−1).
+
+        Args:
+            theta: θ [rad] or [m], (..., D).
+
+        Returns:
+            The positions [rad] or [m] in pinocchio's order, without the root link.
+        """
         q: Array = theta[..., self.theta_index[1:]]
         return polyval(q, self.terms[1:]) if self.is_coupled else q
 
     def ratios(self, theta: Array) -> Array:
-        """Return dq/dθ (..., J−1) of each joint of the tree at θ (..., D)."""
+        """Return the speed of each joint of the tree relative to that of its master, (..., J−1).
+
+        For a joint that is not coupled, the ratio is 1. `theta` is θ [rad] or [m], (..., D).
+        """
         return polyval(theta[..., self.theta_index[1:]], derivative(self.terms[1:]))
 
     def curvatures(self, theta: Array) -> Array:
-        """Return d²q/dθ² (..., J−1) of each joint of the tree at θ (..., D)."""
+        """Return the second derivative of each joint's position with respect to its master's.
+
+        Args:
+            theta: θ [rad] or [m], (..., D).
+
+        Returns:
+            One value for each joint of the tree, (..., J−1); 0 unless its coupling is nonlinear.
+        """
         terms = derivative(derivative(self.terms[1:]))
         return polyval(theta[..., self.theta_index[1:]], terms)
 
     def transmission(self, theta: Array) -> Array:
-        """Return A = ∂q/∂θ at θ (D,), with one row for each joint of the tree, (J−1, D)."""
+        """Return the derivative of all joint positions q of the tree with respect to θ, (J−1, D).
+
+        `theta` is θ [rad] or [m], (D,).
+        """
         return self.ratios(theta)[:, None] * self.moved_by
 
     def of_theta(self, values: Array, theta: Array) -> Array:
-        """Return Aᵀ v for torques or derivatives v of all joints of the tree with respect to q.
+        """Convert torques or derivatives of all joints of the tree into those of the joints of θ.
+
+        The values are multiplied by the transpose of ∂q/∂θ, so that each joint of θ also gets those
+        of the joints that are coupled to it.
 
         Args:
-            values: v, (*N, ..., J−1).
-            theta: θ, (*N, D).
+            values: One value for each joint of the tree, (*N, ..., J−1).
+            theta: θ [rad] or [m], (*N, D).
 
         Returns:
             Torques or derivatives with respect to θ, (*N, ..., D).
@@ -246,7 +280,14 @@ class JointTree:
         return (values * ratios) @ self.moved_by
 
     def of_both(self, matrix: Array, theta: Array) -> Array:
-        """Return Aᵀ B A (D, D) for a matrix B (J−1, J−1), at θ (D,)."""
+        """Convert a matrix of the tree's joints, such as an inertia, to the joints of θ, (D, D).
+
+        The result is Aᵀ B A with A = ∂q/∂θ.
+
+        Args:
+            matrix: The matrix B, (J−1, J−1).
+            theta: θ [rad] or [m], (D,).
+        """
         if not self.is_coupled:
             return self.of_theta(self.of_theta(matrix, theta).T, theta).T
         transmission = self.transmission(theta)

@@ -25,7 +25,7 @@ MOST_DRAWS = 50
 
 
 def jumps(lengths: Callable[[Array], Array], lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the largest jump of each length [m] (M,), and the θ [rad] (M, D) where it occurs.
+    """Return the largest jump of each length [m], (M,), and where it occurs: θ [rad], (M, D).
 
     Args:
         lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
@@ -41,6 +41,8 @@ def _second_differences(
 ) -> tuple[Array, Array]:
     """Return absolute second differences of lengths along random lines in joint space.
 
+    They are small where a length is smooth, and large where it jumps.
+
     Returns:
         The differences [m], (N, M), and the posture in the middle of each [rad], (N, D).
     """
@@ -53,7 +55,7 @@ def _second_differences(
 
 
 def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
-    """Return a mask (M,) of the lengths that jump somewhere within the joint limits.
+    """Return which lengths jump somewhere within the joint limits, (M,).
 
     Args:
         lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
@@ -63,7 +65,11 @@ def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
 
 
 def jumping_muscles(robot: Robot) -> list[tuple[int, float, Array]]:
-    """Return (index, largest jump [m], θ (D,) of this jump) of each muscle whose length jumps."""
+    """Find the muscles whose length jumps somewhere within the joint limits.
+
+    Returns:
+        For each of them, the index, the largest jump [m], and the posture of this jump [rad], (D,).
+    """
     if robot.routes.objects is None:
         return []
     largest, where = jumps(robot.routes.absolute_lengths, robot.lower, robot.upper)
@@ -82,7 +88,7 @@ def jump_warning(robot: Robot) -> str:
 
 
 def jump_choices(robot: Robot) -> list[str]:
-    """Return lines on each muscle whose length jumps: where it jumps, and possible remedies."""
+    """Return texts on each muscle whose length jumps: where it jumps, and possible remedies."""
     if robot.routes.objects is None:
         return []
     bends, theta = _second_differences(robot.routes.absolute_lengths, robot.lower, robot.upper)
@@ -113,7 +119,9 @@ def jump_choices(robot: Robot) -> list[str]:
 
 
 def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Return, as text, limits of one joint that exclude the jumps and keep the largest range.
+    """Suggest new limits of one joint that exclude all postures in which a length jumps.
+
+    Of all joints, the one is chosen that keeps the largest share of its range.
 
     Args:
         robot: The geometric model.
@@ -121,7 +129,8 @@ def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
         crossed: Indices of the joints that may be limited.
 
     Returns:
-        The name of the joint and its new limits; '' if less than LEAST_RANGE would remain.
+        A text with the name of the joint and its new limits; '' if each joint would keep less than
+        30 % of its range.
     """
     best, text = LEAST_RANGE, ''
     for j in crossed:

@@ -2,8 +2,8 @@
 """Rigid-body kinematics and dynamics of the arm, with θ in the order of muscles.yaml.
 
 Pinocchio reads the URDF and computes link poses, gravity, inertia and Jacobians of single postures.
-Training, learning and the view need the poses of thousands of postures; `joint_tree.py`
-computes these from the same placements. A test compares the two.
+Training, learning and the view need the poses of thousands of postures, which `joint_tree.py`
+computes from the same placements. A test checks that pinocchio and `joint_tree.py` agree.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RACK = 0.06
 
 
 class Units(NamedTuple):
-    """Units of a joint's θ, torque and stiffness."""
+    """Units of a joint's position, torque and stiffness."""
 
     theta: str
     torque: str
@@ -47,10 +47,15 @@ def link_placement(model: pin.Model, link: str) -> tuple[int, pin.SE3]:
 
 
 def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
-    """Return a copy of the model in which the joints in `locked` are fixed at a configuration q.
+    """Return a copy of the model in which the joints in `locked` are fixed.
 
     A link may have the name of a joint, or be called 'universe'. `buildReducedModel` looks frames
     up by name and would reject or confuse such frames, so all frames get unique names meanwhile.
+
+    Args:
+        model: The model.
+        locked: Indices of the joints to fix.
+        at: Positions of all joints, at which these joints are fixed.
     """
     named, names = model.copy(), dict[str, str]()
     for i, frame in enumerate(named.frames):
@@ -64,9 +69,9 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
 
 
 def joint_space_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
-    """Return the joint-space inertia [kg·m² or kg] of the tree's joints at q.
+    """Return the joint-space inertia [kg·m² or kg] of all joints of the tree, (J−1, J−1).
 
-    Its shape is (J−1, J−1), because J counts the root link as joint 0 (`JointTree`).
+    J counts the root link as joint 0 (`JointTree`). `q` are the positions of the joints, (J−1,).
     """
     # Add the lower triangle, which pinocchio does not fill.
     upper = np.triu(pin.crba(model, data, q))
@@ -147,9 +152,17 @@ class Kinematics:
         return changed
 
     def holding_torque(self, theta: Array) -> Array:
-        """Return the torque that holds the arm at θ (..., D) against its weight and its springs.
+        """Return the torque that holds the arm against its weight and its springs.
 
-        g(θ) + K θ − b    [N·m], (..., D)
+            g(θ) + K θ − b
+
+        g(θ) holds the weight, and K θ − b the springs of the joints (`JointElasticity`).
+
+        Args:
+            theta: Joint angles θ [rad], (..., D).
+
+        Returns:
+            The torque [N·m], (..., D).
         """
         weight = self.weight_torque(theta)
         if not self.elasticity.is_present:
@@ -157,20 +170,31 @@ class Kinematics:
         return weight + self.elasticity.holding_torque(theta)
 
     def weight_torque(self, theta: Array) -> Array:
-        """Return g(θ) [N·m] (..., D), the torque that holds the arm's weight at θ (..., D)."""
+        """Return the torque that holds the weight of the arm [N·m], (..., D), at θ (..., D)."""
         if theta.ndim > 1:
             return np.stack([self.weight_torque(row) for row in theta])
         return self.tree.of_theta(self._gravity(theta), theta)
 
     def _gravity(self, theta: Array) -> Array:
-        """Return the torque [N·m] (J−1,) of the tree's joints that holds the weight at θ (D,)."""
+        """Return the torque of every joint of the tree that holds the weight [N·m], (J−1,).
+
+        `theta` are the joint angles θ [rad], (D,), from which those of coupled joints follow.
+        """
         q = self.tree.angles(theta)
         return np.array(pin.computeGeneralizedGravity(self.model, self.data, q))
 
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
-        """Return the joint torque of a motion, including the torque of springs and dampers.
+        """Return the joint torque that a motion requires [N·m], (D,).
 
-        M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇    [N·m], (D,)
+            M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇
+
+        M is the inertia, and h the torque of weight and velocity. The other terms are those of the
+        springs and dampers of the joints (`JointElasticity`).
+
+        Args:
+            theta: Joint angles θ [rad], (D,).
+            velocity: θ̇ [rad/s], (D,).
+            acceleration: θ̈ [rad/s²], (D,).
         """
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
         if tree.is_coupled:
@@ -184,7 +208,10 @@ class Kinematics:
         return result
 
     def holding_gradient(self, theta: Array) -> Array:
-        """Return ∂g/∂θ + K [N·m/rad] (D, D), the gradient of `holding_torque` at θ (D,)."""
+        """Return the derivative of `holding_torque` with respect to θ [N·m/rad], (D, D), at θ (D,).
+
+        It is the sum of the derivative of the weight's torque and the stiffness of the springs.
+        """
         tree, q = self.tree, self.tree.angles(theta)
         gradient = pin.computeGeneralizedGravityDerivatives(self.model, self.data, q)
         result = tree.of_both(gradient, theta)
@@ -194,19 +221,22 @@ class Kinematics:
         return result + self.elasticity.stiffness
 
     def joint_inertia(self, theta: Array) -> Array:
-        """Return the inertia [kg·m² or kg] (D,) that each joint moves while all others are held.
+        """Return the inertia that each joint moves while all other joints are held, (D,).
 
         Args:
-            theta: θ [rad], (D,).
+            theta: Joint angles [rad], (D,).
+
+        Returns:
+            The inertia [kg·m²], for prismatic joints the mass [kg].
         """
         inertia = joint_space_inertia(self.model, self.data, self.tree.angles(theta))
         return np.diag(self.tree.of_both(inertia, theta))
 
     def end_effector_jacobian(self, theta: Array) -> Array:
-        """Return J (6, D) of the end effector's origin at θ (D,), in root-link axes.
+        """Return the Jacobian J of the end effector's origin, in the axes of the root link, (6, D).
 
-        The first three rows are linear [m/rad], the others angular [rad/rad]. A wrench F at that
-        point produces the joint torque Jᵀ F.
+        The first three rows are linear [m/rad], the last three angular [rad/rad]. A wrench F on the
+        origin produces the joint torque Jᵀ F. `theta` are the joint angles [rad], (D,).
         """
         axes, tree = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, self.tree
         q, frame = tree.angles(theta), self.end_effector_frame

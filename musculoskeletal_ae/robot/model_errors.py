@@ -3,12 +3,12 @@
 
 A real tendon is attached some millimetres beside the route points of the model, and does not run
 straight between them. At θ = 0, attachments cause no error, because lengths are relative to that
-posture. The variance of the error of a length is
+posture. The variance of the error of a length in the posture θ is
 
     s² = SHAPE_FACTOR² (SMOOTH² + ATTACHMENT² Σ over the route points of ‖∂f/∂p(θ) − ∂f/∂p(0)‖²)
 
-where f is the length of the route and p a route point in the frame of its joint. Errors of
-different muscles are independent.
+where f is the length of the route and p a route point in the frame of its joint. The names in
+capitals are constants of this file. Errors of different muscles are independent.
 """
 
 import numpy as np
@@ -28,7 +28,10 @@ SHAPE_FACTOR = 1.7
 
 
 def length_variances(robot: Robot, theta: Array) -> Array:
-    """Return s² [m²] of every muscle, (N, M), at θ (N, D)."""
+    """Return the variance of each muscle's length error in the geometric model [m²], (N, M).
+
+    `theta` are the joint angles in N postures [rad], (N, D).
+    """
     routes, tree = robot.routes, robot.kinematics.tree
     slopes = routes.moved(tree.joint_poses(theta), routes.point)[1]
     at_zero = routes.moved(tree.joint_poses(np.zeros_like(theta[:1])), routes.point)[1]

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The format of muscles.yaml (doc/reference/file_formats.md describes it for users).
 
-`description` then checks what depends on robot.urdf or on the values of several muscles.
+This module checks each entry on its own. `description.py` then checks what depends on robot.urdf or
+on the values of several muscles.
 """
 
 from collections import Counter
@@ -104,7 +105,7 @@ class RouteEntry(Strict, frozen=True):
 
 
 class MuscleEntry(Strict, frozen=True):
-    """A muscle; for omitted keys the values for all muscles apply."""
+    """A muscle. Omitted keys have the values that the file states for all muscles."""
 
     name: Name
     route: Annotated[tuple[RouteEntry, ...], Meta(min_length=2, max_length=LONGEST_LIST)]
@@ -146,7 +147,7 @@ class CouplingEntry(Strict, frozen=True):
     )
 
     def __post_init__(self) -> None:
-        """Check that only one of the two forms is used."""
+        """Check that the entry does not state both a polynomial and a ratio or offset."""
         if self.polynomial is not None and (self.ratio, self.offset) != (1.0, 0.0):
             raise ValueError('expected polynomial, or ratio and offset, got both')
 
@@ -185,7 +186,7 @@ class MuscleFile(Strict, frozen=True):
     ] = ()
 
     def __post_init__(self) -> None:
-        """Check that names are unique, and that no two keys exclude each other."""
+        """Check that names are unique, and that the file has no keys that exclude each other."""
         _check_unique('joints', self.joints)
         _check_unique('muscles', (muscle.name for muscle in self.muscles))
         _check_unique('end_effectors', self.end_effectors or ())
@@ -196,7 +197,7 @@ class MuscleFile(Strict, frozen=True):
         self._check_actuation()
 
     def _check_drives(self) -> None:
-        """Check that motors are described if their currents are measured, and only then."""
+        """Check that the file describes motors (`drive`) exactly if motor currents are measured."""
         owners = [each.name for each in self.muscles if each.drive is not None]
         if self.tension_source == 'current':
             if self.drive is None and len(owners) < len(self.muscles):
@@ -211,7 +212,7 @@ class MuscleFile(Strict, frozen=True):
             )
 
     def _check_actuation(self) -> None:
-        """Check that no key belongs to the other kind of actuation."""
+        """Check that the file has no key of the kind of muscle modules that it does not select."""
         is_position = self.actuation == 'position'
         if self.tension_source != 'sensor' and not is_position:
             raise ValueError(

@@ -2,10 +2,13 @@
 """Find remedies for an arm that is not holdable or not stiff, by testing each of them.
 
 The postures of the check are evaluated again with other values in muscles.yaml, less mass, longer
-moment arms or narrower limits. If a change is sufficient alone, its smallest sufficient step is
-suggested. Otherwise all changes that help are suggested, and then a combination. The search for the
-combination starts with all changes at their largest steps. It sets each change in turn, the
-costliest first, to its best step, and afterwards to the smallest step that is as good.
+moment arms or narrower limits. Each of these changes has several steps. If a change is sufficient
+alone, its smallest sufficient step is suggested. Otherwise all changes that help are suggested, and
+then a combination of changes.
+
+The search for the combination starts with the largest step of every change. It goes through the
+changes twice, beginning with the costliest one. The first time it sets each change to its best
+step, the second time to the smallest step that gives the same result.
 """
 
 from copy import copy
@@ -35,18 +38,27 @@ CHANGES = {
 
 
 def remedies(check: RobotCheck, fault: Finding) -> list[str]:
-    """Return texts on remedies for a 'not_held' or 'not_stiff' fault.
+    """Return texts on remedies for an arm that is not held or not stiff in enough postures.
 
     Each text states the share of postures that are held or stiff with the remedy.
+
+    Args:
+        check: The result of `check_robot`.
+        fault: The fault of this check to remedy, of the kind 'not_held' or 'not_stiff'.
     """
     kind = fault.kind.removeprefix('not_')
 
     @cache
     def attempt(*steps: int) -> tuple[float, str]:
-        """Apply steps of the changes; return the share of held or stiff postures, and a text.
+        """Check the arm with a combination of changes.
 
         Args:
-            steps: Number of the step of each change, from 1; 0 for no change.
+            steps: For each entry of CHANGES, the number of the applied step, from 1; 0 for no
+                change.
+
+        Returns:
+            The share of postures that are then held or stiff, and a text that states the changes
+            and this share.
         """
         setting, texts = check.setting, list[str]()
         for (what, factors), step in zip(CHANGES.items(), steps, strict=True):
@@ -86,10 +98,10 @@ def rounded(values: Array) -> Array:
 
 
 def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:
-    """Return a setting with one change, and a text that describes the change.
+    """Return a robot in N postures with one change, and a text that describes the change.
 
     Args:
-        setting: The unchanged setting.
+        setting: The unchanged robot and its postures.
         what: The change, a key of CHANGES.
         factor: Factor by which the change multiplies a value.
         joint: Index of the joint to which 'limits' and 'moment arms' apply.

@@ -58,7 +58,14 @@ class Robot:
         return cls(load_description(robot))
 
     def limb(self, joints: Ints, muscles: Ints) -> Robot:
-        """Return the robot with one group's joints and muscles; other joints are fixed at zero."""
+        """Return a robot that has only the joints and muscles of one group, such as a limb.
+
+        All other joints are fixed at zero.
+
+        Args:
+            joints: Indices of the joints in θ.
+            muscles: Indices of the muscles in T and l.
+        """
         whole = self.description
         elastic, tension = (
             [values[muscles] for values in vars(part).values()]
@@ -80,7 +87,10 @@ class Robot:
         return Robot(description)
 
     def elongation(self, tension: Array) -> Array:
-        """Return L_e [m] (M,) for T [N] (M,), with the lengths of the tendons at θ = 0."""
+        """Return the elongation of series elastic elements and tendons [m], (M,).
+
+        The tendons have their lengths at θ = 0. `tension` are the tensions [N], (M,).
+        """
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
 
     def muscle_indices(self, names: Iterable[str]) -> list[int]:
@@ -128,7 +138,17 @@ class Robot:
         return changed
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
-        """Return l = f_geo(θ) − L_e(f_geo,abs(θ), T) [m] (..., M) for θ (..., D) and T (..., M)."""
+        """Return the muscle lengths l of the geometric model [m], (..., M).
+
+            l = f_geo(θ) − L_e(f_geo,abs(θ), T)
+
+        f_geo,abs is the length of the route, f_geo the same relative to θ = 0, and L_e the
+        elongation of series elastic element and tendon.
+
+        Args:
+            theta: Joint angles θ [rad], (..., D).
+            tension: Tensions T [N], (..., M).
+        """
         absolute = self.routes.absolute_lengths(theta)
         relative = absolute - self.routes.length_at_zero
         return relative - self.series_elastic.elongation(absolute, tension)
@@ -136,24 +156,33 @@ class Robot:
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
         """Return an upper limit of the load of each joint in N postures [N·m], (D,).
 
-        It is the largest size of the holding torque, plus the largest sum of the sizes of the
-        torques that all muscles exert on the joint at T_bias.
+        The load of a joint is the magnitude of its holding torque, plus the magnitudes of the
+        torques that the muscles exert on it at T_bias. The limit adds the largest value of either
+        part over the postures.
 
         Args:
             torque: Torque that holds the arm in N postures [N·m], (N, D).
-            jacobian: G [m/rad], (N, M, D).
+            jacobian: Muscle Jacobian in these postures [m/rad], (N, M, D).
         """
         pulls = np.abs(jacobian) * self.tension.bias[:, None]
         load: Array = np.abs(torque).max(axis=0) + pulls.sum(axis=1).max(axis=0)
         return load
 
     def muscle_stiffness(self, theta: Array, tension: Array) -> Array:
-        """Return the stiffness k(θ, T) [N/m] (..., M) of modules and elastic elements in series."""
+        """Return the stiffness of each muscle: module and elastic element in series.
+
+        Args:
+            theta: Joint angles [rad], (..., D).
+            tension: Tensions [N], (..., M).
+
+        Returns:
+            The stiffness of each muscle [N/m], (..., M).
+        """
         absolute = self.routes.absolute_lengths(theta)
         return muscle_stiffness(self.stiffness, self.series_elastic.compliance(absolute, tension))
 
     def posture_text(self, theta: Array, digits: int = 2) -> str:
-        """Return θ (D,) with the names and units of the joints, for messages."""
+        """Return the joint positions θ (D,) as a text with the names and units of the joints."""
         each = zip(self.joints, theta, self.units, strict=True)
         return ', '.join(f'{name} {value:.{digits}f} {unit.theta}' for name, value, unit in each)
 

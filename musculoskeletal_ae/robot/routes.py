@@ -5,10 +5,14 @@
     f_geo(θ)     = f_geo,abs(θ) − f_geo,abs(0)
     G(θ)         = ∂f_geo/∂θ
 
-(paper, §III-B: start, relay and end points linearly connected.) For a straight segment, G is the
-velocity of its end points, ∂p/∂θ_k = a_k × (p − o_k), projected onto the line d between them. For a
-segment that may wrap around a sphere or cylinder (`wrapping`), G is the velocity of the end points
-relative to that object's link, projected onto the directions in which the tendon leaves them.
+(paper, §III-B: start, relay and end points linearly connected.) f_geo,abs is the length of a route
+with the points p_i, and f_geo the same relative to θ = 0. If joint k turns about the axis a_k
+through the point o_k, a point p of the route moves by ∂p/∂θ_k = a_k × (p − o_k). For a straight
+segment, G is the difference of the motions of its two end points, projected onto the line between
+them. For a segment that may wrap around a sphere or cylinder (`wrapping`), G is the motion of the
+end points relative to that object's link, projected onto the directions in which the tendon leaves
+them.
+
 A tendon may have several branches, joined by pulleys. The length of each branch counts 1/divisor,
 and the branch carries 1/divisor of the tension.
 """
@@ -38,7 +42,10 @@ MOST_SERIAL_CHUNKS = 4  # number of chunks above which two threads share the eva
 
 
 def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Array], Array]:
-    """Make a method of θ (N, D) accept θ (..., D), and evaluate it CHUNK rows at a time."""
+    """Make a method that takes θ of shape (N, D) accept the shape (..., D).
+
+    The method is evaluated for at most 4096 postures at a time, which limits its memory.
+    """
 
     @wraps(method)
     def chunked(self: Routes, theta: Array) -> Array:
@@ -134,14 +141,17 @@ class Routes:
         return wrapped_segments(self.objects, turned, moved, start, end)
 
     def drawn(self, theta: Array, points: Array | None = None) -> list[Array]:
-        """Return the branches of all muscles at θ (D,) as polylines with arcs, each (K, 3) [m].
+        """Return the routes of all muscles in a posture as polylines, for drawing.
+
+        An arc around an object consists of several points.
 
         Args:
-            theta: θ [rad], (D,).
-            points: Route points in the root link's frame [m], (P, 3); by default those at θ.
+            theta: Joint angles [rad], (D,).
+            points: Route points in the root link's frame [m], (P, 3); by default those at `theta`.
 
         Returns:
-            One polyline for each entry of `drawn_muscle`.
+            For each branch of a route, its points in the root link's frame [m], (K, 3).
+            `drawn_muscle` states to which muscle each branch belongs.
         """
         poses = self._kinematics.tree.joint_poses(theta[None])
         points = self.placed(poses)[0] if points is None else points
@@ -169,7 +179,7 @@ class Routes:
 
     @property
     def pieces_drawn(self) -> Ints:
-        """Largest number of straight pieces of each polyline of `drawn`."""
+        """Largest number of straight pieces that each polyline of `drawn` can have."""
         wraps = np.isin(np.arange(len(self.first)), self.wrapping)
         return np.array([len(own) + ARC * wraps[own].sum() for own in self._branches])
 
@@ -194,7 +204,14 @@ class Routes:
         return np.einsum('npij,pj->npi', rotation, point) + translation
 
     def _segments(self, theta: Array) -> tuple[Array, Array]:
-        """Return the lengths of segments and the distances of their end points [m], (N, S) each."""
+        """Return the lengths of all segments, with wrapping and as straight lines.
+
+        Args:
+            theta: Joint angles in N postures [rad], (N, D).
+
+        Returns:
+            The lengths, and the distances between the end points [m], (N, S) each.
+        """
         poses = self._kinematics.tree.joint_poses(theta)
         points = self.placed(poses)
         straight = np.linalg.norm(points[:, self.second] - points[:, self.first], axis=-1)
@@ -206,11 +223,11 @@ class Routes:
 
     @_in_chunks
     def absolute_lengths(self, theta: Array) -> Array:
-        """Return f_geo,abs(θ) [m] (..., M) for θ (..., D)."""
+        """Return the length of each muscle's route [m], (..., M), at θ [rad], (..., D)."""
         return self._segments(theta)[0] @ self._sum.T
 
     def moved(self, poses: JointPoses, point: Array) -> tuple[Array, Array]:
-        """Return the absolute lengths of routes with other points, and their gradients.
+        """Return the lengths of routes with other points, and the gradients of these lengths.
 
         Args:
             poses: Poses of the joints in N postures.
@@ -249,12 +266,12 @@ class Routes:
         return np.subtract(*self._segments(theta))[:, self.wrapping]
 
     def relative_lengths(self, theta: Array) -> Array:
-        """Return f_geo(θ) [m] (..., M) for θ (..., D); it is zero at θ = 0."""
+        """Return the route lengths relative to those at θ = 0 [m], (..., M), at θ (..., D)."""
         return self.absolute_lengths(theta) - self.length_at_zero
 
     @_in_chunks
     def muscle_jacobian(self, theta: Array) -> Array:
-        """Return G(θ) [m/rad] (..., M, D) for θ (..., D)."""
+        """Return the muscle Jacobian G = ∂l/∂θ [m/rad], (..., M, D), at θ [rad], (..., D)."""
         kin = self._kinematics
         poses = kin.tree.joint_poses(theta)
         points = self.placed(poses)

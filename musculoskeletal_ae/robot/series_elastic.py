@@ -3,8 +3,9 @@
 
     L_e(l_abs, T) = ln(1 + T / force) / rate + wire_stretch · l_abs · T
 
-(paper, §III-B: estimated from a testbed of one muscle). The series elastic element follows
-T = force · (exp(rate · Δ) − 1). The tendon is Dyneema, whose stretch is proportional to its length.
+(paper, §III-B: estimated from a testbed of one muscle). L_e is the elongation at the tension T, and
+l_abs the length of the tendon. The series elastic element follows T = force · (exp(rate · Δ) − 1),
+where Δ is its own elongation. The tendon is Dyneema, whose stretch is proportional to its length.
 The default constants are plausible values for Musashi, whose own constants are not public.
 """
 
@@ -32,16 +33,29 @@ class SeriesElastic:
         return SeriesElastic(*(values[muscle] for values in vars(self).values()))
 
     def elongation(self, absolute_length: Array, tension: Array | float) -> Array:
-        """Return L_e [m] (..., M) for l_abs [m] and T [N], (..., M) each."""
+        """Return the elongation of series elastic elements and tendons [m], (..., M).
+
+        Args:
+            absolute_length: Lengths of the tendons [m], (..., M).
+            tension: Tensions [N], (..., M).
+        """
         tension = np.maximum(tension, 0.0)
         stretch = self.wire_stretch * absolute_length * tension
         return np.log1p(tension / self.force) / self.rate + stretch
 
     def compliance(self, absolute_length: Array, tension: Array) -> Array:
-        """Return ∂L_e/∂T [m/N] (..., M) for l_abs [m] and T [N], (..., M) each."""
+        """Return the derivative of the elongation with respect to tension [m/N], (..., M).
+
+        Args:
+            absolute_length: Lengths of the tendons [m], (..., M).
+            tension: Tensions [N], (..., M).
+        """
         element = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
         return element + self.wire_stretch * absolute_length
 
     def length_slope(self, tension: Array) -> Array:
-        """Return ∂L_e/∂l_abs [m/m] (..., M) for T [N] (..., M)."""
+        """Return the derivative of the elongation with respect to the tendon's length, (..., M).
+
+        `tension` are the tensions [N], (..., M).
+        """
         return self.wire_stretch * np.maximum(tension, 0.0)

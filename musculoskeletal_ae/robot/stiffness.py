@@ -3,10 +3,14 @@
 
     K_θ = Gᵀ diag(k) G + Σ_i T_i ∂²l_i/∂θ²,    k = (1/K_stiff + ∂L_e/∂T)⁻¹
 
-`check_robot` takes G and L_e from the geometric model, the controller from the network. A muscle
-that MSC holds at T_bias does not resist shortening. The one-sided stiffness therefore counts it as
-slack, with k = 0. For position-controlled modules, K_stiff is infinite. The stiffness against an
-external wrench is K_θ + ∂g/∂θ, because the torque of the arm's weight changes with θ as well.
+K_θ is the joint stiffness, k the stiffness of each muscle with the control stiffness K_stiff and
+the elongation L_e of its elastic element, T_i the tension and l_i the length of muscle i, and
+G = ∂l/∂θ. `check_robot` takes G and L_e from the geometric model, the controller from the network.
+
+A muscle that MSC holds at T_bias does not resist shortening. The one-sided stiffness therefore
+counts such a muscle as slack, with k = 0. For position-controlled modules, K_stiff is infinite. The
+stiffness against an external wrench is K_θ + ∂g/∂θ, because the torque g of the arm's weight
+changes with θ as well.
 """
 
 from collections.abc import Callable
@@ -19,11 +23,11 @@ LEAST_COMPLIANCE = 1e-7  # smallest plausible ∂L_e/∂T of an elastic element 
 
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:
-    """Return the stiffness k [N/m] of a muscle module and its elastic element in series.
+    """Return the stiffness of a muscle module and its elastic element in series [N/m].
 
     Args:
-        module: K_stiff [N/m]; infinite for a position-controlled module.
-        compliance: ∂L_e/∂T [m/N].
+        module: Control stiffness of the module [N/m]; infinite for a position-controlled module.
+        compliance: Derivative of the elongation with respect to tension [m/N].
     """
     return 1.0 / (1.0 / module + np.maximum(compliance, LEAST_COMPLIANCE))
 
@@ -31,11 +35,14 @@ def muscle_stiffness(module: Array, compliance: Array) -> Array:
 def muscle_hessian(
     muscle_jacobian: Callable[[Array], Array], theta: Array, step: Array | float = 1e-5
 ) -> Array:
-    """Return ∂²l/∂θ² [m/rad²] (..., M, D, D), computed by central differences of G.
+    """Return the second derivatives ∂²l/∂θ² of the muscle lengths [m/rad²], (..., M, D, D).
+
+    They are computed by central differences of the muscle Jacobian.
 
     Args:
-        muscle_jacobian: Function of θ [rad] (..., D) that returns G [m/rad], (..., M, D).
-        theta: θ [rad], (..., D).
+        muscle_jacobian: Function of θ [rad], (..., D), that returns the muscle Jacobian ∂l/∂θ
+            [m/rad], (..., M, D).
+        theta: Joint angles [rad], (..., D).
         step: Half width of the differences [rad], scalar or (D,).
     """
     offsets, middle = step * np.eye(theta.shape[-1]), theta[..., None, :]
@@ -45,13 +52,13 @@ def muscle_hessian(
 
 
 def joint_stiffness(jacobian: Array, hessian: Array, stiffness: Array, tension: Array) -> Array:
-    """Return the joint stiffness K_θ [N·m/rad], (..., D, D).
+    """Return the joint stiffness [N·m/rad], (..., D, D).
 
     Args:
-        jacobian: G [m/rad], (..., M, D).
-        hessian: ∂²l/∂θ² [m/rad²], (..., M, D, D).
-        stiffness: k [N/m], (..., M).
-        tension: T [N], (..., M).
+        jacobian: Muscle Jacobian ∂l/∂θ [m/rad], (..., M, D).
+        hessian: Second derivatives ∂²l/∂θ² [m/rad²], (..., M, D, D).
+        stiffness: Stiffness of each muscle [N/m], (..., M).
+        tension: Tensions [N], (..., M).
     """
     elastic = jacobian.swapaxes(-1, -2) @ (stiffness[..., None] * jacobian)
     return elastic + np.einsum('...m,...mij->...ij', tension, hessian)

@@ -3,9 +3,9 @@
 
     min  mean_p |d_p| / r + penalty(d),    d_p = r · x_p / √(1 + |x_p|²)
 
-over x. Each via point p moves by d_p, which is shorter than the reach r. The penalty is zero if the
-arm is held, and its stiffness and moment arms meet the requirements of the check, in all but a few
-postures.
+Each via point p moves by d_p, which is shorter than the reach r, because the search varies x_p
+instead of d_p. The penalty is zero if the muscles hold the arm, and its stiffness and moment arms
+meet the requirements of the check, in all but a few postures.
 """
 
 import shutil
@@ -46,8 +46,8 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
         seed: Random seed. The postures differ from the postures of a check with the same seed.
 
     Returns:
-        The change d [m] (P, 3), in the frames of the links, and by how much the requirements are
-        missed before and after the change; 0 if they are met.
+        The displacement of each via point in the frame of its link [m], (P, 3); and by how much the
+        requirements are missed before and after the change (`lacking`), 0 if they are met.
     """
     import cma
 
@@ -110,9 +110,10 @@ def moved(robot: Robot, change: Array) -> Robot:
 
 
 def lacking(check: checks.RobotCheck) -> float:
-    """Return by how much an arm misses the requirements of the check that via points can change.
+    """Return by how much an arm misses the requirements of `check_robot`, as a number without unit.
 
-    The result has no unit. It is 0 if the arm meets all these requirements with a margin.
+    Only requirements that depend on the via points count: holding torque, stiffness, and moment
+    arms. The result is 0 if the arm meets all of them with a margin.
     """
     arms, least = check.moment_arms, check.matters
     torque = np.linalg.norm(check.missing_torque, axis=1)

@@ -4,8 +4,12 @@
     hard:   min ‖T − T_desired‖²         subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
 
-(Kawamura 2016). T_desired = 0 gives the least tension that holds τ; the control experiment reports
-it as the QP bound. `check_robot` uses T_desired = 0.3 T_limit, the tension of a well-tensed arm.
+(Kawamura 2016). T are the tensions, τ is the joint torque and G = ∂l/∂θ the muscle Jacobian. The
+hard form produces exactly the torque τ. The soft form comes as near to τ as possible, with a small
+weight ε on the tensions.
+
+T_desired = 0 gives the least tension that holds τ; the control experiment reports it as the QP
+bound. `check_robot` uses T_desired = 0.3 T_limit, the tension of a well-tensed arm.
 """
 
 from functools import cache
@@ -26,7 +30,7 @@ SOFT_WEIGHT = 1e-7
 
 
 class Exertion(NamedTuple):
-    """Tensions, and the torque that they do not produce."""
+    """Tensions, and the part of the required torque that they do not produce."""
 
     tension: Array  # T [N], (M,)
     missing_torque: Array  # τ + Gᵀ T, the part of τ that T does not produce [N·m], (D,)
@@ -45,8 +49,8 @@ class TensionProgramme:
         """Set the constraints.
 
         Args:
-            muscle_jacobian: G [m/rad], (M, D).
-            torque: τ [N·m], (D,).
+            muscle_jacobian: Muscle Jacobian ∂l/∂θ [m/rad], (M, D).
+            torque: Joint torque to produce [N·m], (D,).
             low: Lowest tensions [N], scalar or (M,).
             high: Highest tensions [N], scalar or (M,).
         """
@@ -78,11 +82,17 @@ class TensionProgramme:
             raise InfeasibleError(problem) from error
 
     def nearest(self, desired: Array | float) -> Array:
-        """Solve the hard form; return the tensions [N] (M,) nearest to the desired ones."""
+        """Return the tensions that produce exactly the torque [N], (M,).
+
+        Of all such tensions, those nearest to `desired` [N], scalar or (M,), are returned.
+        """
         return self.minimum(self._eye, np.full(self._count, desired, dtype=float))
 
     def compromise(self) -> Exertion:
-        """Solve the soft form; return the lowest tensions that come nearest to the torque."""
+        """Return the tensions within the limits that come nearest to producing the torque.
+
+        If several tensions come equally near, the lowest of them are returned.
+        """
         jacobian = self._jacobian
         quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * self._eye
         tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
@@ -117,9 +127,15 @@ def least_tension(
     high: Array | float,
     desired: Array | float = 0.0,
 ) -> Exertion:
-    """Return the solution of the hard form, or of the soft form if the hard one is infeasible.
+    """Return tensions that produce a joint torque or, if that is impossible, come nearest to it.
 
-    The arguments are those of `TensionProgramme`; `desired` is T_desired [N], scalar or (M,).
+    Args:
+        muscle_jacobian: Muscle Jacobian ∂l/∂θ [m/rad], (M, D).
+        torque: Joint torque to produce [N·m], (D,).
+        low: Lowest tensions [N], scalar or (M,).
+        high: Highest tensions [N], scalar or (M,).
+        desired: Desired tensions [N], scalar or (M,). Of all tensions that produce the torque,
+            those nearest to the desired tensions are returned.
 
     Raises:
         InfeasibleError: If an entry is not finite.
@@ -133,7 +149,10 @@ def least_tension(
 
 @cache
 def _unit(count: int) -> tuple[Array, Array]:
-    """Return the unit matrix (M, M) and the normals of the limits (M, 2 M); do not change them."""
+    """Return the unit matrix (M, M), and the constraint matrix of lower and upper limits (M, 2M).
+
+    The arrays are cached, so the caller must not change them.
+    """
     eye = np.eye(count)
     return eye, np.hstack([eye, -eye])
 

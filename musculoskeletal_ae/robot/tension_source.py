@@ -3,9 +3,10 @@
 
     T_read = i k_t n / r
 
-i is a motor current, k_t the motor's torque constant, n the gear ratio and r the radius of the
-spool. T_read also contains the friction of motor and gear, an offset, and the error of k_t, which
-online learning identifies (`signals.friction.Transmission`).
+If motor currents are measured instead of tensions, this formula converts them. i is a motor
+current, k_t the motor's torque constant, n the gear ratio and r the radius of the spool. T_read
+also contains the friction of motor and gear, an offset, and the error of k_t. Online learning
+identifies these errors (`signals.friction.Transmission`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class TensionSource:
 
     Attributes:
         kind: SENSOR, CURRENT or NONE.
-        newton_per_ampere: k_t n / r of each muscle [N per A], (M,); None unless `kind` is CURRENT.
+        newton_per_ampere: Tension per motor current of each muscle [N per A], (M,); None unless
+            `kind` is CURRENT.
     """
 
     kind: str = SENSOR
@@ -43,26 +45,36 @@ class TensionSource:
         return self.newton_per_ampere is not None
 
     def of_muscles(self, muscles: Ints) -> TensionSource:
-        """Return the source of some of the muscles."""
+        """Return the tension source of some of the muscles (indices)."""
         if self.newton_per_ampere is None:
             return self
         return TensionSource(self.kind, self.newton_per_ampere[muscles])
 
     def from_message(self, values: Array) -> Array:
-        """Return T_read [N] (M,) from the values of a message, in [N] or [A]; NaN if unknown."""
+        """Return the tensions in a message [N], (M,); NaN if the robot does not measure tensions.
+
+        `values` are tensions [N] or motor currents [A], (M,), depending on `kind`.
+        """
         scale = self.newton_per_ampere
         return self.known(values if scale is None else values * scale)
 
     def known(self, tension: Array) -> Array:
-        """Return T_read [N] (..., M), or NaN if tensions are unknown."""
+        """Return `tension` [N], (..., M), or NaN if the robot does not measure tensions."""
         return tension if self.is_known else np.full_like(tension, np.nan)
 
     def measured(self, rows: Array) -> Array:
-        """Return the rows l and T_read of `rows` (2, ...), or only the row l if T is unknown."""
+        """Return those of two rows that the robot measures.
+
+        Args:
+            rows: Row 0 has lengths, row 1 tensions, (2, ...).
+
+        Returns:
+            Both rows, or only row 0 if the robot does not measure tensions.
+        """
         return rows if self.is_known else rows[:1]
 
     def to_message(self, tension: Array) -> Array:
-        """Return the values of a message, in [N] or [A], from T_read [N] (M,)."""
+        """Convert tensions [N], (M,), to the values of a message: tensions [N] or currents [A]."""
         return tension if self.newton_per_ampere is None else tension / self.newton_per_ampere
 
 

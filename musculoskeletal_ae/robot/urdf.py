@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read robot.urdf with pinocchio, after a check of its structure and its numbers (NUMBERS).
+"""Read robot.urdf with pinocchio, after a check of its structure and its numbers.
 
 The URDF parser silently ignores what it does not understand, so the file is checked here first. The
 parser only warns about a missing or malformed mass or inertia, and continues with a massless link.
-In a xacro file that was not expanded, it ignores the macros and reads the rest.
+If a file still contains xacro macros, the parser ignores the macros and reads the rest.
 """
 
 import math
@@ -120,7 +120,7 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 
 
 def _check_expanded(file: Path, root: ET.Element) -> None:
-    """Reject a file that still needs a preprocessor, because the URDF parser ignores macros."""
+    """Reject a file that still contains macros, which the URDF parser would ignore."""
     for problem in _preprocessor_parts(root):
         remedy = 'expand it to a new file first:  xacro FILE > NEW.urdf'
         raise RobotDescriptionError(f'{file}: this is a xacro, not a URDF ({problem}); {remedy}')

@@ -53,7 +53,12 @@ class WrapObjects(NamedTuple):
 
 
 def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
-    """Return the objects of a description's wraps, in the frames of the joints of the tree."""
+    """Express the wrap objects of a robot description in the frames of the tree's joints.
+
+    Args:
+        kinematics: The kinematics of the robot.
+        wraps: The wrap objects, in the frames of their links.
+    """
     rows = []
     for wrap in wraps:
         joint, at = kinematics.placement(wrap.link)
@@ -68,13 +73,16 @@ def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
 
 @njit(cache=True)
 def _product(a: complex, b: complex) -> complex:
-    """Return a complex number with the real part a · b and the imaginary part a × b."""
+    """Return the dot product (real part) and cross product (imaginary part) of plane vectors.
+
+    The complex numbers a and b are vectors in the plane.
+    """
     return a.conjugate() * b
 
 
 @njit(cache=True)
 def _cross_each_other(a: complex, b: complex, c: complex, d: complex) -> bool:
-    """Return whether the segments a–b and c–d cross."""
+    """Return whether the line segments a–b and c–d in the complex plane cross."""
     determinant = _product(b - a, d - c).imag
     if abs(determinant) < TINY:
         return False
@@ -85,11 +93,20 @@ def _cross_each_other(a: complex, b: complex, c: complex, d: complex) -> bool:
 
 @njit(cache=True)
 def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, complex, complex]:
-    """Return what `_round` returns, for a tendon that runs through a ring of radius r.
+    """Bend a tendon through a ring of radius r around the origin of the complex plane.
 
-    At the point of contact, both straight parts make the same angle with the radius. The sine z of
-    this angle is the root of asin(r z / |a|) + asin(r z / |b|) − 2 asin z + (angle between the
-    ends) = 0.
+    The tendon touches the ring at one point, where its two straight parts make the same angle with
+    the radius. The sine z of this angle is the root of asin(r z / |a|) + asin(r z / |b|) −
+    2 asin z + (angle between the ends) = 0.
+
+    Args:
+        a: Start of the tendon [m].
+        b: End of the tendon [m].
+        r: Radius of the ring [m].
+
+    Returns:
+        Whether the tendon touches the ring; its length [m]; and the unit vectors along the tendon,
+        away from a and away from b. The last three are zero if it does not touch the ring.
     """
     straight = False, 0.0, 0j, 0j
     d, far, near = b - a, abs(a), abs(b)
@@ -116,7 +133,10 @@ def _through_ring(a: complex, b: complex, r: float) -> tuple[bool, float, comple
 
 @njit(cache=True)
 def _beyond_rim(distance: float, r: float) -> float:
-    """Return `distance` from the centre [m], or exactly r if the two differ by at most RIM · r."""
+    """Return `distance` [m], or exactly the radius r if it differs from r by at most RIM · r.
+
+    A point so near to the rim of the object thus counts as lying on the rim.
+    """
     return r if abs(distance - r) <= RIM * r else distance
 
 
@@ -189,7 +209,7 @@ def _unit(a: Vector) -> Vector:
 
 @njit(cache=True)
 def _beside(a: Vector) -> Vector:
-    """Return a unit vector perpendicular to a unit vector."""
+    """Return any unit vector that is perpendicular to the unit vector a."""
     return _unit(cross(a, (1.0, 0.0, 0.0) if abs(a[0]) < 0.6 else (0.0, 1.0, 0.0)))
 
 
@@ -271,7 +291,9 @@ def wrapped_segment(
 def wrapped_segments(
     objects: WrapObjects, rotation: Array, translation: Array, start: Array, end: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the results of `wrapped_segment` for S segments in N postures.
+    """Return lengths and directions of S segments, wrapped where necessary, in N postures.
+
+    `wrapped_segment` describes the arguments, which have further axes (N) or (N, S) here.
 
     Returns:
         Lengths [m], (N, S), and the unit vectors away from the start and from the end, (N, S, 3).
@@ -293,7 +315,8 @@ def arc_points(
 ) -> Array:  # fmt: skip
     """Return points along the arc of segment s for drawing, in the root link's frame [m], (K, 3).
 
-    K is 0 for a straight segment, 1 for a ring, and `most` for an arc.
+    K is 0 for a straight segment, 1 for a tendon that is bent through a ring, and `most` for an
+    arc. `wrapped_segment` describes the other arguments.
     """
     leave, arrive = np.zeros(3), np.zeros(3)
     length = wrapped_segment(objects, s, rotation, translation, start, end, leave, arrive)
