@@ -37,9 +37,9 @@ class State(NamedTuple):
 
 
 class Mask(Enum):
-    """Selects the two quantities of (θ, T, l) that enter the network (paper, §III-A).
+    """Selects the two quantities of (θ, T, l) that enter the network.
 
-    The paper numbers the masks ①, ② and ③ in this order.
+    The members are the masks ①, ② and ③ (paper, §III-A), in this order.
     """
 
     THETA_TENSION = (1, 1, 0)
