@@ -491,9 +491,9 @@ class Attack:
         self.start(name)
 
     def episode(self, messages: int, kills: int) -> None:
-        """Attack the moving arm with `messages` messages, in bursts and singly, and kill nodes.
+        """Attack the moving arm with `messages` messages, and kill `kills` nodes.
 
-        Some requests to services and some faults come in between. `kills` is the number of kills.
+        The messages come singly and in bursts. Requests to services and faults come in between.
         """
         if not self.moving():
             return

@@ -52,10 +52,10 @@ LEARNED = ('before [rad]', 'after', 'oracle', '`proposed`')
 
 
 def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Array]], Any]:
-    """Return a function that computes lengths of a cardsflow.xml's straight muscles by MuJoCo.
+    """Return a function that computes the lengths of a cardsflow.xml's straight muscles by MuJoCo.
 
-    The function takes joint positions by name, each (N,), and returns lengths by muscle [m], each
-    (N,).
+    The function takes joint positions by name, each (N,). It returns muscle lengths by name [m],
+    each (N,).
     """
     urdf = file.with_name('model.urdf')
     tree, root = (parse_xml(each, read_text(each, refuse)) for each in (urdf, file))

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs the tests with the arithmetic of other processors: several BLAS and torch kernels.
 
-Other processors select other kernels, which sum in another order. No test may depend on the last
-bits. Tests must therefore pass with each combination of kernels that this processor can run.
+Other processors select other kernels, which add numbers in another order, so the last bits of a
+result differ. No test may depend on these. Tests must therefore pass with each combination of
+kernels that this processor can run.
 """
 
 import itertools

@@ -42,7 +42,7 @@ class Seldom(Trainer):
 
 
 class LearnedArm(NamedTuple):
-    """An individual's network, the network that drives it, and the data that it learned from."""
+    """The network of a learned individual, the network that commanded it, and the recorded data."""
 
     mae: Mae
     driver: Mae  # network of the geometric model, which computes the commands
@@ -58,7 +58,10 @@ def initial(robot: Robot, folder: Path) -> Mae:
 
 
 def learned_arm(robot: Robot, seed: int, folder: Path, minutes: float) -> LearnedArm:
-    """Return an individual that has learned for `minutes`, from the cache in `folder` if there."""
+    """Return an individual that has learned for `minutes` [min].
+
+    If the cache in `folder` has the individual, it is read from there.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
     messages = folder / f'exploring_{seed}.npz'

@@ -24,7 +24,7 @@ LOAD = -50.0  # vertical force on the hand [N], as in the paper's simulation
 
 
 def save_both(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
-    """Draw the simulated arm at rest in mid-range, then with a loaded hand; return both files."""
+    """Draw the simulated arm in mid-range, at rest and with a loaded hand; return both files."""
     simulated = Simulation(robot, mae)
     theta = 0.5 * (robot.lower + robot.upper)
     tension, _ = least_tension(

@@ -55,7 +55,7 @@ SLOWER = 1.5  # largest legal ratio of the median update times in the last and t
 
 
 class RareTrainer(Trainer):
-    """A trainer that updates after every `every`-th sample only; the first updates come earlier.
+    """A trainer that updates only after every `every`-th sample, and more often at the beginning.
 
     Attributes:
         every: Number of samples between updates.

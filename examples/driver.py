@@ -30,7 +30,7 @@ RELEASE = 100.0  # rate of this decrease [N/s]
 
 
 class Bus:
-    """Your motors and sensors; all arrays in the order of muscles.yaml. This one is a fake."""
+    """Your motors and sensors; arrays have the order of muscles.yaml. This class is a fake."""
 
     def __init__(self, robot: Robot) -> None:
         self.arm, self.read_at = EmulatedArm(robot, seed=1), time.monotonic()

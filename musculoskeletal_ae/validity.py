@@ -216,7 +216,7 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
 def read_wrench(message: Any, root_link: str) -> Array:
     """Return force [N] and torque [N·m], together (6,), of a WrenchStamped.
 
-    The frame of the message must be `root_link`, or empty, which means the same.
+    The frame of the message must be `root_link` or empty; an empty frame counts as `root_link`.
     """
     if message.header.frame_id not in ('', root_link):
         raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {root_link!r}')

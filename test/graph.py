@@ -34,7 +34,7 @@ LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticSt
 
 
 def executable(name: str) -> list[str]:
-    """Return the command that runs an installed executable, which is found as by `ros2 run`."""
+    """Return the command that runs an installed executable, found as `ros2 run` finds it."""
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         file = Path(prefix) / 'lib' / 'musculoskeletal_ae' / name
         if file.exists():
@@ -173,7 +173,7 @@ class Graph:
         return self.received[topic]
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile | int = 10) -> Any:
-        """Advertise a topic, and wait for a subscriber."""
+        """Advertise a topic, wait for a subscriber, and return the publisher."""
         publisher = self.node.create_publisher(kind, topic, qos)
         self.wait(lambda: publisher.get_subscription_count() > 0, f'a subscriber of {topic}')
         return publisher

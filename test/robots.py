@@ -99,7 +99,7 @@ def write_robot(
     slider: bool = False,
     **top: Any,
 ) -> Path:
-    """Write a sound arm of 3 joints and 8 muscles, whose names no shipped robot has.
+    """Write an arm of 3 joints and 8 muscles that `check_robot` accepts, with names of its own.
 
     Args:
         directory: Directory; it is created if it is missing.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors about a value of a file name its place, the value and the legal ones."""
+"""Errors about a value of a file name its place, the value and the legal values."""
 
 from typing import Annotated, Literal
 

@@ -95,7 +95,11 @@ class _Muscle:
         return SeriesElastic(*(value * f for value, f in zip(nominal, factors, strict=True)))
 
     def fitted(self, states: _States) -> tuple[Array, Array]:
-        """Fit the parameters to states; return them, and the remaining errors of l [m], (N,)."""
+        """Fit the parameters of the muscle to N states.
+
+        Returns:
+            The parameters, and the remaining errors of l [m], (N,).
+        """
 
         def residuals(parameters: Array) -> Array:
             length, _ = self._linearised(parameters, states)

@@ -36,7 +36,7 @@ LEAST_OFFSET = 0.002  # smallest joint-sensor offset that is shown [rad]
 
 
 def train(args: Namespace) -> None:
-    """Learn from recordings in order; print the errors on these and on held-out recordings."""
+    """Learn from recordings in order; print the errors on them and on held-out recordings."""
     robot = prepare(args)
     # All bags are read first, because training takes minutes and a bag may be unusable.
     motors = motor_settings(args.params_file)

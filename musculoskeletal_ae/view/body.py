@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """An arm as solids: links as meshes of the URDF or as capsules, muscles as tubes.
 
-Muscles are blue at T_bias and orange at T_limit, which colour-blind people can distinguish, and
-thicker at higher tension. Ruptured muscles are black and dashed, isolated ones grey and dashed, and
-suspects magenta and thick.
+A muscle is blue at T_bias and orange at T_limit; colour-blind people can distinguish these colours.
+It is thicker at higher tension. Ruptured muscles are black and dashed, isolated ones grey and
+dashed, and suspects magenta and thick.
 """
 
 import io
@@ -177,7 +177,7 @@ def viewpoint(points: Array, direction: Array, half: tuple[float, float]) -> tup
 
 
 def grid_cell(reach: float) -> float:
-    """Return a power of ten as the size of the floor's cells [m], for a `reach` of the arm [m]."""
+    """Return the size of the floor's cells [m], a power of ten, for a `reach` of the arm [m]."""
     return float(10.0 ** np.round(np.log10(0.15 * reach)))
 
 
@@ -191,10 +191,10 @@ def pieces(robot: Robot) -> Ints:
 
 
 def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dict[str, Array]:
-    """Return the tubes of all muscles at θ [rad] (D,) and T [N] (M,): DASHES tubes per piece.
+    """Return the tubes that draw all muscles at θ [rad] (D,) and T [N] (M,).
 
-    Positions [m], quaternions wxyz and scales place a tube of radius 1 that reaches from −½ to ½
-    along z.
+    Each piece of a muscle has DASHES tubes. Positions [m], quaternions (w, x, y, z) and scales
+    place a tube of radius 1 that reaches from −½ to ½ along z.
     """
     owner = pieces(robot)
     # The number of pieces is constant. While a tendon does not touch its object, the pieces of the

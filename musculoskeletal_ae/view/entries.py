@@ -3,7 +3,7 @@
 
 Each slider has a box for numbers. viser reports every change of either, and does not say which of
 them the visitor used: while somebody types -1.2 into the box, the slider first becomes -1. Nobody
-types as fast as a dragged slider changes, so the rate of changes tells them apart.
+types as fast as a dragged slider changes. The rate of changes therefore shows which one was used.
 """
 
 import threading

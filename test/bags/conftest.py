@@ -61,7 +61,7 @@ class Tool:
 
 @pytest.fixture
 def tool():
-    """Start tools, and kill those that still run at the end of the test."""
+    """Return a function that starts a tool; tools that still run at the end are killed."""
     started: list[Tool] = []
 
     def start(name: str, *arguments: str | Path) -> Tool:

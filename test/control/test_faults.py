@@ -153,7 +153,7 @@ def test_under_each_fault_no_command_jumps_and_the_arm_resumes_after_the_repair(
 
 
 def longest_overload(loop):
-    """Return the longest time for which a muscle pulled more than 1.1 times its limit [s]."""
+    """Return the longest time [s] for which a tension exceeded 1.1 times its limit."""
     longest, time = 0.0, np.zeros(ROBOT.muscle_count)
     for tension in loop.pulls:
         time = np.where(tension > 1.1 * ROBOT.tension.limit, time + DT, 0.0)

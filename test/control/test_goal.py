@@ -24,7 +24,7 @@ TIGHT = np.array([0.05, np.inf])
 
 
 class FollowingBench:
-    """A controller that follows a trajectory of 1 s, and the goal of the action for it."""
+    """A controller that follows a trajectory of 1 s, and the goal that requested the trajectory."""
 
     def __init__(self, path=FREE, goal=FREE, patience=0.0, delay=0.0):
         self.bench = Bench()

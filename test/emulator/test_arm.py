@@ -228,7 +228,7 @@ def test_the_sensor_of_a_prismatic_joint_errs_by_millimetres(tmp_path, reality):
 
 
 def test_a_prismatic_joint_stops_at_its_limits(tmp_path, reality):
-    """200 N push the joint some mm beyond its limit, because the stop is not infinitely stiff."""
+    """200 N push the joint a few mm beyond its limit, because the stop is not infinitely stiff."""
     urdf = write_robot(tmp_path, slider=True) / 'robot.urdf'
     urdf.write_text(urdf.read_text().replace('"0.25"', '"0.005"'))  # a light tool [kg]
     robot = Robot.load(tmp_path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What follows from a finding depends on its kind and on the parameter `on_anomaly`."""
+"""The reaction to a finding depends on its kind and on the parameter `on_anomaly`."""
 
 import pytest
 

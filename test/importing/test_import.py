@@ -186,7 +186,7 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
 
 
 def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
-    """MuJoCo accepts XML without a space between attributes, which occurs in a file of MyoHub."""
+    """MuJoCo accepts XML without a space between attributes. A file of MyoHub has such a place."""
     expected = import_robot(mjcf, tmp_path / 'sound')
     mjcf.write_text('<!-- own -->\n' + mjcf.read_text().replace('ball" type=', 'ball"type='))
     result = import_robot(mjcf, tmp_path / 'loose')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The life cycle of the learner, and its rules that depend on time, which the tests provide."""
+"""The life cycle of the learner, and its rules that depend on time. The tests provide the time."""
 
 from dataclasses import replace
 

@@ -11,9 +11,9 @@ PERIOD = 0.01  # period of the messages [s]
 
 
 def delays_of(messages, ahead=1.0):
-    """Return the delays [s] of messages, given by their times of reception and of sending [s].
+    """Return the delays [s] of messages with these times of reception and of sending [s].
 
-    The clock of the publisher is `ahead` [s] of the receiver's.
+    The clock of the publisher is `ahead` seconds ahead of that of the receiver.
     """
     delays = MessageDelay()
     return [delays.step(received, round(1e9 * (sent + ahead))) for received, sent in messages]
