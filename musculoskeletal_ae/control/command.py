@@ -38,17 +38,17 @@ class Pull(NamedTuple):
 
 
 def msc_compensation(robot: Robot, tension: Array) -> Array:
-    """Return the l_target − l for which muscle stiffness control exerts the given tension.
+    """Return the difference l_target − l with which muscle stiffness control exerts a tension.
 
         l_comp(T) = −(T − T_bias) / K_stiff              (paper, §III-E, eq. 6)
 
     Args:
         robot: The body.
-        tension: T [N], (..., M).
+        tension: The tension T [N], (..., M).
 
     Returns:
-        l_comp [m], (..., M); zero at T_bias, negative above it. Zero for modules that follow
-        positions, since their K_stiff is infinite.
+        The difference l_comp [m], (..., M); zero at T_bias, negative above it. Zero for modules
+        that follow positions, since their K_stiff is infinite.
     """
     return -(tension - robot.tension.bias) / robot.stiffness
 

@@ -265,7 +265,11 @@ class Controller:
             self._use_sample(self.stream.take(message, now, delay=delay), now)
 
     def muscles(self, states: Array, now: float) -> None:
-        """Process raw l [m], T [N] and temperature [°C], (3, M), as `take` does with a message.
+        """Check and filter raw muscle states, and use their values from now on, as `take` does.
+
+        Args:
+            states: Lengths [m], tensions [N] and temperatures [°C] as measured, (3, M).
+            now: Time of reception by the steady clock [s].
 
         Raises:
             RejectionError: If the values are implausible for this arm.
@@ -388,10 +392,14 @@ class Controller:
     # -- commands from users --------------------------------------------------------------------
 
     def target(self, joints: Mapping[str, tuple[float, float]]) -> None:
-        """Set θ_target [rad] and effort [N·m] of some joints; other joints keep their targets.
+        """Set the targets of some joints; other joints keep their targets.
 
         If there is no target yet, other joints keep their estimated angles. Targets beyond the
         joint limits are clamped.
+
+        Args:
+            joints: Target angle [rad] and effort [N·m] of each of these joints, by name. The effort
+                is a torque in addition to gravity compensation.
 
         Raises:
             MessageError: If the target is refused.

@@ -27,7 +27,7 @@ class Exploration:
     """
 
     def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
-        """Draw the steps of a preset for `robot`."""
+        """Prepare to draw the random steps of a preset for `robot`, with the random seed `seed`."""
         self._rng = np.random.default_rng([seed, 0xE8])
         self.use(robot, preset)
 

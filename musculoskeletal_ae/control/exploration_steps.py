@@ -31,7 +31,7 @@ class Step(NamedTuple):
 
 
 def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_LIMITS) -> Array:
-    """Return a random θ [rad], (D,); each joint is at a limit with probability `share`."""
+    """Return a random posture [rad], (D,); each joint is at a limit with probability `share`."""
     theta = robot.random_postures(1, rng)[0]
     chosen, upper = rng.uniform(size=(2, robot.joint_count))
     limit = np.where(upper < 0.5, robot.upper, robot.lower)
@@ -65,7 +65,9 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
 def holdable_postures(
     robot: Robot, postures: Iterable[Array], count: int, *others: Callable[[Array], Array]
 ) -> list[tuple[Array, Array]]:
-    """Return the first `count` holdable postures θ (D,), each with its least T [N], (M,).
+    """Return the first `count` holdable postures, each with the least tensions that hold it.
+
+    A posture has the shape (D,), and its tensions [N] have the shape (M,).
 
     Args:
         robot: The robot.

@@ -131,7 +131,11 @@ class RestFeedback:
         return True
 
     def shift(self, jacobian: Array) -> Array:
-        """Return the length correction G c + r [m], (M,); `jacobian` is G at the target, (M, D)."""
+        """Return the correction of the lengths, G c + r [m], (M,).
+
+        Args:
+            jacobian: Muscle Jacobian G at the target [m/rad], (M, D).
+        """
         return jacobian @ self.correction + self.relief
 
 
@@ -149,7 +153,7 @@ class MotionFeedback:
         self._shift: Array = np.zeros_like(rest.correction)  # shift of θ [rad], (D,)
 
     def step(self, error: Array, is_held_back: bool, dt: float) -> Array:
-        """Return the shift of θ [rad], (D,).
+        """Return the angles [rad], (D,), by which to shift the desired posture.
 
         Args:
             error: Desired − estimated θ [rad], (D,).

@@ -143,9 +143,9 @@ class CommandLimiter:
         return Command(LENGTH, self._length_demanding(self.command.value, sample))
 
     def _length_demanding(self, tension: Array, sample: MuscleSample) -> Array:
-        """Return lengths [m], (M,), that demand given tensions [N], (M,).
+        """Return length commands [m], (M,), that demand given tensions [N], (M,).
 
-        Of all these lengths, those nearest to the last published lengths are returned.
+        If several lengths demand a tension, the one nearest to the last published length is chosen.
         """
         robot = self._robot
         demand = np.maximum(tension, robot.tension.bias)
@@ -234,7 +234,7 @@ class CommandLimiter:
         return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
-        """Return lower bounds of l_target [m], (M,), that follow from the rejected messages.
+        """Return lower bounds of the length commands [m], (M,), due to rejected messages.
 
         A module compares l_target with its own reading of l. If this reading jumps, the module
         may wind in until the tension is beyond the limit. Therefore l_target of a muscle whose
@@ -255,7 +255,7 @@ class CommandLimiter:
         return relieved
 
     def _tension_rate(self, time: float, tension: Array) -> Array:
-        """Return dT/dt [N/s], (M,), between the last two messages."""
+        """Return the rates of change of the tensions [N/s], (M,), between the last two messages."""
         rate = np.zeros_like(tension)
         if self._tension is not None:
             before, old, rate = self._tension
@@ -269,7 +269,7 @@ class CommandLimiter:
     def _shortest(
         self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
-        """Return the shortest length [m], (M,), that demands no tension above the limit."""
+        """Return the shortest length commands [m], (M,), that demand no tension above the limit."""
         robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable
         rate = self._tension_rate(sample.sent_at, tension)

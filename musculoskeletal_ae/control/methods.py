@@ -106,7 +106,14 @@ class LengthMethod(NamedTuple):
 
 
 def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array:
-    """Return l_target [m], (..., M), for θ_target [rad], (..., D), and tension T [N], (..., M)."""
+    """Return length commands [m], (..., M), for target postures and tensions.
+
+    Args:
+        robot: The body.
+        mae: The network.
+        theta: θ_target [rad], (..., D).
+        tension: T [N], (..., M).
+    """
     return mae.lengths(theta, tension) + msc_compensation(robot, tension)
 
 

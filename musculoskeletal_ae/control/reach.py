@@ -8,13 +8,15 @@ the cheapest path through a roadmap of random postures, with
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
-where τ_missing,j is the torque of joint j that muscles and stops do not provide. Prismatic joints
-count as if a pinion of radius `kinematics.RACK` turned them. Tensions are limited to T_bias + USED
-(T_limit − T_bias), so that the path keeps a reserve of tension. If no path can keep the reserve,
-the cost favours postures in which little torque is missing. On an edge, tendon friction opposes the
-motion (`Limits`). A joint that is at a stop at the start is also at this stop in some postures of
-the roadmap. An edge is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and
-Kavraki 2000); until then its cost is approximated from the postures at its ends.
+where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Prismatic
+joints count as if a pinion of radius `kinematics.RACK` turned them. Tensions are limited to
+T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no path can keep
+the reserve, the cost favours postures in which little torque is missing. On an edge, tendon
+friction opposes the motion (`Limits`).
+
+A joint that is at a stop at the start is also at this stop in some postures of the roadmap. An edge
+is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
+then, its cost is approximated from the postures at its ends.
 
 `slowness` slows the motion along the path until the muscles can accelerate the arm.
 """
@@ -162,7 +164,7 @@ class PathCost:
         self._limits = Limits(robot, mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
-        """Return m, the largest missing torque [N·m] of each posture, (N,).
+        """Return the largest missing torque m of each posture [N·m], (N,).
 
         Missing torques up to NOTABLE count as 0.
 
@@ -226,7 +228,15 @@ class Roadmap:
     def __init__(
         self, robot: Robot, cost: PathCost, start: Array, theta: Array, direct: float
     ) -> None:
-        """Draw the postures; `direct` is the cost of the straight path from `start` to θ."""
+        """Draw the random postures, and approximate the costs of the edges between them.
+
+        Args:
+            robot: The robot.
+            cost: Computes the costs.
+            start: Start of the path [rad], (D,).
+            theta: Goal of the path [rad], (D,).
+            direct: Cost of the straight path from start to goal.
+        """
         self._cost = cost
         self._postures = np.vstack([start, theta, _random_postures(robot, start)])
         self._price = cost.of_ends(self._postures)

@@ -91,7 +91,7 @@ class PlannedTension(NamedTuple):
 
     @classmethod
     def at_bias(cls, robot: Robot) -> PlannedTension:
-        """Return tensions of T_bias, which apply before the first setpoint."""
+        """Return the tensions before the first setpoint, at which all muscles have T_bias."""
         bias = robot.tension.bias.copy()
         return cls(bias, bias, np.zeros(robot.joint_count))
 
@@ -124,7 +124,7 @@ class TensionPlan:
         self._friction = tendon_friction(self._robot, mae)
 
     def reset(self) -> None:
-        """Start from T_bias, with unknown sliding directions."""
+        """Start again from the tension bias of all muscles, with unknown sliding directions."""
         self.tension = PlannedTension.at_bias(self._robot)
         self._sliding = np.zeros(self._robot.muscle_count)
         self._stiffening.reset()

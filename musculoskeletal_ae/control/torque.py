@@ -51,7 +51,7 @@ class TorqueControl(ActivityControl):
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the posture [rad], (D,), and a torque [N·m], (D,), added to gravity compensation."""
+        """Set the target posture [rad] and a torque [N·m] besides gravity compensation, (D,) each."""
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:

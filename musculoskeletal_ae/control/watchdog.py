@@ -67,7 +67,8 @@ class DataAge:
     def received(self, cause: StopCause, now: float) -> float:
         """Record that data was received; return the time since the previous data [s].
 
-        `cause` is the stop cause that occurs when this data is too old.
+        The result is 0 for the first data. `cause` is the stop cause that occurs when this data is
+        too old.
         """
         awake, before = self.awake(now), self._came_at[cause]
         self._came_at[cause] = awake
@@ -93,7 +94,7 @@ class DataAge:
         ]
 
     def clock_jumped_back(self) -> None:
-        """Restart the comparison of the clocks after a backward jump."""
+        """Restart the comparison of the clocks, because the messages' clock has jumped back."""
         self._time, self.pace = math.nan, 1.0
 
     def step(self, now: float, time: float, is_stopped: bool) -> Step:

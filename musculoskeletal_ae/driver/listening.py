@@ -120,7 +120,7 @@ class Listening:
 
     @property
     def measured(self) -> Array:
-        """The newest θ of the joint sensors [rad], (D,); NaN where it is unknown."""
+        """The newest angles of the joint sensors [rad], (D,); NaN where they are unknown."""
         return np.full_like(self._theta, math.nan) if self._stated else self._theta
 
     def muscles(self, message: object, now: float, sent: float = math.nan, number: int = 0) -> None:
@@ -270,7 +270,12 @@ class Listening:
         return fault.replace('tension', 'current')
 
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
-        """Check T and temperature in `states` (3, M) of modules without commands."""
+        """Check the tensions and temperatures of modules that have received no command.
+
+        Args:
+            verdict: Receives the results.
+            states: Medians of the published l, T and temperatures, (3, M).
+        """
         bias = self._robot.tension.bias
         # With position-controlled modules, T depends on the posture, so it is not compared.
         bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
@@ -291,10 +296,16 @@ class Listening:
     def _judge_lengths_and_joints(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Compare l with the model at θ (N, D).
+        """Compare the lengths with the model, and find faults of lengths or of joint sensors.
 
-        If several lengths have faults, and one fault of θ explains all of them, that fault is
-        reported instead.
+        If several lengths have faults, and a single fault of the joint sensors explains all of
+        them, only that fault is reported.
+
+        Args:
+            verdict: Receives the results.
+            theta: θ [rad], (N, D).
+            length: l [m], (N, M).
+            tension: T [N], (N, M).
         """
         lengths_verdict = Verdict(self._robot)
         misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
@@ -393,7 +404,7 @@ class Listening:
     def _judge_lengths(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> float:
-        """Compare l with the model.
+        """Compare the lengths with the geometric model, and report the faults of lengths.
 
         Args:
             verdict: Receives the results.

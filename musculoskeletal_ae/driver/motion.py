@@ -99,7 +99,11 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _command(self, length: Array) -> Array:
-        """Return the command [m], (M,), for the present targets at the measured l [m], (M,)."""
+        """Return the command [m], (M,), for the present targets.
+
+        Args:
+            length: Measured lengths [m], (M,).
+        """
 
     @abstractmethod
     def _hold(self) -> Wait:
@@ -191,11 +195,14 @@ class MotionTest(ABC):
         return int(is_wild.argmax()) if is_wild.any() else None
 
     def _readings(self) -> Array:
-        """Return l [m], T [N] and temperature [°C] of the last MEAN seconds, (N, 3, M)."""
+        """Return the readings of the last MEAN seconds, (N, 3, M).
+
+        Each reading consists of lengths [m], tensions [N] and temperatures [°C].
+        """
         return np.array([states for _, states in self._recent])
 
     def _noise(self) -> Array:
-        """Return the standard deviation [N] (M,) of T in the last MEAN seconds."""
+        """Return the standard deviations of the tensions [N], (M,), in the last MEAN seconds."""
         return np.std(self._readings()[:, 1], axis=0)
 
     def _go(self, m: int, goal: float) -> Wait:

@@ -173,5 +173,5 @@ class Positioning(MotionTest):
         verdict.passed('latency', m)
 
     def _may_go_on(self, m: int) -> bool:
-        """Return whether muscle m may be wound in further; if T is unknown, it may."""
+        """Return whether muscle m may be wound in further; True if its tension is unknown."""
         return not float(self._readings()[:, 1, m].mean()) > self._highest[m]

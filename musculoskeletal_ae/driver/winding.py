@@ -216,7 +216,11 @@ class Winding(MotionTest):
         return self._sent.copy()
 
     def _demanded(self, length: Array) -> Array:
-        """Return the tensions [N] (..., M) that the present commands demand at l [m] (..., M)."""
+        """Return the tensions [N], (..., M), that the present commands demand.
+
+        Args:
+            length: Measured lengths [m], (..., M).
+        """
         demand = self._robot.actuation.demanded(length, self._sent)
         assert demand is not None  # None only for modules that follow positions (`Positioning`)
         return demand
@@ -334,7 +338,10 @@ class Winding(MotionTest):
             self.verdict.passed('law', m)
 
     def _whose_tension(self, m: int, home: _Reading, last: _Reading) -> int:
-        """Return the muscle whose T responds when muscle m is wound in; m if no other one does."""
+        """Return the muscle whose tension responds when muscle m is wound in.
+
+        This is m itself unless the tension of another muscle responds instead.
+        """
         asked, got = last.demand - home.demand, last.tension - home.tension
         if asked[m] < 0.25 * (self._highest - self._bias)[m] or abs(got[m]) > 0.3 * asked[m]:
             return m
@@ -342,11 +349,15 @@ class Winding(MotionTest):
         return other if SLOPES[0] < (got - asked)[other] / asked[m] < SLOPES[1] else m
 
     def _find_onset(self, m: int, home: _Reading) -> Generator[None, None, float | None]:
-        """Return the l_target [m] at which T of muscle m begins to rise; None without a response.
+        """Return the target [m] at which the tension of muscle m begins to rise.
 
-        The target moves slowly inwards and outwards, past −l, where T would rise if a sign were
-        wrong. The search ends at the first response. It also ends if l or T stays exactly constant,
-        which shows that the sensor is not read any more.
+        The target moves slowly inwards and outwards, past the negative of the measured length,
+        where the tension would rise if a sign were wrong. The search ends at the first response. It
+        also ends if the length or the tension stays exactly constant, which shows that the sensor
+        is not read any more.
+
+        Returns:
+            The target, or None without a response.
         """
         home_length, far = (
             home.length[m],

@@ -23,7 +23,7 @@ class AnomalyLatch:
     """Latches the anomalies that messages of `anomaly_detected` report to one node."""
 
     def __init__(self, node: Node, follow: Callable[[bool], object]) -> None:
-        """Begin without an anomaly.
+        """Start without an anomaly.
 
         Args:
             node: The node; it calls the service of the estimator.

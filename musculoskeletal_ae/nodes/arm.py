@@ -131,9 +131,9 @@ class Arm(Shell):
         self.listen(WrenchStamped, topic, lambda m: follow(read_wrench(m, frame)), RELIABLE)
 
     def follow_length_commands(self, follow: Callable[[Array], object]) -> None:
-        """Call `follow` with each commanded l_target [m], (M,).
+        """Call `follow` with each received length command l_target [m], (M,).
 
-        On a ros2_control robot, l_target is computed from the commands to the motors.
+        On a ros2_control robot, the length commands are computed from the commands to the motors.
         """
         if not self.motors.command_topic:
             self.follow_muscles('muscle_length_command', follow)

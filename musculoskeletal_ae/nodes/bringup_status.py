@@ -28,7 +28,7 @@ SETTLING = 4.0
 
 
 class BringupStatus(Shell):
-    """Prints the estimation error, the anomaly A, and the numbers of samples and checkpoints."""
+    """Prints the estimation error, the anomaly measure A, and counts of samples and checkpoints."""
 
     # The node is not watched for progress, because printing blocks while a terminal is paused.
     is_watched = False

@@ -38,7 +38,7 @@ class Candidates:
     def __init__(
         self, node: Shell, use: Callable[[Mae], None], on_candidate: Callable[[], None]
     ) -> None:
-        """Begin without a network.
+        """Start without a network.
 
         Args:
             node: The estimator.

@@ -57,15 +57,15 @@ def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointStat
 
 
 def motor_command(motors: MotorInterface, length: Array) -> Float64MultiArray:
-    """Return the message that commands l_target [m], (M,), to the motors of ros2_control.
+    """Return the message that commands lengths [m], (M,), to the motors of a ros2_control robot.
 
-    Like other commands to ros2_control, it has no layout.
+    Like other commands to ros2_control, the message has no layout.
     """
     return Float64MultiArray(data=array('d', motors.command(length).tobytes()))
 
 
 def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: Time) -> JointState:
-    """Return the JointState of the muscles' motors at l [m], (M,), and T [N], (M,)."""
+    """Return the JointState of the muscles' motors for lengths [m] and tensions [N], (M,) each."""
     names, position, effort = motors.joint_values(length, tension)
     message = joint_message(names, position, stamp)
     message.velocity = array('d', [math.nan] * len(names))

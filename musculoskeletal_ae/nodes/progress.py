@@ -116,9 +116,9 @@ class ProgressWatch:
 
 
 def _is_patient() -> bool:
-    """Return whether the main thread runs a debugger or compiler, which may take long.
+    """Return whether the main thread runs code that may take long without being stuck.
 
-    These are the modules in SLOW_MODULES.
+    SLOW_MODULES lists the modules with such code, which are debuggers and a compiler.
     """
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     while frame is not None:

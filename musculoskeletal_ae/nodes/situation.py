@@ -112,7 +112,7 @@ class Situation:
     """
 
     def __init__(self, namespace: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin without reports; `clock` returns steady time [s]."""
+        """Start without reports; `clock` returns the time of a steady clock [s]."""
         self._clock, self._awake = clock, AwakeClock(TICK)
         self._here = namespace.rstrip('/')
         self.detected = False

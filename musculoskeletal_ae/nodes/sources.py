@@ -4,7 +4,7 @@
 A message does not name its sender, so this module looks at the ROS graph. While several nodes
 publish a topic of `AUTHORS`, the nodes that use the topic reject its messages and report an ERROR,
 and the controller stops. Afterwards nodes resubscribe to latched topics to receive the value again.
-Only a node that takes the place of an arm follows commands of several publishers (`arm.Arm`).
+Only a node that replaces a real arm obeys the commands of several publishers (`arm.Arm`).
 
 Two publishers with the same node name do not prove that two nodes run. A killed node stays in the
 graph for up to 20 s beside its successor, but sends no more messages. Any of these signs proves
@@ -213,7 +213,7 @@ class Sources:
         turns: Counter[str],
         renew: Callable[[str], object],
     ) -> None:
-        """Begin without topics.
+        """Start without topics to watch.
 
         Args:
             node: Node whose view of the graph is used.

@@ -46,7 +46,7 @@ class StopRecording:
         directory: Path | None = None,
         topics: Mapping[str, Topic] = TOPICS,
     ) -> None:
-        """Begin without messages.
+        """Start without messages.
 
         Args:
             resolve: Returns the full name of a topic.

@@ -36,7 +36,7 @@ class Layout(NamedTuple):
 
 
 class MuscleReading(NamedTuple):
-    """l [m], T [N] and temperature [°C] in the format of a muscle_states message."""
+    """Lengths [m], tensions [N] and temperatures [°C] in the format of a muscle_states message."""
 
     data: Array  # (3·M,)
     layout: Layout = Layout()
@@ -143,13 +143,20 @@ class MotorInterface:
         return MuscleReading(rows.ravel())
 
     def command(self, length: Array) -> Array:
-        """Return the motor positions for l_target [m], (M,), in the order of the motor commands."""
+        """Return the motor positions that command lengths, in the order of the motor commands.
+
+        Args:
+            length: Length commands [m], (M,), in the order of the muscles.
+        """
         return self._position(length)[self._order]
 
     # -- the reverse conversion, for emulated arms -----------------------------------------------
 
     def take_command(self, follow: Callable[[Array], object]) -> Callable[[Any], None]:
-        """Return a callback that converts motor commands, and calls `follow` with l_target [m]."""
+        """Return a callback that converts motor commands to length commands.
+
+        The callback calls `follow` with the length commands [m], (M,).
+        """
 
         def take(message: Any) -> None:
             position = np.empty(len(self._order))
@@ -159,7 +166,12 @@ class MotorInterface:
         return take
 
     def joint_values(self, length: Array, tension: Array) -> tuple[tuple[str, ...], Array, Array]:
-        """Return names, positions and efforts of the motors for l [m] and T [N], (M,) each."""
+        """Return names, positions and efforts of the motors for given muscle states.
+
+        Args:
+            length: Lengths [m], (M,).
+            tension: Tensions [N], (M,).
+        """
         effort = tension / self._tension_per_effort + self._effort_zero
         return tuple(self._motors), self._position(length), effort
 

@@ -214,7 +214,7 @@ class MuscleStream:
         self._delay = 0.0  # delay of the newest message, accepted or not [s]
 
     def use_transmission(self, transmission: Transmission) -> None:
-        """Convert readings of tension to T and T_end by this transmission from now on."""
+        """From now on, compute motor-side and bone-side tensions by this transmission."""
         if self._robot.tension_source.is_current and transmission.drive is None:
             unknown = Transmission.unknown(self._robot.description.tension.limit)
             transmission = replace(unknown, friction=transmission.friction)
@@ -322,8 +322,8 @@ class MuscleStream:
         """Check all values for plausible levels, and the lengths for jumps.
 
         Args:
-            read: l, T_read and temperature as measured, (3, M).
-            states: The same values with the length offset removed from l, (3, M).
+            read: Lengths [m], tensions [N] and temperatures [°C] as measured, (3, M).
+            states: The same values with the length offset removed from the lengths, (3, M).
             now: Time of reception by a steady clock [s].
         """
         known, used = self.body.offsets.known, self.body.used

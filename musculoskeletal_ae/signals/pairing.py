@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs each (T, l) with the θ nearest in time, within half a period of the muscle messages.
+"""Pairs each message of the muscle modules with the posture θ that is nearest in time.
 
-A θ between two messages of the muscle modules belongs to the nearer one, or to the earlier one if
-both are equally near. Hence no θ is used twice. The rule applies to each joint separately, because
-several nodes may publish different joints at different times. Live arms and recordings use the same
-rule.
+The posture must be within half a period of the muscle messages. A posture between two muscle
+messages belongs to the nearer one, or to the earlier one if both are equally near. Hence no posture
+is used twice. The rule applies to each joint separately, because several nodes may publish
+different joints at different times. Live arms and recordings use the same rule.
 """
 
 import math
@@ -36,10 +36,13 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Pairs each muscle message with θ, and returns the pair when the next message arrives."""
+    """Pairs each muscle message with the nearest posture θ.
+
+    The pair is complete, and is returned, when the next muscle message arrives.
+    """
 
     def __init__(self, period: float) -> None:
-        """Start; `period` is the period of the muscle messages [s]."""
+        """Start without messages; `period` is the period of the muscle messages [s]."""
         self._half = 0.5 * period + 1e-9
         self.reset()
 

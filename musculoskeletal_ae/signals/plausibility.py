@@ -33,7 +33,9 @@ class LevelCheck:
         self._slack = LIMITS.slack_share * robot.description.tension.bias
 
     def plausible_pull(self, states: Array, offset: Array) -> Array:
-        """Return l [m], with `offset` [m] removed, and T [N], together (2, M); −∞ if implausible.
+        """Return the plausible lengths [m] and tensions [N] of a message, together (2, M).
+
+        The length offsets `offset` [m], (M,), are subtracted. Implausible values become −∞.
 
         A length may exceed its range by `slack_length_margin`, because the module may have lost its
         length offset.
