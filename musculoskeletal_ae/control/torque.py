@@ -51,7 +51,10 @@ class TorqueControl(ActivityControl):
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the target posture [rad] and a torque [N·m] besides gravity compensation, (D,) each."""
+        """Set the target: a posture [rad], and a torque [N·m] besides gravity compensation.
+
+        Both arrays have the shape (D,).
+        """
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:
