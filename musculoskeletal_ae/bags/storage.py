@@ -131,7 +131,10 @@ def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
 
 
 def add_topic(topics: dict[str, BagTopic], topic: BagTopic, file: Path) -> BagTopic:
-    """Add a topic, or add its messages to the topic of the same name; return the topic.
+    """Add a topic to `topics`, or its message count to the topic of the same name.
+
+    Returns:
+        The topic in `topics`.
 
     Raises:
         BagError: If the topic of the same name has another type or definition.

@@ -269,7 +269,9 @@ def _deliver(
     clock_offsets: Mapping[str, int],
     reception: Reception,
 ) -> None:
-    """Call the functions that wait for a topic with each message, as (arrival, decoded content).
+    """Read the messages of a bag, and pass each one to the functions for its topic.
+
+    The functions receive pairs (arrival, decoded content).
 
     Args:
         bag: The recording.

@@ -61,7 +61,7 @@ Parts = namedtuple('Parts', 'routes placed body constants muscle joint command w
 
 @njit(cache=True)
 def tension_from_elongation(elongation: float, force: float, rate: float, stretch: float) -> float:
-    """Return the tension T [N] at which a tendon and its series elastic element are this elongated.
+    """Return the tension T [N] of a tendon and its series elastic element at an elongation.
 
         ln(1 + T/force)/rate + stretch·T = elongation
 

@@ -37,7 +37,7 @@ POSTURES = 200  # number of postures over which moment arms are averaged
 
 
 def effects(robot: Robot) -> Effects:
-    """Return the sizes of the deviations of sensors, series elastic elements and friction."""
+    """Return how far an individual's sensors, elastic elements and friction may deviate."""
     return replace(
         NONE,
         stiffness=0.2,

@@ -73,7 +73,7 @@ NONE = Effects(**{field.name: 0.0 for field in fields(Effects)})
 
 
 class Draw:
-    """Random draws of one individual. Each draw depends only on the seed and on its own name."""
+    """Random draws of one individual; each depends only on the seed and on the name of the draw."""
 
     def __init__(self, seed: int, effects: Effects) -> None:
         self._seed, self.sizes = seed, effects

@@ -41,7 +41,7 @@ OTHER_ROUTE = 0.02  # tolerated difference of a file's route lengths [m]
 class ForeignBody:
     """True lengths, moment arms, elastic laws and sensor errors of one arm.
 
-    They hold for an arm at rest whose tendons have not aged.
+    These properties are those of the arm at rest, before its tendons have aged.
     """
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
@@ -263,7 +263,7 @@ class Ageing:
 
 
 class ForeignArm(Arm):
-    """An arm simulated by MuJoCo."""
+    """An emulated arm that MuJoCo simulates: emulator model `foreign`, or a user's MJCF file."""
 
     def __init__(
         self,
@@ -391,7 +391,10 @@ class ForeignArm(Arm):
         self._sensors.stand(theta)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ [rad], (D,), as `Arm.reset` does; tendons do not become new."""
+        """Put the arm at rest at θ [rad], (D,), as `Arm.reset` does.
+
+        The age of the tendons, and thus their lengthening, does not change.
+        """
         super().reset(theta)
         self._memory.rest[:] = 1.0
         for m in range(self.robot.muscle_count):

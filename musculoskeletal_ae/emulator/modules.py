@@ -172,7 +172,7 @@ def wind(
 def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
     """Turn motor m for one step of 1 ms, and return the length that was wound in [m].
 
-    A positive `speed` [m/s] pays out. The motor stops at the limits of its length.
+    A positive `speed` [m/s] pays out. The motor stops at the length limits of the module.
     """
     before = muscle.length[m]
     after = min(modules.length_high[m], max(modules.length_low[m], before + STEP * speed))
@@ -329,15 +329,18 @@ class Arm(ABC):
 
     @property
     def safe(self) -> bool:
-        """Whether the modules are in the safe state, because no command has come recently."""
+        """Whether the modules ignore the last command, because it is too old (safe state)."""
         return self._kind == SAFE
 
     def command_length(self, length: Array) -> None:
-        """Follow target lengths [m], shape (M,), by muscle stiffness control or as positions."""
+        """Let the modules follow target lengths [m], shape (M,).
+
+        The robot description says whether they use muscle stiffness control or position control.
+        """
         self._follow(FOLLOW_LENGTH, length)
 
     def command_tension(self, tension: Array) -> None:
-        """Follow target tensions [N], shape (M,).
+        """Let the modules follow target tensions [N], shape (M,).
 
         Raises:
             MusculoskeletalError: If the modules follow positions; nothing changes then.
@@ -440,8 +443,8 @@ class Arm(ABC):
     def _read_currents(self, tension: Array) -> Array:
         """Return the tensions that noisy motor currents indicate [N], (M,).
 
-        They include the friction of the drive, which a motor carries in addition to the tension of
-        its tendon.
+        These tensions include the friction of the drive, which a motor carries in addition to the
+        tension of its tendon.
 
         Args:
             tension: Tensions without noise [N], (M,), as from `_raw_readings`.

@@ -137,9 +137,15 @@ def place(routes: WrappedRoutes, q: Array, placed: Placed) -> None:
 
 @njit(cache=True)
 def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Array, Array]:
-    """Return absolute lengths [m] (N, M) and their Jacobian [m/rad] (N, M, J−1) at q (N, J−1).
+    """Return the route lengths of all muscles, and their derivatives, in N postures.
 
-    `placed` is a buffer for intermediate results.
+    Args:
+        routes: The routes.
+        q: Positions of all joints of the tree [rad] or [m], (N, J−1).
+        placed: Buffer for intermediate results.
+
+    Returns:
+        Lengths [m], (N, M), and their derivatives with respect to q [m/rad], (N, M, J−1).
     """
     lengths = np.zeros((q.shape[0], placed.absolute.shape[0]))
     jacobian = np.zeros((*lengths.shape, q.shape[1]))

@@ -68,7 +68,7 @@ class CheckpointValidator:
 
     @property
     def mae(self) -> Mae | None:
-        """The network in use."""
+        """The network in use; None before the first."""
         return self._used[-1][1] if self._used else None
 
     def message(
@@ -134,7 +134,7 @@ class CheckpointValidator:
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
-        """Record that a network took over at `now` [s]."""
+        """Record that this network is in use from the time `now` [s] on."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
@@ -187,9 +187,10 @@ class CheckpointValidator:
         return detector.measures(mae, self._messages, self.isolated)
 
     def with_detector(self, mae: Mae, now: float) -> Mae:
-        """Return the network that takes over, with a calibrated detector if there is one.
+        """Return a network with a calibrated anomaly detector, if one is available.
 
-        If `mae` has no calibrated detector of its own, it inherits the detector in use.
+        If `mae` has no calibrated detector of its own, the copy that is returned has the detector
+        of the network in use.
         """
         statistics = None if self.mae is None else self.mae.anomaly
         has_own = mae.anomaly is not None and mae.anomaly.calibrated

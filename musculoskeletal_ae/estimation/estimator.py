@@ -238,7 +238,7 @@ class Estimator:
         """Clear the anomaly, and consider the body healthy in its present state.
 
         If the length of the suspect has jumped since the finding, its length offset is checked
-        first. If this offset is wrong, all length offsets become unknown.
+        first. If this offset is wrong, all length offsets become unreliable.
 
         Raises:
             MusculoskeletalError: If the length offsets are unreliable, and joint sensors do not

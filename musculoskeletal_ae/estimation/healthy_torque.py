@@ -29,9 +29,9 @@ LEAST_SPREAD = 1e-3  # smallest σ [N·m]
 
 
 class HealthyTorque:
-    """Measures the residual torque σ of a healthy arm over the last minutes of motion.
+    """Measures the external torque σ that is wrongly estimated for a healthy moving arm.
 
-    `use` must be called before `step`.
+    The average covers the last minutes of motion. `use` must be called before `step`.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -44,10 +44,10 @@ class HealthyTorque:
         self._square, self._time = np.zeros_like(self._radian), 0.0
 
     def use(self, mae: Mae) -> Mae:
-        """Use another network, and return it with the measured residual torque σ.
+        """Use another network, and return a copy that contains the residual torque σ measured here.
 
-        A network that contains no σ is returned unchanged. Until the arm has moved, σ is that of
-        the network.
+        A network that contains no σ is returned unchanged. Until the arm has moved, the copy has
+        the σ of the network itself.
         """
         if (known := mae.touch) is None:
             self._mae = mae

@@ -63,7 +63,7 @@ class Prediction(NamedTuple):
     elastic: Array  # ε, standard deviation of the elongations [m], (M,)
 
     def limit(self, muscle: int, sigmas: float) -> float:
-        """Return `sigmas` standard deviations of the predicted minus the measured length [m]."""
+        """Return the limit of one muscle's `excess` [m]: `sigmas` standard deviations."""
         return sigmas * math.sqrt(self.variance[muscle])
 
 

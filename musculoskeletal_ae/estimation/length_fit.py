@@ -76,7 +76,7 @@ LARGEST_DAMPING = 1e4  # damping at which the fit ends, because no step lowers t
 
 
 class Fit(NamedTuple):
-    """A fit to K moments.
+    """Length offsets and other constants that were fitted to the readings of K moments.
 
     Attributes:
         cost: −2 times the logarithm of the posterior, up to a constant; 0 if the joint angles were
@@ -126,7 +126,10 @@ class LengthFit:
         self._noise = np.concatenate((length_noise, self._torque_noise, LIMIT_NOISE * radian))
 
     def known_angles(self, moments: Moments) -> Fit:
-        """Return the fit to moments whose joint angles were measured."""
+        """Fit the offsets to moments whose joint angles were measured.
+
+        A moment is the mean of the readings over a short window.
+        """
         residual = moments.length - self._mae.lengths(moments.theta, moments.tension)
         muscle_count = self._robot.muscle_count
         constants = np.concatenate([residual.mean(axis=0), self._prior_mean[muscle_count:]])
@@ -237,7 +240,7 @@ class LengthFit:
     def _residuals(
         self, fit: Fit, moments: Moments, turning: Array, derivatives: bool = False
     ) -> tuple[Array, ...]:
-        """Return the residuals of lengths, torques and joint limits, divided by their noise.
+        """Return the residuals of lengths, torques and joint limits, in standard deviations.
 
         Args:
             fit: Constants and postures.

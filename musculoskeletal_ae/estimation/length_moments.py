@@ -23,7 +23,7 @@ MOST = 240  # largest number of moments that are kept
 
 
 class Moments(NamedTuple):
-    """Means of K short windows.
+    """Means of the readings over K short windows.
 
     Attributes:
         tension: Tensions [N], 0 for isolated muscles, (K, M).
@@ -46,7 +46,7 @@ class Moments(NamedTuple):
 
 
 class MomentCollector:
-    """Collects the moments of an arm that moves gently, or that stands in a stated posture.
+    """Averages the readings of an arm that moves gently or stands, over short windows (moments).
 
     Attributes:
         time: Duration of the gentle motion, or of standing [s].

@@ -67,7 +67,7 @@ class StateEstimator:
 
 
 def estimate_of(mae: Mae, state: State, bone_tension: Array, length: Array) -> Estimate:
-    """Complete the state that a network restored by its residual, anomaly score and covariance.
+    """Return a state that a network restored, with its residual, anomaly score and covariance.
 
     Args:
         mae: The network.

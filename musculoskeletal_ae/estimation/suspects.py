@@ -134,10 +134,10 @@ class SuspectHandling:
         return (*isolated, muscle)
 
     def explains(self, finding: Finding) -> bool:
-        """Return whether a finding is a length jump that comes from repairing the suspect muscle.
+        """Return whether a new finding is a length jump that the repair of a muscle explains.
 
-        Args:
-            finding: A new finding, while an earlier one may be latched.
+        This is the case if the latched finding concerns the same muscle and is to be remedied by
+        its repair.
         """
         suspected = self.finding
         if suspected is None or suspected.remedy != REPAIR:

@@ -141,7 +141,7 @@ class ModuleLaw:
         self.bias, self._stiffness = bias, stiffness
 
     def stretch(self, row: _Reading) -> float:
-        """Return by how much the length that the other muscles indicate exceeds the measured [m].
+        """Return the length that the other muscles indicate minus the measured length [m].
 
         The verdict on modules under muscle stiffness control does not use the result. For
         position-controlled modules, `PositionLaw` overrides this method.
@@ -224,7 +224,7 @@ class Verification:
     def step(
         self, tension: float, length: float, command: float | None, likely: float, dt: float
     ) -> Verdict | None:
-        """Add the readings of one message to the evidence, and classify the suspect when complete.
+        """Record the readings of one message, and classify the suspect once there are enough.
 
         Args:
             tension: Tension of the suspect [N].

@@ -179,7 +179,9 @@ class Actuation(ABC):
 
     @abstractmethod
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return the tension above T_bias that makes each module pay out at a speed [N], (M,).
+        """Return by how much the tension of a muscle that is paid out exceeds T_bias [N], (M,).
+
+        The tension is higher because the module lags behind its command.
 
         Args:
             lag: Time by which the modules lag behind their commands [s].
@@ -301,6 +303,8 @@ class StiffnessControl(Actuation):
 
             T = T_bias + max(0, K_stiff (l − l_target))
 
+        K_stiff is the control stiffness of each module.
+
         Args:
             length: Measured lengths l [m], (M,).
             command: Target lengths l_target [m], (M,).
@@ -324,7 +328,10 @@ class StiffnessControl(Actuation):
         return TENSION, wanted
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the length command [m], (M,), that demands T_bias or a higher present tension."""
+        """Return the length command that demands the present tension [m], (M,).
+
+        Where the present tension is below T_bias, the command demands T_bias.
+        """
         return self.length_for(length, tension, np.maximum(tension, self._bias))
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
@@ -345,11 +352,11 @@ class StiffnessControl(Actuation):
         return tension
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
-        """Return how much shorter than the length a command is that demands T_limit [m], (M,)."""
+        """Return the difference between the length and a command that demands T_limit [m], (M,)."""
         return self.largest_depth(limit)
 
     def largest_depth(self, limit: Array) -> Array:
-        """Return how much shorter than the length a command is that demands `limit` [m], (M,)."""
+        """Return the difference between the length and a command that demands `limit` [m], (M,)."""
         depth: Array = (limit - self._bias) / self._stiffness
         return depth
 
@@ -460,7 +467,7 @@ class PositionControl(Actuation):
         return self.release
 
     def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
-        """Return 0 m, because the module would wind in its lead even if the arm were blocked."""
+        """Return 0 m: the module would follow a leading command even if the arm were blocked."""
         return 0.0
 
     def recovered(self, shortest: Array, dt: float) -> Array:

@@ -5,8 +5,8 @@ For postures drawn uniformly within the joint limits, the check computes
 
 - the tension nearest to 0.3 T_limit within [T_bias, T_limit] that holds weight and springs,
 - the joint stiffness at that tension (`stiffness`), with the springs, and
-- the moment arms r(θ) = −G(θ) [m], the joint torque for one newton of tension. A muscle with r > 0
-  moves the joint in its positive direction.
+- the moment arms r(θ) = −∂l/∂θ [m], the joint torque for one newton of tension. A muscle with
+  r > 0 moves the joint in its positive direction.
 
 To give all joints the same unit, the check assumes that a pinion of radius RACK moves each
 prismatic joint. A tendon parallel to the axis of the joint then has r = RACK.
@@ -108,7 +108,7 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
-        """Compute the quantities of a robot in postures θ [rad] or [m], (N, D)."""
+        """Return a robot in postures θ [rad] or [m], (N, D), with all quantities computed."""
         jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
         hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
         weight = radian * robot.kinematics.weight_torque(theta)

@@ -75,9 +75,9 @@ def draw_arm(robot: Robot, theta: Array, tension: Array, points: Array | None = 
 
 
 def _within(line: Line, middle: Array, reach: float) -> Line:
-    """Return the part of a bone inside the cube `middle` ± `reach` [m]; without points if outside.
+    """Return the part of a bone that lies inside the cube `middle` ± `reach` [m].
 
-    The line of a muscle is returned unchanged.
+    The result has no points if the bone lies outside. The line of a muscle is returned unchanged.
     """
     if line.kind != 'bones':
         return line

@@ -30,9 +30,9 @@ PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismati
 
 
 class JointPoses(NamedTuple):
-    """Poses of pinocchio's joints in the root link's frame in N postures.
+    """Poses of pinocchio's J joints in the root link's frame, in N postures.
 
-    Index 0 along the axis of J joints is the root link itself.
+    Joint 0 is the root link itself.
     """
 
     rotation: Array  # rotation matrices, (N, J, 3, 3)

@@ -197,7 +197,7 @@ class MuscleFile(Strict, frozen=True):
         self._check_actuation()
 
     def _check_drives(self) -> None:
-        """Check that the file describes motors (`drive`) exactly if motor currents are measured."""
+        """Check that motors are described (`drive`) if and only if their currents are measured."""
         owners = [each.name for each in self.muscles if each.drive is not None]
         if self.tension_source == 'current':
             if self.drive is None and len(owners) < len(self.muscles):
@@ -212,7 +212,7 @@ class MuscleFile(Strict, frozen=True):
             )
 
     def _check_actuation(self) -> None:
-        """Check that the file has no key of the kind of muscle modules that it does not select."""
+        """Check that the file has no key that belongs to the other kind of muscle modules."""
         is_position = self.actuation == 'position'
         if self.tension_source != 'sensor' and not is_position:
             raise ValueError(

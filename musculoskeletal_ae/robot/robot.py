@@ -89,7 +89,8 @@ class Robot:
     def elongation(self, tension: Array) -> Array:
         """Return the elongation of series elastic elements and tendons [m], (M,).
 
-        The tendons have their lengths at θ = 0. `tension` are the tensions [N], (M,).
+        The stretch of the tendons is that of their lengths at θ = 0. `tension` are the tensions
+        [N], (M,).
         """
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
 
@@ -157,8 +158,8 @@ class Robot:
         """Return an upper limit of the load of each joint in N postures [N·m], (D,).
 
         The load of a joint is the magnitude of its holding torque, plus the magnitudes of the
-        torques that the muscles exert on it at T_bias. The limit adds the largest value of either
-        part over the postures.
+        torques that the muscles exert on it at T_bias. The limit is the sum of the largest values
+        that these two parts have in any posture.
 
         Args:
             torque: Torque that holds the arm in N postures [N·m], (N, D).

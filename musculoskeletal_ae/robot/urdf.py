@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read robot.urdf with pinocchio, after a check of its structure and its numbers.
 
-The URDF parser silently ignores what it does not understand, so the file is checked here first. The
-parser only warns about a missing or malformed mass or inertia, and continues with a massless link.
-If a file still contains xacro macros, the parser ignores the macros and reads the rest.
+The URDF parser silently ignores elements that it does not know, so the file is checked here first.
+The parser only warns about a missing or malformed mass or inertia, and continues with a massless
+link. If a file still contains xacro macros, it ignores the macros and reads the rest.
 """
 
 import math

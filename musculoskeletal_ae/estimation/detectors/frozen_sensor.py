@@ -18,7 +18,7 @@ MOVED = 0.006  # predicted motion of the muscle above which its constant reading
 
 
 class FrozenSensor(Detector):
-    """Predicts, from the other muscles, the length of a muscle whose reading is constant."""
+    """Reports a muscle whose reading is constant although other muscles indicate its motion."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
@@ -42,7 +42,10 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle whose reading is constant while the other muscles indicate its motion."""
+        """Report a muscle whose reading is constant while the other muscles indicate its motion.
+
+        The result is None if there is no such muscle.
+        """
         sample, robot = observation.sample, self._robot
         tension, mae = sample.model_tension, self._mae
         readings = np.array([sample.length_read, tension])

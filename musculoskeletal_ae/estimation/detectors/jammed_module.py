@@ -33,7 +33,7 @@ JAM_SHARE = 0.3
 
 
 class JammedModule(Detector):
-    """Measures how long each winch has been stationary although it should move."""
+    """Reports a winch that has been stationary for some time although it should move."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
@@ -50,7 +50,10 @@ class JammedModule(Detector):
         self._time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the winch that has been stationary longest, if at least for 1 s; or None."""
+        """Report the winch that has been stationary longest although it should move.
+
+        The result is None if no winch has been stationary for 1 s.
+        """
         is_far, length = self._is_far(observation), observation.sample.length
         if is_far is None:
             self._time[:] = 0.0
@@ -79,7 +82,7 @@ class JammedModule(Detector):
 
 
 class JammedPosition(JammedModule):
-    """Measures how long each position-controlled winch has been stationary away from its target."""
+    """Reports a position-controlled winch that has been stationary away from its target length."""
 
     def _is_far(self, observation: Observation) -> Bools | None:
         """Return which modules are far from their target length and could pull harder, (M,).

@@ -17,9 +17,9 @@ is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary e
 have this form. If some δθ explains most of Δ, the joint sensor with the largest δθ is reported;
 otherwise, the lengths are reported.
 
-If a tendon is shorter than l_net, a healthy one would be stretched and have tension. If such a
-tendon has no tension, it is ruptured, and its muscle is reported, provided that the lengths of all
-other muscles agree with θ. This is how a rupture is detected while no commands arrive.
+A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
+has no tension, it is ruptured. Its muscle is reported, provided that the lengths of all other
+muscles agree with θ. This is how a rupture is detected while no commands arrive.
 """
 
 from collections import deque
@@ -81,7 +81,7 @@ UNEXPLAINED = 0.5
 
 
 class JointDisagreement(Detector):
-    """Compares measured muscle lengths with those that the network computes for measured angles.
+    """Reports muscle lengths, or a joint sensor, if they indicate different postures.
 
     Attributes:
         gap: Measured minus computed length of each muscle [m], (M,); 0 for isolated muscles. None
@@ -107,13 +107,13 @@ class JointDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Discard the last messages, but not the usual difference, which remains valid."""
+        """Discard the last messages, but not the differences that are usual on the healthy arm."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Discard the last messages and the usual difference, when the length offsets change."""
+        """Discard the last messages and the usual differences, because length offsets change."""
         self.reset()
         self._healthy.clear()
         self._usual = None
@@ -130,7 +130,10 @@ class JointDisagreement(Detector):
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report lengths or a joint sensor if they have disagreed for more than 1 s; or None."""
+        """Report lengths or a joint sensor if they have disagreed for more than 1 s.
+
+        The result is None if there is nothing to report.
+        """
         self._since += observation.dt
         if self._since < SPACING - 1e-9 or self._mae is None:
             return None
@@ -163,12 +166,16 @@ class JointDisagreement(Detector):
             self._compute_usual()
 
     def _change(self, gap: Array) -> tuple[Array, Largest]:
-        """Return how much the lengths differ from what is usual [m], (M,), and the limits of that.
+        """Return how far the lengths differ from what is usual on the healthy arm, and the limits.
 
-        While the usual difference is unknown, it counts as 0, and the limits are wider.
+        While it is not known what is usual, a difference of 0 counts as usual, and the limits are
+        wider.
 
         Args:
             gap: Measured minus computed lengths [m], (M,).
+
+        Returns:
+            The difference of each length [m], (M,), and the limits of these differences.
         """
         assert self._mae is not None
         statistics = self._mae.anomaly

@@ -17,7 +17,7 @@ SILENT = 0.15  # time with NaN for the same muscle after which it is reported [s
 
 
 class MissingValues(Detector):
-    """Measures how long the same muscle has reported NaN."""
+    """Reports a muscle that has been the only one to report NaN for some time."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -27,9 +27,9 @@ class MissingValues(Detector):
         self._since = self._last = -math.inf
 
     def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
-        """Report the only muscle with NaN in a message, if it has had NaN for 0.15 s; or None.
+        """Report the only muscle with NaN in a message, if it has reported NaN for 0.15 s.
 
-        `Detector.read` describes the arguments.
+        The result is None if there is nothing to report. `Detector.read` describes the arguments.
         """
         known = self._robot.tension_source.measured(states[:2])
         is_missing = ~np.isfinite(known).all(axis=0) & usable

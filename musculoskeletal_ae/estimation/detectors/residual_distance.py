@@ -6,10 +6,9 @@
 The residual e is the difference between the tensions and lengths that the network restores from all
 readings (T_est, l_est) and the readings themselves (T, l). Its size A is published, but the healthy
 value of A varies with the posture. The decision is based on d instead, which relates the residual
-of every muscle to its healthy spread. The healthy
-mean μ and covariance Σ have to be measured on the real arm: with statistics of the geometric model,
-most healthy postures would count as anomalous. Without calibrated statistics, d is published, but
-not compared with a threshold.
+of every muscle to its healthy spread. The healthy mean μ and covariance Σ have to be measured on
+the real arm: with statistics of the geometric model, most healthy postures would count as
+anomalous. Without calibrated statistics, d is published, but not compared with a threshold.
 
 Threshold. Far from calibrated postures, the network is less accurate, so the threshold grows with
 the distance to the nearest one (`unfamiliarity`). It also grows in proportion to a tension above
@@ -76,10 +75,10 @@ class ResidualDistance(Detector):
 
         Args:
             robot: The nominal body.
-            settings: Settings; if their `anomaly_threshold` is above 0, it is compared with the
-                anomaly score A instead of d.
-            slack: The detector that knows which slack tendons are being wound in. Messages do not
-                count meanwhile; None if all messages count.
+            settings: If `anomaly_threshold` is above 0, the anomaly score A is compared with it,
+                and d is not used.
+            slack: The detector that knows which slack tendons are being wound in. Meanwhile,
+                messages do not count. If it is None, all messages count.
         """
         self._robot = self._complete_robot = robot
         self._settings, self._slack = settings, slack
@@ -91,7 +90,7 @@ class ResidualDistance(Detector):
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the healthy statistics come from the real arm."""
+        """Whether mean and covariance of healthy residuals were measured on the real arm."""
         return self._statistics is not None and self._statistics.calibrated
 
     def use(self, mae: Mae) -> None:

@@ -50,7 +50,7 @@ DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
 
 class SlackTendon(Detector):
-    """Measures how long each tendon has been slack, and whether it is being wound in.
+    """Reports a muscle whose tendon has been slack for some time and is not being wound in.
 
     Attributes:
         is_winding_in: Whether each tendon is slack and being wound in, (M,).
@@ -81,7 +81,10 @@ class SlackTendon(Detector):
         self._slack_time[:] = self._idle_time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has been slack for 0.5 s and is not being wound in; or None."""
+        """Report a muscle that has been slack for 0.5 s and is not being wound in.
+
+        The result is None if there is no such muscle.
+        """
         sample, theta, dt = observation.sample, observation.estimate.state.theta, observation.dt
         tension, length = sample.motor_tension, sample.length
         demand = self._demand(observation)
@@ -133,7 +136,7 @@ class SlackTendon(Detector):
 
 
 class StretchedTendon(SlackTendon):
-    """Measures how long each tendon has had no tension although it is stretched.
+    """Reports a muscle whose tendon has had no tension for some time although it is stretched.
 
     A tendon is stretched if its length is so short that a healthy tendon would have tension. This
     class is for position-controlled modules. They do not wind in slack by themselves, so
@@ -166,7 +169,10 @@ class StretchedTendon(SlackTendon):
         self._taut_predictions.clear()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle that has been stretched without tension for 0.5 s; or None."""
+        """Report a muscle that has been stretched without tension for 0.5 s.
+
+        The result is None if there is no such muscle.
+        """
         sample, used = observation.sample, self._robot.used
         lowest = self._slack_tension
         is_slack = (sample.motor_tension < lowest) & used

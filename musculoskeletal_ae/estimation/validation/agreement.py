@@ -3,8 +3,8 @@
 
 Three quantities are compared:
 
-    θ         the joint angles that the network estimates on the recent messages (mask ②)
-    lengths   the muscle lengths that the network computes at the same posture (mask ①)
+    θ         the joint angles that the network estimates on the recent messages
+    lengths   the muscle lengths that the network computes at the same posture
     shape     the change of these lengths from posture to posture, on fixed random states
 
 If joint sensors measured the postures, they are the reference. The limit of the median error of
@@ -52,7 +52,7 @@ BY_NETWORK = 'the network in use'  # source of a reference
 
 
 class Comparison(NamedTuple):
-    """Differences of one quantity from its reference."""
+    """How much one quantity of a candidate network differs from its reference."""
 
     name: str
     owners: tuple[str, ...]  # joint or muscle of each entry
@@ -161,9 +161,9 @@ class AgreementCheck:
         return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
 
     def _shape(self, mae: Mae) -> Comparison:
-        """Compare how muscle lengths change from posture to posture by two networks.
+        """Compare the network `mae` with the network in use by how lengths change with posture.
 
-        `mae` and the network in use compute the lengths at the same fixed states.
+        Both networks compute the muscle lengths at the same fixed states.
         """
         theta, tension = self._postures.theta, self._postures.tension
         used = np.delete(np.arange(self._robot.muscle_count), self._isolated)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps the last seconds of healthy messages, on which candidate networks are validated."""
+"""Stores the healthy messages of the last seconds, on which candidate networks are validated."""
 
 import math
 from collections import deque
