@@ -209,7 +209,10 @@ class Supervisor:
         self._fire(Event.VERIFIED if verifiable else Event.VERIFIED_IN_VAIN)
 
     def on_reset(self, present: Sequence[Condition]) -> Condition | None:
-        """End the stop, or return the first cause that is still present."""
+        """End the stop, and return None; if a cause is still present, return the first one instead.
+
+        In this case, the stop does not end.
+        """
         if present:
             return present[0]
         self.explored = False

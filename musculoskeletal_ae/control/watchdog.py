@@ -159,7 +159,10 @@ class Overload:
         return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the stop condition of an overload that has lasted longer than OVERLOAD_TIME."""
+        """Return the stop condition of an overload that has lasted longer than OVERLOAD_TIME.
+
+        The list is empty if there is no such overload.
+        """
         m = int(self._since.argmin())
         age = min(now - self._received_at, LONGEST_STEP)
         if self._sent_at + age - self._since[m] <= OVERLOAD_TIME:

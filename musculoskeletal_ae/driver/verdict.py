@@ -118,7 +118,7 @@ class Verdict:
         return f'no fault found; not judged: {"; ".join(parts)}'
 
     def _whose(self, muscles: Sequence[int]) -> str:
-        """Return the names of muscles as a list for a text, or 'all muscles'."""
+        """Return the names of muscles, separated by commas, or 'all muscles' for all of them."""
         if len(muscles) == self.robot.muscle_count:
             return 'all muscles'
         return ', '.join(self.robot.muscles[m] for m in muscles)

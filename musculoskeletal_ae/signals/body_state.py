@@ -72,7 +72,7 @@ class BodyState:
 
     Attributes:
         offsets: Length offsets of all muscles.
-        isolated: Indices of isolated muscles in T and l, in ascending order.
+        isolated: Indices of the isolated muscles, in ascending order.
         version: Number of changes so far.
     """
 

@@ -54,7 +54,7 @@ class MotorInterface:
     """
 
     def __init__(self, settings: MotorSettings, muscles: Sequence[str]) -> None:
-        """Connect motors to muscles.
+        """Assign motors to muscles according to the parameters.
 
         Args:
             settings: The parameters.
