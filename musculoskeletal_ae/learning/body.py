@@ -50,8 +50,9 @@ LARGEST_LOG = 1.5  # largest |κ|
 class Layout:
     """Positions of the parameters δ, κ, μ, o, r and v in the vector of one muscle.
 
-    The symbols are explained in the module. δ has three values for each route point. If tensions
-    come from motor currents, the vector also contains the constants γ, b and F of `Transmission`.
+    The docstring of the module explains the symbols. δ has three values for each route point. If
+    tensions come from motor currents, the vector also contains the constants γ, b and F of
+    `Transmission`.
     """
 
     def __init__(

@@ -106,7 +106,7 @@ def _at_stop(within: Array, span: float) -> Array:
 
 
 def _different(own: Array, elsewhere: Bools) -> Array:
-    """Return the readings of a joint at distinct rests; at most N.
+    """Return those readings of a joint that were taken at distinct rests.
 
     Repeated readings of a parked joint, or of an arm that returns to the same posture, would
     otherwise look like a cluster at a stop.

@@ -109,7 +109,7 @@ def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State
 
 
 def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
-    """Return up to which tension [N] each sample draws its random tensions, (count, M).
+    """Return the upper ends of the ranges from which random tensions are drawn [N], (count, M).
 
     In most samples, this is T_limit. In a random share OVERLOAD_SHARE, it is a random value between
     T_limit and T_max.

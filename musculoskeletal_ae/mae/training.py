@@ -113,7 +113,7 @@ OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
 class PairError(NamedTuple):
-    """Error of one output restored through one mask."""
+    """Error of one output that the network restores with one mask."""
 
     mask: Mask
     output: str  # 'theta', 'tension' or 'length'
