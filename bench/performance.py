@@ -238,8 +238,8 @@ def flames(network: Path, seconds: float, out: Path) -> str:
         time.sleep(SETTLING)
         for name, process in system.nodes.items():
             command = f'py-spy record --pid {process.pid} --duration {seconds:.0f} --output'.split()
-            command.append(str(out / f'{name}.svg'))
-            subprocess.run(command, stdout=subprocess.DEVNULL)
+            # The title of the graph is this command, and must not contain a path of this computer.
+            subprocess.run([*command, f'{name}.svg'], cwd=out, stdout=subprocess.DEVNULL)
     finally:
         system.end()
     return FLAMES.format(', '.join(f'[{name}](flames/{name}.svg)' for name in system.nodes))
