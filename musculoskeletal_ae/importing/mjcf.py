@@ -460,7 +460,7 @@ class _Reader:
         return np.array([min(lengths), max(lengths)])
 
     def _with_tendons(self, data: Any) -> Any:
-        """Update the tendon lengths of MuJoCo's data, and return the data."""
+        """Compute the tendon lengths for the positions in MuJoCo's data; return the data."""
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
         mujoco.mj_tendon(self.model, data)

@@ -36,7 +36,7 @@ def encode(message: object, type_name: str) -> bytes:
 
 
 def message_class(type_name: str) -> Any:
-    """Return the message class of a type, without ROS."""
+    """Return the class of a message type; ROS is not required."""
     return message_types.TYPESTORE.types[type_name]
 
 
