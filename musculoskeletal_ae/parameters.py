@@ -30,7 +30,7 @@ UNBOUNDED = 2**63 - 1  # largest integer of a ROS parameter
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value that a user may choose."""
+    """A value that a user may choose, with its default, meaning, unit and legal values."""
 
     default: Any  # also determines the type; a tuple for a list of numbers or names
     meaning: str  # description as one phrase
