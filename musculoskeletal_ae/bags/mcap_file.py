@@ -54,7 +54,7 @@ class _Span(NamedTuple):
 
 
 class McapFile:
-    """An mcap file; a file of a killed recorder is read up to its last complete record."""
+    """An mcap file. If its recorder was killed, it is read up to the last complete record."""
 
     def __init__(self, path: Path) -> None:
         """Read the whole file and verify its checksums.

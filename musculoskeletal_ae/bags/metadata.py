@@ -141,7 +141,9 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
 
 
 def read_metadata(directory: Path) -> Contents:
-    """Return the storage files that metadata.yaml names, or all if metadata.yaml is unusable.
+    """Return the storage files of a bag that metadata.yaml names.
+
+    If metadata.yaml is missing or invalid, all storage files in the directory are returned.
 
     Raises:
         BagError: If there are no storage files, or rosbag2 compressed the files or messages.

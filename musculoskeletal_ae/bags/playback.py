@@ -59,9 +59,10 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 
 
 def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
-    """Yield the messages to publish between two recorded times [ns].
+    """Yield the messages that playback publishes from one recorded time to another [ns].
 
-    The last latched messages before `start` come first, because a late joiner would receive them.
+    The last message before `start` of each latched topic comes first, because a subscriber that
+    joins at this time would receive it.
 
     Raises:
         BagError: If a message cannot be decoded; replay must not publish it.

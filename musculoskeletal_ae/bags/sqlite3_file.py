@@ -32,7 +32,7 @@ _DEFINITION_ENCODINGS = {
 
 
 class Sqlite3File:
-    """A sqlite3 file of rosbag2; the format has no checksums."""
+    """A sqlite3 file of rosbag2, a format without checksums."""
 
     has_checksums = False
 

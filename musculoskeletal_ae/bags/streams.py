@@ -75,8 +75,8 @@ class Streams(NamedTuple):
     def pairs(self) -> Pairs:
         """Pair each muscle message with the joint angles at the same time.
 
-        The rule is that of online learning on the robot (`signals/pairing.py`). Muscle messages
-        without matching joint angles are left out.
+        Online learning on the robot pairs messages in the same way (`signals/pairing.py`). Muscle
+        messages without matching joint angles are left out.
         """
         time = self.muscles.time
         pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)

@@ -59,7 +59,7 @@ def typical_arms(robot: Robot) -> Array:
 
 
 def slack(robot: Robot, draw: Draw) -> Array:
-    """Return a random error of each tendon's length [m], (M,), which offsets its length sensor."""
+    """Return a random error of each tendon's length [m], (M,): an offset of its length sensor."""
     sigma = np.minimum(SLACK * typical_arms(robot), LONGEST)
     return sigma * draw.rng('slack').normal(size=len(sigma))
 

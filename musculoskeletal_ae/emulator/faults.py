@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of tendons, motors, sensors and communication that can be switched while the arm moves.
+"""Faults of tendons, motors, sensors and communication, which can begin and end at any time.
 
 A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
 'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. If the line names no muscle or

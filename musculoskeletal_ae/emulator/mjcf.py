@@ -52,9 +52,12 @@ mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the 
 
 
 def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
-    """Return the body of a robot directory with the deviations of an individual, as an MjSpec.
+    """Return the MuJoCo model (an MjSpec) of one individual of a robot directory.
 
-    `again` holds how often the deviations of each muscle's route points are redrawn, (M,).
+    Args:
+        robot: The robot.
+        draw: The random draws of the individual.
+        again: How often the deviations of each muscle's route points are redrawn, (M,).
     """
     spec, bodies = skeleton(robot, draw)
     add_routes(robot, draw, again, spec, bodies)
@@ -435,7 +438,7 @@ def _moves(geom: Any) -> bool:
 
 
 def _equalities(spec: Any, kind: Any, names: set[str]) -> list[Any]:
-    """Return the equalities of a kind that refer to one of the named joints or tendons."""
+    """Return the equality constraints of a kind that refer to one of these joints or tendons."""
     equalities = [each for each in spec.equalities if each.type == kind]
     return [each for each in equalities if not names.isdisjoint([each.name1, each.name2])]
 

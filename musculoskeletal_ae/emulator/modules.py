@@ -293,7 +293,7 @@ class Arm(ABC):
 
     @abstractmethod
     def _stand(self, theta: Array) -> None:
-        """Put the bones at rest at θ [rad] (D,)."""
+        """Set the joint angles to θ [rad], (D,), with all joints at rest."""
 
     @property
     def theta(self) -> Array:

@@ -83,7 +83,7 @@ def _multiply(a: Array, b: Array, product: Array) -> None:
 
 @njit(cache=True)
 def point_of(placed: Placed, joint: int, point: Array) -> Vector:
-    """Transform a point [m] (3,) from a joint's frame to the root link's."""
+    """Transform a point [m] (3,) from a joint's frame to the root link's frame."""
     r, t = placed.rotation[joint], placed.translation[joint]
     return (
         t[0] + r[0, 0] * point[0] + r[0, 1] * point[1] + r[0, 2] * point[2],

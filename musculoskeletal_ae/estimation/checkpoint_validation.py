@@ -216,6 +216,6 @@ class CheckpointValidator:
 
     @cached_property
     def _likely_cause(self) -> str:
-        """Text on a property of the robot description that may cause a rejection, or ''."""
+        """Text on a property of the robot that may cause a rejection; '' if there is none."""
         warning = jump_warning(self._robot)
         return f' ({warning})' if warning else ''

@@ -140,7 +140,7 @@ class Estimator:
 
     @property
     def cause(self) -> str:
-        """The latched finding as a text for users, or ''."""
+        """The latched finding as a text for users; '' if there is none."""
         return self.suspects.cause
 
     # -- settings and services ------------------------------------------------------------------

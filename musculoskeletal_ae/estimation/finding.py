@@ -62,7 +62,7 @@ class Finding:
 
     @property
     def remedy(self) -> tuple[Step, ...]:
-        """The steps by which a user ends the anomaly, unless a verification ends it."""
+        """The steps by which a user ends the anomaly, if no verification of the muscle ends it."""
         return _REMEDIES.get(self.kind, REPAIR)
 
 

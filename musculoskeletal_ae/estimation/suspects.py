@@ -78,14 +78,14 @@ class SuspectHandling:
 
     @property
     def cause(self) -> str:
-        """The latched finding as a text for users, or ''."""
+        """The latched finding as a text for users; '' if there is none."""
         if self.finding is None:
             return ''
         return f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
 
     @property
     def advice(self) -> str:
-        """What ends the anomaly, as a text for users, or ''."""
+        """What ends the anomaly, as a text for users; '' without a latched finding."""
         if self.finding is None:
             return ''
         wait = 'wait until the muscle has been verified'
@@ -93,7 +93,7 @@ class SuspectHandling:
 
     @property
     def last_verification(self) -> str:
-        """The last verdict as a text for users, or ''."""
+        """The last verdict of a verification as a text for users; '' before the first."""
         if self.last_verdict is None:
             return ''
         muscle, verdict = self.last_verdict

@@ -344,9 +344,10 @@ class StiffnessControl(Actuation):
         return pulling
 
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return control stiffness times lag times speed [N], (M,).
+        """Return by how much the tension of a muscle that is paid out exceeds T_bias [N], (M,).
 
-        A module that pays out at a speed lags behind its command by `lag` times this speed.
+        A module that pays out at a speed lags behind its command by the length `lag` times speed.
+        The control stiffness converts this length into a tension.
         """
         tension: Array = self._stiffness * lag * speed
         return tension
@@ -421,7 +422,8 @@ class PositionControl(Actuation):
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:
         """Return the length command [m], (M,), that produces wanted tensions in the same posture.
 
-        The length changes by as much as the elongation of series elastic element and tendon.
+        The command differs from the present length by the change of the elongation of series
+        elastic element and tendon.
         """
         elongation = self._robot.elongation
         return length + elongation(tension) - elongation(wanted)

@@ -146,7 +146,7 @@ class RobotCheck:
 
 
 def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
-    """Check the muscles of a robot in random postures, and look for suspicious descriptions.
+    """Check the muscles of a robot in random postures, and its description for suspicious values.
 
     Args:
         robot: The robot.

@@ -421,7 +421,10 @@ def _read_tension(
 def _read_route(
     place: str, muscle: MuscleEntry, links: list[str], fail: Fail, warnings: list[str]
 ) -> Route:
-    """Return the route of a muscle; leave out repeated points, and append a warning for each."""
+    """Return the route of a muscle, without points that repeat the point before them.
+
+    A warning about each of these points is appended to `warnings`.
+    """
     route: list[RoutePoint | Wrap] = []
     for i, entry in enumerate(muscle.route):
         _check_link(f'{place}[{i}].link', entry.link, links, fail)

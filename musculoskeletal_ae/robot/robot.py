@@ -54,7 +54,11 @@ class Robot:
 
     @classmethod
     def load(cls, robot: str | Path) -> Robot:
-        """Load a shipped robot by name, or a robot directory; see `load_description` for errors."""
+        """Load a shipped robot by name, or a robot directory.
+
+        Raises:
+            RobotDescriptionError: If the description is invalid (`load_description`).
+        """
         return cls(load_description(robot))
 
     def limb(self, joints: Ints, muscles: Ints) -> Robot:

@@ -85,7 +85,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
 def parse_xml(file: Path, text: str) -> ET.Element:
     """Return the root element of an XML text.
 
-    A DOCTYPE is rejected, which excludes entities.
+    A DOCTYPE is rejected, so that the text cannot define entities.
 
     Raises:
         RobotDescriptionError: If the text is not valid XML, has a DOCTYPE or is nested too deeply.

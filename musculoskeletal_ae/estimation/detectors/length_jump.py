@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects lengths that jumped to new values and kept them, as when modules lose their offsets.
+"""Detects lengths that have jumped and stay at their new values.
 
-`signals/length_jumps.py` rejects messages with a jump. If the new lengths persist, it accepts them
-and names the muscles in the sample.
+This happens, for example, if muscle modules lose their length offsets. `signals/length_jumps.py`
+rejects messages with a jump. If the new lengths persist, messages are accepted again, and the first
+accepted sample names the muscles whose lengths have jumped.
 """
 
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
