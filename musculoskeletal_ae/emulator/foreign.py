@@ -72,13 +72,14 @@ class ForeignBody:
         mujoco.mj_fwdPosition(self._model, data)
         return data
 
-    def _routed(self, theta: Array) -> Any:
-        """Return an MjData with the lengths and moment arms of the tendons at θ [rad], (D,).
+    def _routed(self, q: Array) -> Any:
+        """Return an MjData with the lengths and moment arms of the tendons in one posture.
 
-        Contacts are not computed, because they would take most of the time in some files.
+        Contacts are not computed, because they would take most of the time in some files. `q` are
+        the positions of all joints of the tree [rad] or [m], (J−1,).
         """
         data = self._data
-        data.qpos[self.tree] = self._robot.kinematics.tree.angles(theta)
+        data.qpos[self.tree] = q
         mujoco.mj_kinematics(self._model, data)
         mujoco.mj_comPos(self._model, data)
         mujoco.mj_tendon(self._model, data)
@@ -86,7 +87,7 @@ class ForeignBody:
 
     def absolute_lengths(self, theta: Array) -> Array:
         """Return the lengths of the routes [m], (N, M), for joint angles θ [rad], (N, D)."""
-        data = (self._routed(row) for row in theta)
+        data = (self._routed(row) for row in self._robot.kinematics.tree.angles(theta))
         return np.stack([each.ten_length[self.tendon_ids] for each in data])
 
     def muscle_jacobian(self, theta: Array) -> Array:
@@ -94,11 +95,10 @@ class ForeignBody:
         model = self._model
         jacobian = np.empty((len(theta), model.ntendon, model.nv))
         rows = model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
-        for dense, angles in zip(jacobian, theta, strict=True):
-            mujoco.mju_sparse2dense(dense, self._routed(angles).ten_J, *rows)
-        return self._robot.kinematics.tree.of_theta(
-            jacobian[:, self.tendon_ids][:, :, self.tree], theta
-        )
+        tree = self._robot.kinematics.tree
+        for dense, q in zip(jacobian, tree.angles(theta), strict=True):
+            mujoco.mju_sparse2dense(dense, self._routed(q).ten_J, *rows)
+        return tree.of_theta(jacobian[:, self.tendon_ids][:, :, self.tree], theta)
 
     def muscle_lengths(self, theta: Array, tension: Array) -> Array:
         """Return the muscle lengths [m], (N, M), for joint angles (N, D) and tensions (N, M).
