@@ -63,12 +63,27 @@ def test_without_a_gpu_training_falls_back_to_the_cpu_with_a_warning(arm26, init
     assert 'cannot use it' in capfd.readouterr().err
 
 
-def test_a_training_process_that_hangs_is_replaced_and_its_job_repeated(
+def test_a_training_process_that_cannot_start_dies_or_hangs_is_replaced_and_its_job_repeated(
     process, initial, stage, monkeypatch
 ):
-    process.begin(initial)
+    def full(*_):
+        raise OSError('Cannot allocate memory')
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainers.SpawnProcess, 'start', full)
+        process.begin(initial)
+    assert 'Cannot allocate memory' in process.trouble
+    assert not process.ready
+
+    process.poll()
     process.submit(job(stage.store(3), steps=1))
+    os.kill(process.pid, signal.SIGKILL)
+    assert answer(process) is None
+    assert 'died (status -9)' in process.trouble
     assert answer(process)
+    assert process.trouble == ''
+    assert process.restarts == 2
+
     first = process.pid
     os.kill(first, signal.SIGSTOP)
     with monkeypatch.context() as patch:
@@ -82,29 +97,3 @@ def test_a_training_process_that_hangs_is_replaced_and_its_job_repeated(
     assert answer(process).mae.training.count('300 samples')
     assert process.trouble == ''
     assert process.pid != first
-
-
-def test_a_training_process_that_dies_is_replaced_and_its_job_repeated(process, initial, stage):
-    process.begin(initial)
-    process.submit(job(stage.store(3), steps=1))
-    os.kill(process.pid, signal.SIGKILL)
-    assert answer(process) is None
-    assert 'died (status -9)' in process.trouble
-    assert answer(process)
-    assert process.restarts == 1
-
-
-def test_a_training_process_that_cannot_be_started_is_started_later(
-    process, initial, stage, monkeypatch
-):
-    def full(*_):
-        raise OSError('Cannot allocate memory')
-
-    with monkeypatch.context() as patch:
-        patch.setattr(trainers.SpawnProcess, 'start', full)
-        process.begin(initial)
-    assert 'Cannot allocate memory' in process.trouble
-    assert not process.ready
-    process.poll()
-    process.submit(job(stage.store(3), steps=1))
-    assert answer(process)
