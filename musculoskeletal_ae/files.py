@@ -52,7 +52,7 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
         except OSError as error:
             raise refuse(file, f'cannot be read: {error.strerror}') from error
     if len(data) > largest:
-        raise refuse(file, f'is larger than {largest} bytes')
+        raise refuse(file, f'is larger than {largest} bytes, the largest legal size')
     return data
 
 
@@ -169,10 +169,10 @@ def _check(text: str) -> None:
             within.append(_Collection(anchor, count - 1, is_mapping))
         if count > MOST_ENTRIES:
             raise ValueError(
-                f'{where}: more than {MOST_ENTRIES} entries after aliases are expanded'
+                f'{where}: too many entries; legal: at most {MOST_ENTRIES}, with aliases expanded'
             )
         if len(within) > DEEPEST:
-            raise ValueError(f'{where}: entries are nested more than {DEEPEST} levels deep')
+            raise ValueError(f'{where}: nested too deeply; legal: at most {DEEPEST} levels')
 
 
 @contextmanager

@@ -44,7 +44,9 @@ def read_array(message: Any, rows: int, columns: int) -> Array:
     values = _values(message, rows, columns)
     finite = np.isfinite(values)
     if not finite.all():
-        raise MessageError('not finite', f'element {np.flatnonzero(~finite)[0]} of the data')
+        place = np.flatnonzero(~finite)[0]
+        detail = f'element {place} of the data is {values.flat[place]}; expected a finite number'
+        raise MessageError('not finite', detail)
     return values[0] if rows == 1 else values
 
 
@@ -76,7 +78,8 @@ def read_muscle_states(
     usable[2] |= np.isnan(values[2])
     if not usable.all():
         row, muscle = np.argwhere(~usable)[0]
-        raise MessageError('not finite', f'{QUANTITIES[row]} of muscle {muscle}')
+        stated = f'{QUANTITIES[row]} of muscle {muscle} is {values[row, muscle]}'
+        raise MessageError('not finite', f'{stated}; expected a finite number')
     return values
 
 
@@ -162,12 +165,13 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
     ):  # fmt: skip
         wrong = [name for name, value in zip(names, values) if not math.isfinite(value)]
         if wrong:
-            raise MessageError('not finite', f'{what} of {", ".join(wrong)}')
+            stated = f'{what} of {", ".join(wrong)}'
+            raise MessageError('not finite', f'{stated}; expected finite numbers')
     for name, effort in zip(names, efforts.tolist()):
         if abs(effort) > MOST_EFFORT:
             value, most = distinct(effort, math.copysign(MOST_EFFORT, effort))
-            legal = f'at most ±{most.lstrip("-")}'
-            raise MessageError('oversized', f'effort {value} N·m of {name}, {legal}')
+            legal = f'at most ±{most.lstrip("-")} N·m'
+            raise MessageError('oversized', f'effort of {name} is {value} N·m; legal: {legal}')
     return dict(zip(names, zip(message.position, efforts.tolist())))
 
 
@@ -205,7 +209,7 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
         raise MessageError('wrong frame', problem)
     acceleration = np.array([vector.x, vector.y, vector.z])
     if not np.isfinite(acceleration).all():
-        raise MessageError('not finite', 'an acceleration')
+        raise MessageError('not finite', 'an acceleration; expected finite numbers')
     norm = float(np.linalg.norm(acceleration))
     if not LEAST_GRAVITY <= norm <= MOST_GRAVITY:
         legal = f'{LEAST_GRAVITY:g} to {MOST_GRAVITY:g} (an IMU at rest measures 9.81)'
@@ -219,7 +223,7 @@ def read_wrench(message: Any, root_link: str) -> Array:
     The frame of the message must be `root_link` or empty; an empty frame counts as `root_link`.
     """
     if message.header.frame_id not in ('', root_link):
-        raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {root_link!r}')
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}; expected {root_link!r}')
     wrench = message.wrench
     return _six(wrench.force, wrench.torque, MOST_WRENCH, 'a force or torque')
 
@@ -228,7 +232,7 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
     """Return two vectors as one array (6,), whose elements must be finite and within ±`most`."""
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
-        raise MessageError('not finite', what)
+        raise MessageError('not finite', f'{what}; expected finite numbers')
     if (np.abs(values) > most).any():
         raise MessageError('oversized', f'{values}; legal: magnitudes of at most {most}')
     return values
@@ -277,19 +281,22 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> TrajectoryPoints | N
             'effort', 'the points have efforts; legal: positions, velocities, accelerations'
         )
     if velocity is None and acceleration is not None:
-        raise MessageError('wrong length', 'the points have accelerations, but no velocities')
+        detail = 'the points have accelerations, but no velocities; send both'
+        raise MessageError('wrong length', detail)
     spans = [point.time_from_start for point in points]
     time = np.array([span.sec + 1e-9 * span.nanosec for span in spans])
     if not (np.diff(time, prepend=-1e-9) > 0.0).all() or time[0] < 0.0:
-        raise MessageError('times negative or not increasing', str(time[:20].tolist()))
+        stated = f'{time[:20].tolist()}; expected increasing times of at least 0'
+        raise MessageError('times negative or not increasing', stated)
     columns = {'position': position, 'velocity': velocity, 'acceleration': acceleration}
     for what, column in columns.items():
         if column is not None and not np.isfinite(column).all():
             point, joint = np.argwhere(~np.isfinite(column))[0]
-            raise MessageError('not finite', f'{what} of {names[joint]} at point {point + 1}')
+            place = f'{what} of {names[joint]} at point {point + 1}'
+            raise MessageError('not finite', f'{place}; expected a finite number')
     if velocity is not None and np.abs(velocity[-1]).max() > LAST_VELOCITY:
         raise MessageError(
-            'moves at its end', f'last velocities {velocity[-1].tolist()}; expected 0'
+            'moves at its end', f'the last velocities are {velocity[-1].tolist()}; expected 0'
         )
     places = np.array([list(joints).index(name) for name in names])
     return TrajectoryPoints(places, time, position, velocity, acceleration)
@@ -323,7 +330,7 @@ def read_twist(message: Any, frame: str) -> Array:
     The frame of the message must be `frame`.
     """
     if message.header.frame_id != frame:
-        raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}; expected {frame!r}')
     twist = message.twist
     return _six(twist.linear, twist.angular, MOST_TWIST, 'a linear or angular velocity')
 
@@ -343,13 +350,13 @@ def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
     With `position_only`, the rotation in the message is ignored, and the result has none.
     """
     if message.header.frame_id != frame:
-        raise MessageError('wrong frame', f'{message.header.frame_id!r}, expected {frame!r}')
+        raise MessageError('wrong frame', f'{message.header.frame_id!r}; expected {frame!r}')
     position, turn = message.pose.position, message.pose.orientation
     values = np.array([turn.x, turn.y, turn.z, turn.w, position.x, position.y, position.z])
     if position_only:
         values[:4] = 0.0, 0.0, 0.0, 1.0
     if not np.isfinite(values).all():
-        raise MessageError('not finite', 'a position or orientation')
+        raise MessageError('not finite', 'a position or orientation; expected finite numbers')
     norm = np.linalg.norm(values[:4])
     if abs(norm - 1.0) > UNIT_TOLERANCE:
         detail = f'{values[:4]} has the norm {norm:.4g}; legal: 1 ± {UNIT_TOLERANCE:g}'

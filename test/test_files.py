@@ -153,11 +153,11 @@ def bomb(step):
 
 
 REFUSED_YAML = {
-    'nine to the sixteenth entries': (bomb('[{}]'), 'line 6: more than 100000 entries'),
-    'as many merged keys': (bomb('{{<<: [{}]}}'), 'line 6: more than 100000 entries'),
+    'nine to the sixteenth entries': (bomb('[{}]'), 'legal: at most 100000, with aliases'),
+    'as many merged keys': (bomb('{{<<: [{}]}}'), 'legal: at most 100000, with aliases'),
     'a list within itself': ('a: &a [*a]', 'alias *a has no anchor before it'),
     'a key twice': ('a: {b: 1, c: 2, b: 3}', "line 1: key 'b' is written twice"),
-    'too deep': ('[' * 100_000, 'more than 50 levels'),
+    'too deep': ('[' * 100_000, 'legal: at most 50 levels'),
     'an object of Python': ('!!python/object/apply:os.abort []', 'could not determine'),
     'no date': ('a: 2020-13-45', 'month must be in 1..12'),
     'two documents': ('a: 1\n---\nb: 2', 'expected a single document'),

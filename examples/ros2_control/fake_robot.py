@@ -83,7 +83,8 @@ class FakeRobot(Node):
         if all(map(math.isfinite, message.data)):
             self.commands = list(message.data)
         else:
-            self.get_logger().warning('Non-finite value received. Dropping message')
+            values = list(message.data)
+            self.get_logger().warning(f'ignored a command that is not finite: {values}')
 
     def update(self) -> None:
         """Read the hardware, publish its state, and write the last command, however old it is."""
@@ -97,8 +98,8 @@ class FakeRobot(Node):
         if self.commands is None:
             return
         if len(self.commands) != len(self.joints):
-            sizes = f'command size ({len(self.commands)}), interfaces ({len(self.joints)})'
-            self.get_logger().error(f'{sizes} do not match', throttle_duration_sec=1.0)
+            problem = f'a command has {len(self.commands)} values; expected {len(self.joints)}'
+            self.get_logger().error(problem, throttle_duration_sec=1.0)
             return
         self.hardware.write(dict(zip(self.joints, self.commands)))
 

@@ -153,7 +153,8 @@ class McapFile:
             self._expanded += record.uncompressed_size
             most = MOST_EXPANDED + LARGEST_EXPANSION * self._size
             if self._expanded > most:
-                raise ValueError(f'its {self._size} bytes decompress to more than {most} bytes')
+                problem = f'its {self._size} bytes decompress to more than {most} bytes'
+                raise ValueError(f'{problem}, the largest legal size')
             self.has_checksums &= record.uncompressed_crc != 0
         elif isinstance(record, Message):
             self.has_checksums = False
@@ -183,7 +184,7 @@ class McapFile:
         topic.problem = topic_problem(topic, channel.metadata.get('topic_type_hash', ''))
         topic = add_topic(self.topics, topic, self.path)
         if self._channels.setdefault(channel.id, topic) is not topic:
-            raise ValueError(f'channel {channel.id} has two topics')
+            raise ValueError(f'channel {channel.id} is declared for two topics')
 
     def _survey_message(self, message: Message) -> None:
         topic = self._channels[message.channel_id]
@@ -238,14 +239,15 @@ def _contents(record: McapRecord) -> list[McapRecord]:
     # The library would decompress any amount, but `_decompress` stops at the stated size.
     data = _decompress(record)
     if len(data) != record.uncompressed_size:
-        raise ValueError(f'a chunk does not decompress to {record.uncompressed_size} bytes')
+        size = record.uncompressed_size
+        raise ValueError(f'a chunk does not decompress to {size} bytes, the size that it states')
     return breakup_chunk(replace(record, compression='', data=data), validate_crc=True)
 
 
 def _decompress(chunk: Chunk) -> bytes:
     size = chunk.uncompressed_size
     if size > LARGEST_RECORD:
-        raise ValueError(f'a chunk of {size} bytes exceeds the limit of {LARGEST_RECORD}')
+        raise ValueError(f'a chunk has {size} bytes uncompressed; legal: at most {LARGEST_RECORD}')
     if chunk.compression == 'zstd':
         decompressor = zstandard.ZstdDecompressor(max_window_size=2 * LARGEST_RECORD)
         return decompressor.stream_reader(chunk.data, read_across_frames=True).read(size + 1)

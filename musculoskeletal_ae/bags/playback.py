@@ -51,7 +51,7 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
     """
     length = (bag.end - bag.start) / 1e9
     if start > length:
-        raise BagError(bag.path, f'is {length:.3f} s long', 'choose a smaller --start')
+        raise BagError(bag.path, f'is only {length:.3f} s long', 'choose a smaller --start')
     first = bag.start + round(start * 1e9)
     if duration is None or duration > length:
         return first, bag.end
@@ -175,11 +175,12 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
     if (gap := float(gaps.max())) > LONGEST_GAP:
         begin = f'which begins {time[gaps.argmax()]:.1f} s after the start of this part of the bag'
         problem = f'{topic} has a gap of {gap:.1f} s, {begin}'
-        raise BagError(bag.path, problem, 'choose a part without gaps with --start and --duration')
+        remedy = 'use --start and --duration to choose a part without gaps'
+        raise BagError(bag.path, problem, remedy)
     longest = SPACING * (MOST_ENTRIES // joint_count - 2)
     if span > longest:
         problem = f'the motion on {topic} lasts {span:.0f} s; legal: at most {longest:.0f} s'
-        raise BagError(bag.path, problem, 'choose a part with --start and --duration')
+        raise BagError(bag.path, problem, 'use --start and --duration to choose a shorter part')
 
 
 def _no_motion(bag: Bag, topic: str) -> BagError:

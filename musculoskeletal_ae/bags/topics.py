@@ -113,7 +113,7 @@ def select(
             kind = 'of the interface' if wanted[0] == ALL else 'to replay by default'
             legal = '--topics NAME,…' if wanted[0] == ALL else f'--topics {ALL} or --topics NAME,…'
             problem = f'has no topic {kind}; {topics_of_bag}'
-            raise BagError(bag.path, problem, f'choose with {legal}')
+            raise BagError(bag.path, problem, f'choose topics with {legal}')
     else:
         chosen = [name for one in wanted for name in names if one in (name, names[name])]
         for one in wanted:
@@ -263,9 +263,11 @@ def _compare_type(bag: Bag, name: str, expected: str, leave_out: str = '') -> No
     """
     topic = bag.topics[name]
     if topic.type != expected:
-        problem = f'topic {name} has the type {topic.type[:80]!r}, but the interface uses this '
+        problem = (
+            f'topic {name} has the type {topic.type[:80]!r}; legal for this name: {expected!r}'
+        )
         remedy = f'record the topic under another name{leave_out}'
-        raise BagError(bag.path, f'{problem}name for {expected!r}', remedy)
+        raise BagError(bag.path, problem, remedy)
     if topic.problem:
         remedy = f'record the topic with ROS 2 Jazzy{leave_out}'
         raise BagError(bag.path, f'topic {name} {topic.problem}', remedy)

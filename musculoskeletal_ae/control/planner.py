@@ -196,7 +196,7 @@ class Planner:
         value, least, most = distinct(points.position[k, j], low[j], high[j], digits=4)
         raise MessageError(
             'beyond the joint limits',
-            f'{robot.joints[points.joints[j]]} {value}, legal: {least} to {most} {unit}',
+            f'{robot.joints[points.joints[j]]} is {value} {unit}; legal: {least} to {most} {unit}',
         )
 
     def _slowed(self, mae: Mae, planned: Trajectory) -> Trajectory:

@@ -105,7 +105,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
                 degree = len(coupling.terms) - 1
                 problem = f'the coupling of joint {name!r} is a polynomial of degree {degree}'
                 raise MusculoskeletalError(
-                    f'reality `foreign`: {problem}; MuJoCo allows up to 4; use reality `kin`'
+                    f'reality `foreign`: {problem}; legal in MuJoCo: at most 4; use reality `kin`'
                 )
             data[: len(coupling.terms)] = coupling.terms
             link = {'objtype': mujoco.mjtObj.mjOBJ_JOINT, 'name1': name, 'name2': coupling.master}

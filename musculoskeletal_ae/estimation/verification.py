@@ -106,11 +106,11 @@ class Verdict(NamedTuple):
     """The outcome of a verification, with its evidence."""
 
     outcome: Outcome
-    evidence: str = ''  # size of the fault, such as 'of 50 mm'
+    evidence: str = ''  # size of the fault, such as '50 mm'
 
     def __str__(self) -> str:
         text = _TEXTS[self.outcome]
-        return f'{text} {self.evidence}' if self.evidence else text
+        return f'{text} of {self.evidence}' if self.evidence else text
 
 
 class _Reading(NamedTuple):
@@ -274,7 +274,7 @@ class Verification:
         if np.ptp(tension) < FROZEN:
             return Verdict(Outcome.TENSION_SENSOR_FROZEN)
         if not is_slack and abs(beside) > FAR:
-            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'of {1e3 * beside:.0f} mm')
+            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'{1e3 * beside:.0f} mm')
         stands = abs(length[first_quarter].mean() - length[last_quarter].mean()) < STANDS
         close = CLOSE * self._scale
         rise, demanded_rise = reached - self._before[0], wanted - self._before[1]
@@ -310,7 +310,7 @@ class Verification:
         if math.isnan(tension):
             return Verdict(Outcome.TENSION_UNKNOWN)
         if abs(excess) > FAR:
-            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'of {1e3 * excess:.0f} mm')
+            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'{1e3 * excess:.0f} mm')
         rise, demanded = tension - self._before[0], demand - self._before[1]
         if rise >= SHARE * demanded or demanded <= CLOSE * self._scale:
             return Verdict(Outcome.HEALTHY)

@@ -62,11 +62,11 @@ def measure(args: Namespace) -> None:
         files += update_readme(args.readme, args.out)
     if args.page:
         files += update_page(args.page, args.out)
-    print(*files, f'{time.perf_counter() - start:.0f} s', sep='\n')
+    print(*files, f'finished after {time.perf_counter() - start:.0f} s', sep='\n')
     measured = read(args.out)
     if failed := failures({name: measured[name] for name in names}):
         problem = f'some experiments failed: {"; ".join(failed)}'
-        raise MusculoskeletalError(f'{problem}; the results of all others are written')
+        raise MusculoskeletalError(f'{problem}; the results of all other experiments are written')
 
 
 @contextmanager

@@ -50,7 +50,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
             source, centres = read(beside, tree, (limits, limits_file.name))
             break
     else:
-        raise refuse(file, 'its directory contains neither model.urdf nor model.sdf')
+        raise refuse(file, 'the directory of this file contains neither model.urdf nor model.sdf')
     if limits:
         known = [name for name in limits if source.model.existJointName(name)]
         source.note(

@@ -164,8 +164,8 @@ def play(robot: Robot, file: Path) -> int:
         return 0
     slower = needed / REAL_TIME
     print(
-        f'{message}, {slower:.2g} times as much as real time permits beside the other nodes; '
-        "`bringup.sh --mujoco` therefore lets all nodes follow the emulator's slower clock"
+        f'{message}, {slower:.2g} times the {REAL_TIME:g} s that are legal for real time beside '
+        "other nodes; `bringup.sh --mujoco` therefore lets all nodes use the emulator's own clock"
     )
     return SLOW
 

@@ -242,7 +242,7 @@ def serve(connection: Connection, directory: Path, preset: str, seed: int, devic
     try:
         train_on(device)
     except MusculoskeletalError as error:
-        print(f'{error}; learning on the CPU', file=sys.stderr, flush=True)
+        print(f'{error}; the learner uses the CPU instead', file=sys.stderr, flush=True)
     robot = Robot.load(directory)
     trainer = Trainer(robot, preset, seed)
     try:

@@ -245,8 +245,8 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
             if node == ALL_NODES:
                 continue
             if names := sorted(_keys(section) & MOTORS.keys()):
-                problem = f'{names[0]!r} is under {node!r}; state it under {ALL_NODES!r}, because '
-                raise _unreadable(file, f'{problem}all nodes and tools must use the same value')
+                problem = f'{names[0]!r} is under {node!r}, but all nodes must use the same value'
+                raise _unreadable(file, f'{problem}; state it under {ALL_NODES!r}')
         section = sections.get(ALL_NODES)
         parameters = section.get('ros__parameters') if isinstance(section, dict) else None
         if not isinstance(parameters, dict):

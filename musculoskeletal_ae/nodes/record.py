@@ -218,7 +218,7 @@ def parse(arguments: list[str]) -> Namespace:
     add = parser.add_argument
     directory_help = 'new directory (default: DATE-TIME_bag)'
     add('directory', nargs='?', type=Path, metavar='DIR', help=directory_help)
-    add('-o', '--out', type=Path, metavar='DIR', help='same as DIR')
+    add('-o', '--out', type=Path, metavar='DIR', help='another way to state DIR')
     add('--topics', type=names, metavar='LIST', help='topics, separated by commas (default: all)')
     parser.add_motors()
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
@@ -231,7 +231,7 @@ def parse(arguments: list[str]) -> Namespace:
     add('--recover', type=Path, metavar='BAG', help=recover_help)
     options = parser.parse_args(arguments)
     if options.directory and options.out:
-        parser.error('DIR is given twice; remove --out')
+        parser.error('DIR is given twice, the second time with --out; state it only once')
     if options.recover and (options.topics or options.duration):
         parser.error('--recover copies the whole recording: remove --topics and --duration')
     options.out = options.out or options.directory

@@ -256,7 +256,7 @@ def parse(arguments: list[str]) -> Namespace:
     rate = 'playback speed as a multiple of the recorded speed; needs --clock'
     add('--rate', type=number(1e-3, 1e3), default=1.0, help=rate)
     add('--clock', action='store_true', help='publish the recorded time on /clock')
-    add('--loop', action='store_true', help='after the end, start again')
+    add('--loop', action='store_true', help='start again after the end of the recording')
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='duration of the part to play [s]')
@@ -277,8 +277,8 @@ def _check_combination(parser: Parser, options: Namespace) -> None:
     """Exit with an error if options contradict each other or would have no effect."""
     if options.rate != 1 and not options.clock:
         parser.error(
-            '--rate other than 1 needs --clock, and nodes with use_sim_time: '
-            'by their own clocks the arm would seem faster or slower than it was'
+            '--rate other than 1 needs --clock, and nodes with use_sim_time, because nodes with '
+            'clocks of their own would compute wrong speeds; add --clock'
         )
     if options.robot and not options.check:
         parser.error('--robot requires --check; add it, or remove --robot')

@@ -52,7 +52,9 @@ def send_taught_motion(bag: Bag, options: Namespace, arguments: list[str]) -> in
     topic, spinner = name.removesuffix(TAUGHT_TOPIC) + TRAJECTORY, Spinner(node)
     _send(node, spinner, message, topic, options.wait)
     length = f'{len(message.points)} points, {motion.time[-1]:.1f} s'
-    print(f'{topic}: {length}; the first {LEAD_TIME:g} s lead to the beginning of the motion')
+    print(
+        f'{topic}: {length}; the first {LEAD_TIME:g} s move the arm to the beginning of the motion'
+    )
     return 0
 
 

@@ -87,7 +87,7 @@ class View(Node):
             page = import_heavy('musculoskeletal_ae.view.page')
         except ImportError as error:
             raise MusculoskeletalError(
-                'the page needs viser; install it by: pip install -r requirements.txt'
+                'the page needs viser; install it with: pip install -r requirements.txt'
             ) from error
         self.robot = robot
         self.motors = MotorInterface(motor_settings(options.params_file), robot.muscles)

@@ -81,7 +81,7 @@ class RouteEntry(Strict, frozen=True):
                 raise ValueError(f'axis, radius, side and side_link {legal}')
             return
         if self.divisor is not None:
-            raise ValueError('divisor: expected at a point where a branch begins; remove it here')
+            raise ValueError('divisor: legal only at a point where a branch begins; remove it here')
         if self.side_link is not None and self.side is None:
             raise ValueError("side_link needs side; key 'side' is missing")
         if self.radius is None:

@@ -101,7 +101,7 @@ def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:
     passed = 0.0
     with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
         if bar.disable:
-            print(f'{path}: learning from {total:.0f} s', flush=True)
+            print(f'{path}: learning from a recording of {total:.0f} s', flush=True)
 
         def progress(seconds: float) -> None:
             nonlocal passed, reported
@@ -210,10 +210,10 @@ def read(
     """
     bag = Bag.open(path)
     for reason in bag.unfinished:
-        print(f'warning: {path}: unfinished: {reason}', file=sys.stderr)
+        print(f'warning: {path} is unfinished: {reason}', file=sys.stderr)
     streams = read_streams(bag, robot, namespace, motors)
     for reason, count in streams.rejected.items():
-        print(f'warning: {path}: {count} messages rejected, {reason}', file=sys.stderr)
+        print(f'warning: {path}: {count} messages were rejected: {reason}', file=sys.stderr)
     for note in streams.notes:
         print(f'warning: {path}: {note}', file=sys.stderr)
     for part, count in streams.ignored.items():

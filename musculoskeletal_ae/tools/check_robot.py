@@ -31,11 +31,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--reach', type=number(1e-3, 1.0), help=text)
     args = parser.parse_args(argv)
     if args.suggest != bool(args.out):
-        parser.error('use --suggest and --out DIR, a new directory, together')
+        parser.error('--suggest needs --out DIR, a new directory, and --out needs --suggest')
     if args.out and args.out.exists():
-        parser.error(f'--out {args.out} exists; state --out DIR, a new directory')
+        parser.error(f'--out {args.out} exists already; name a new directory')
     if args.reach and not args.suggest:
-        parser.error('use --reach with --suggest only')
+        parser.error('--reach needs --suggest; add it, or remove --reach')
     args.reach = args.reach or REACH
     return exit_status(
         lambda: import_heavy('musculoskeletal_ae.tools.robot_report').check(args), out=args.out

@@ -65,13 +65,15 @@ def _suggested(robot: Robot, args: Namespace) -> int:
         return 1
     if after:
         reach = f'{1e3 * args.reach:g} mm'
-        print(f'moving each via point by at most {reach} does not make the robot sound;', end=' ')
+        problem = f'moving each via point by at most {reach} does not'
         if after >= before:
-            print('no candidate has fewer faults than the robot, and nothing was written')
+            print(f'{problem} reduce the number of faults; nothing was written')
             return 1
-        print('the best candidate is', end=' ')
+        print(f'{problem} make the robot sound; the best candidate is written')
     write(robot, change, args.out)
-    print(f'{args.out}: {np.sum(far > 0.0)} of {len(far)} points moved, up to {far.max():.1f} mm')
+    print(
+        f'{args.out}: {np.sum(far > 0.0)} of {len(far)} points moved, by up to {far.max():.1f} mm'
+    )
     for m, name in enumerate(robot.muscles):
         own = routes.muscle == m
         if (moved := far[np.union1d(routes.first[own], routes.second[own])]).any():

@@ -69,7 +69,7 @@ def test_a_window_lies_within_the_bag(bag, content):
     assert window(opened, 0.0, None) == (first, last)
     assert window(opened, 0.1, 0.2) == (first + SECOND // 10, first + 3 * SECOND // 10)
     assert window(opened, 0.5, 100.0) == (first + SECOND // 2, last)
-    with pytest.raises(BagError, match=r'is 0.620 s long; choose a smaller --start'):
+    with pytest.raises(BagError, match=r'is only 0.620 s long; choose a smaller --start'):
         window(opened, 1.0, None)
 
 

@@ -282,7 +282,7 @@ def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
 def test_an_impossible_request_is_reported_in_one_line(tool, bag):
     cases = [
         (('record', bag), 1, 'is not empty; name a new directory'),
-        (('replay', bag, '--start', '100'), 1, 'is 0.620 s long; choose a smaller --start'),
+        (('replay', bag, '--start', '100'), 1, 'is only 0.620 s long; choose a smaller --start'),
         (('replay', bag, '--ros-args', '-r', 'bad'), 2, "Couldn't parse remap rule"),
     ]
     started = [(tool(*arguments), *rest) for arguments, *rest in cases]

@@ -72,7 +72,7 @@ def test_bad_messages_of_a_recording_are_left_out_and_reported(robot, capsys):
     recording = read(BAGS / 'faults', robot)
     assert len(recording.time) > 2000
     errors = capsys.readouterr().err
-    assert '2 messages rejected, /muscle_states: not finite' in errors
+    assert '2 messages were rejected: /muscle_states: not finite' in errors
     assert '/muscle_states: wrong length' in errors
 
 
@@ -129,7 +129,7 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 1
     printed = capsys.readouterr()
     assert 'training: 50 %, loss 0.5' in printed.out
-    assert 'BAG: learning from 20 s\n' in printed.out
+    assert 'BAG: learning from a recording of 20 s\n' in printed.out
     assert re.search(r'BAG: \d+ %, [01] samples, 0 updates, \d+ s elapsed\n', printed.out)
     *_, warning, failed = printed.err.splitlines()
     assert failed.startswith('error: nothing was learned (0 updates). Different resting postures')

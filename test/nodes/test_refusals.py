@@ -22,8 +22,8 @@ def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(graph, monk
     for topic, message, reason in (
         ('target_joint_states', unknown, "unknown joint: 'elbo'"),
         ('joint_trajectory', JointTrajectory(joint_names=['elbow'], points=[beyond]), 'no posture'),
-        ('target_pose', PoseStamped(), "wrong frame: '', expected"),
-        ('target_twist', TwistStamped(), "wrong frame: '', expected"),
+        ('target_pose', PoseStamped(), "wrong frame: ''; expected"),
+        ('target_twist', TwistStamped(), "wrong frame: ''; expected"),
     ):
         graph.publisher(type(message), topic).publish(message)
         texts = f'refused {topic}: ', reason
