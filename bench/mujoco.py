@@ -49,7 +49,7 @@ import numpy as np
 
 from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach
+from musculoskeletal_ae.control import reach, slowness
 from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
@@ -131,7 +131,7 @@ def can_exert(limits: reach.Limits, muscle_jacobian: MuscleJacobian, planned: Tr
     """
     moments = planned.sample(np.linspace(0.0, planned.duration, MOMENTS + 1)[1:])
     each = zip(muscle_jacobian(moments.theta), map(Setpoint._make, zip(*moments)))
-    missing = (limits.missing_in_motion(G, at, reach.LEAST_LAG, 1.0) for G, at in each)
+    missing = (limits.missing_in_motion(G, at, slowness.LEAST_LAG, 1.0) for G, at in each)
     return all(torque < LEAST_TORQUE for torque in missing)
 
 
