@@ -112,7 +112,8 @@ def observe(
         state: The state that the network restores from the readings; None to compute it here.
         command: Target lengths of the modules [m], (M,), or None without a length command.
     """
-    unknown = np.full(len(length), np.nan)
+    unknown, usable = np.full(len(length), np.nan), np.ones(len(length), dtype=bool)
+    usable[list(mae.isolated)] = False
     sample = MuscleSample(
         time=math.nan,
         length=length,
@@ -122,7 +123,7 @@ def observe(
         bone_tension=bone_tension,
         sliding=unknown,
         temperature=unknown,
-        usable=~np.isin(np.arange(len(length)), mae.isolated),
+        usable=usable,
         newest=np.array([length, motor_tension, unknown]),
     )
     state = mae.estimate(bone_tension, length) if state is None else state

@@ -32,7 +32,7 @@ PUSH = 1.5  # duration of a push at rest [s]
 EVALUATED = 0.5  # duration of the last part of a push, over which estimates are averaged [s]
 APART = 3.0  # longest time between collisions [s]
 FLOATING = 30.0  # duration of the drift test [s]
-QUICK_FLOATING = 5.0  # duration of the drift test in a shortened run [s]
+QUICK_FLOATING = 2.0  # duration of the drift test in a shortened run [s]
 #: factor on all other durations and numbers of tests in a shortened run, which makes at least one
 #: test of each kind
 QUICK_SHARE = 0.001

@@ -55,9 +55,20 @@ METHODS = {
     f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
 APPROACHES = 5  # number of θ_eval, and number of starts for each of them
-# Time from the command until the results are read [s]. `second` ends after 5 s + 2 s.
-DURATION = 8.0
-STARTING = 5.0  # duration of the motion to a start [s]
+
+
+class Durations(NamedTuple):
+    """Durations of the parts of an approach [s]."""
+
+    start: float  # of the motion to a start
+    end: float  # from the command until the results are read; `second` must have ended by then
+    first: float  # setting `first_duration`
+    second: float  # setting `second_duration`
+
+
+DURATIONS = Durations(5.0, 8.0, 5.0, 2.0)
+#: the same in a shortened run, whose approaches begin on the way to a start
+QUICK_DURATIONS = Durations(1.0, 3.5, 2.0, 1.0)
 
 
 class Approaches(NamedTuple):
@@ -73,10 +84,21 @@ class Approaches(NamedTuple):
     stops: dict[str, int]  # number of approaches that ended with a stop of the controller
 
 
-def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Approaches:
+def protocol(
+    arm: Arm,
+    networks: Mapping[str, Mae],
+    seed: int,
+    count: int,
+    durations: Durations = DURATIONS,
+) -> Approaches:
     """Approach `count` random targets from `count` random starts each, with every control method.
 
-    `seed` determines targets and starts. `networks` maps the names of presets to their networks.
+    Args:
+        arm: The arm.
+        networks: The networks by the names of their presets.
+        seed: Random seed of targets and starts.
+        count: Number of targets, and of starts for each of them.
+        durations: Durations of the parts of an approach.
     """
     robot, rng = arm.robot, np.random.default_rng([seed, 0xC0])
     postures = robot.random_postures(TRIES, rng)
@@ -90,12 +112,16 @@ def protocol(arm: Arm, networks: Mapping[str, Mae], seed: int, count: int) -> Ap
                 method, _, preset = name.partition('_')
                 preset = preset or 'default'
                 loop = ClosedLoop(arm, networks['default'])
-                loop.approach(start, STARTING)
+                loop.approach(start, durations.start)
                 if not loop.core.supervisor.is_running:  # start from where the controller stopped
                     loop = ClosedLoop(arm, networks['default'])
                 loop.use(networks[preset])
-                loop.core.configure(Settings(method=method, preset=preset))
-                loop.approach(theta, DURATION)
+                settings = Settings(
+                    method=method, preset=preset,
+                    first_duration=durations.first, second_duration=durations.second,
+                )  # fmt: skip
+                loop.core.configure(settings)
+                loop.approach(theta, durations.end)
                 stops[name] += not loop.core.supervisor.is_running
                 offset[name][p, s] = arm.theta - theta
                 tension[name][p, s] = np.linalg.norm(arm.tension)
@@ -116,7 +142,8 @@ def _bound(arm: Arm) -> float:
 def measure(study: Study, seed: int) -> Measured:
     """Measure the errors and tensions of every control method on one individual."""
     networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
-    ended = protocol(study.arm(seed), networks, seed, 1 if study.quick else APPROACHES)
+    count, durations = (1, QUICK_DURATIONS) if study.quick else (APPROACHES, DURATIONS)
+    ended = protocol(study.arm(seed), networks, seed, count, durations)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
     numbers: dict[str, Any] = {
         'qp_bound_n': float(ended.bound.mean()),
@@ -140,11 +167,13 @@ def measure(study: Study, seed: int) -> Measured:
             'stops': ended.stops[name],
         }
     frictionless = study.arm(seed, friction=False)
-    numbers['proposed_causes'] = _causes(frictionless, networks['default'], ended)
+    numbers['proposed_causes'] = _causes(frictionless, networks['default'], ended, durations)
     return Measured(numbers, {'errors': errors, 'tensions': ended.tension, 'bound': ended.bound})
 
 
-def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
+def _causes(
+    frictionless: Arm, mae: Mae, ended: Approaches, durations: Durations
+) -> dict[str, float]:
     """Return measures that show why `proposed` needs more than the least tension.
 
     `proposed` first plans the tensions that hold each target. It then moves the same body without
@@ -162,7 +191,7 @@ def _causes(frictionless: Arm, mae: Mae, ended: Approaches) -> dict[str, float]:
         torque = robot.kinematics.holding_torque(theta)
         bias = np.full(robot.muscle_count, robot.tension.bias)
         plan = proposed(robot, mae, theta, torque, bias, robot.tension.limit)
-        ClosedLoop(frictionless, mae).approach(theta, DURATION)
+        ClosedLoop(frictionless, mae).approach(theta, durations.end)
         parts = plan.tension, frictionless.tension, frictionless.theta - theta
         rows.append([np.linalg.norm(part) for part in parts])
     planned, tension, error = np.transpose(rows)

@@ -14,13 +14,12 @@ from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
     Recording,
     columns,
-    end_tensions,
-    motor_tensions,
     rows_between,
 )
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import directions
 
 PAYLOAD = 3.6  # mass of the dumbbell in the paper (§IV-B) [kg]
 GRASPING = 60.0  # time from grasp to release, and from release to grasp [s]
@@ -148,16 +147,26 @@ class DetectorOutput(NamedTuple):
     alarm: Bools  # whether the message completes a detection, (N,)
 
 
-def run_detector(robot: Robot, mae: Mae, recording: Recording) -> DetectorOutput:
+def run_detector(
+    robot: Robot, mae: Mae, recording: Recording, sliding: Array | None = None
+) -> DetectorOutput:
     """Return what estimator and detector report for each message of a recording.
 
     Both run as in the estimator node, but they continue after an alarm.
+
+    Args:
+        robot: The robot.
+        mae: The network.
+        recording: The N messages.
+        sliding: Sliding directions of the tendons, (N, M), if they are already known. They are the
+            same for all networks.
     """
     health, rows = HealthMonitor(robot, mae.preset), []
     health.use(mae)
-    bone_tensions = end_tensions(mae, recording)
+    sliding = directions(recording.length) if sliding is None else sliding
+    bone_tensions = mae.transmission.end(recording.tension, sliding)
     restored = mae.estimate(bone_tensions, recording.length)
-    tensions = motor_tensions(mae, recording)
+    tensions = mae.transmission.motor(recording.tension, sliding)
     messages = zip(recording.length, tensions, bone_tensions, strict=True)
     for n, (length, tension, bone_tension) in enumerate(messages):
         command = recording.command[n]

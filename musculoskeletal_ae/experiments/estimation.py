@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.baselines import baseline_errors
 from musculoskeletal_ae.experiments.detection import (
@@ -63,15 +64,18 @@ from musculoskeletal_ae.experiments.study import (
     Study,
     first_individual,
 )
+from musculoskeletal_ae.signals.friction import directions
 
 HEALTHY_STREAM = 9500
 #: duration of the healthy motion in which alarms are false, shared by the individuals [s]
 HEALTHY_TIME = 3600.0
 PLOT_START = 60.0  # time that plots show before the grasp [s]
 PLOT_TAIL = 3.0  # time that plots show after the repair [s]
-QUICK_RUPTURES = 2  # number of muscles that rupture in a shortened run
+QUICK_RUPTURES = 1  # number of muscles that rupture in a shortened run
 OFF_TIME = 40.0  # duration of the motion before muscles are switched off [s]
-#: times of the pictures [s], at ends of the motion's cycles without and with the payload
+QUICK_OFF_TIME = 10.0  # the same in a shortened run [s]
+#: times of the pictures [s], at ends of the motion's cycles without and with the payload; a
+#: shortened run has pictures of those times that its shorter motion reaches
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
 OFF = 'switched_off'
 OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for switched-off muscles
@@ -87,9 +91,11 @@ def measure(study: Study, seed: int) -> Measured:
     duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
     stream = HEALTHY_STREAM + seed
     healthy = record(study.arm(seed), driven_by, stream, duration, grasp_and_release)
-    plan_off = GraspAndRupture(robot, OFF_TIME, seed, switched_off=True, most=most)
+    off_time = QUICK_OFF_TIME if study.quick else OFF_TIME
+    plan_off = GraspAndRupture(robot, off_time, seed, switched_off=True, most=most)
     switched_off = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan_off.duration, plan_off)
-    recordings = Recordings(plan, faulty, healthy, plan_off, switched_off)
+    sliding = [directions(each.length) for each in (faulty, healthy, switched_off)]
+    recordings = Recordings(plan, faulty, healthy, plan_off, switched_off, sliding)
     numbers, outputs, off_outputs = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     for preset in study.presets:
         values, outputs[preset], off_outputs[preset] = _preset(study, seed, preset, recordings)
@@ -101,7 +107,8 @@ def measure(study: Study, seed: int) -> Measured:
     numbers['baselines'] = baseline_errors(robot, study.rests(seed), exploring, held_out)
     second = plan_off.order[0]
     at = float(plan_off.rupture[second]) + 0.9 * RUPTURE_TIME
-    moments = MOMENTS | {f'#{second + 1} switched off': at}
+    moments = {name: time for name, time in MOMENTS.items() if time < off_time}
+    moments[f'#{second + 1} switched off'] = at
     steps = [round(time / SAMPLE_TIME) for time in moments.values()]
     postures = {'arm': switched_off.theta}
     for preset, by_time in off_outputs.items():
@@ -138,6 +145,7 @@ class Recordings(NamedTuple):
     healthy: Recording
     plan_off: GraspAndRupture
     switched_off: Recording  # recording of the switched-off muscles of `plan_off`
+    sliding: list[Array]  # sliding directions of the tendons in each of the three recordings
 
 
 def _preset(
@@ -151,10 +159,12 @@ def _preset(
         'after', which name the network.
     """
     robot, networks = study.robot, study.networks(seed, preset)
-    plan, faulty, healthy, plan_off, switched_off = recordings
+    plan, faulty, healthy, plan_off, switched_off, _ = recordings
     outputs, healthy_outputs, off_outputs = (
-        {when: run_detector(robot, mae, recording) for when, mae in networks.items()}
-        for recording in (faulty, healthy, switched_off)
+        {when: run_detector(robot, mae, recording, sliding) for when, mae in networks.items()}
+        for recording, sliding in zip(
+            (faulty, healthy, switched_off), recordings.sliding, strict=True
+        )
     )
     numbers: dict[str, Any] = {}
     for when, output in outputs.items():

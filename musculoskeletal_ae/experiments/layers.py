@@ -50,7 +50,7 @@ HIDDEN = {
     'fewer units: 20, 10': (20, 10),
 }
 TRAININGS = 3  # number of trainings of each layout, which differ in the random seed
-QUICK_LAYOUTS, QUICK_TRAININGS = 1, 2
+QUICK_LAYOUTS, QUICK_TRAININGS = 1, 1
 QUICK_STEPS = 600  # number of steps of a shortened initial training
 ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is reported
 

@@ -76,6 +76,7 @@ METHODS = {
     'first': '#E69F00',
     'second': '#009E73',
 }
+QUICK_METHODS = OURS, 'tension', 'second'  # control methods of a shortened run
 RADIUS, SPEED = 0.05, 0.1  # radius of a circle [m], and speed of the hand along it [m/s]
 EVERY = 2  # number of messages from one pose to the next
 NEAR = 0.002  # largest distance at which a pose counts as reachable [m]
@@ -266,7 +267,7 @@ def measure(study: Study, seed: int) -> Measured:
     postures = np.array([theta for theta, _ in held])
     numbers: dict[str, Any] = {'methods': {}}
     traces: dict[str, Any] = {}
-    for method in METHODS:
+    for method in QUICK_METHODS if study.quick else METHODS:
         row: dict[str, float | str] = {}
         for duration in DURATIONS:
             name = f'{duration:.0f}s'

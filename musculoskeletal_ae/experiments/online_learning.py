@@ -58,7 +58,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.names import DEFAULT, PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
@@ -68,9 +68,9 @@ CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
 FIRST_ERRORS = 10.0
 PUBLISHED_MINUTES = 10.0
 PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
-#: number of steps of a shortened initial training; after fewer steps, checkpoint validation rejects
-#: the network of preset `paper`
-QUICK_STEPS = 600
+#: numbers of steps of a shortened initial training, by preset; after fewer steps, checkpoint
+#: validation rejects the network of preset `paper`
+QUICK_STEPS = {PAPER_PRESET: 600, DEFAULT: 300}
 NOTE_EVERY = 25  # number of mini-batches from one record of the training errors to the next
 TEST_STATES = 1000  # number of test states
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
@@ -151,7 +151,8 @@ def train_initial(study: Study, preset: str) -> None:
         norms = ([each.norm for each in pair_errors(mae, states)] for states in (train, test))
         rows.append([step, *np.reshape([*norms], (2, len(Mask), -1)).mean(axis=1).ravel()])
 
-    trained = initial_mae(robot, preset, progress=note, steps=QUICK_STEPS if study.quick else None)
+    steps = QUICK_STEPS[preset] if study.quick else None
+    trained = initial_mae(robot, preset, progress=note, steps=steps)
     checkpoint.save(trained.mae, study.network_file(preset, None))
     np.save(study.folder / f'{preset}_initial.npy', rows)
 

@@ -217,11 +217,6 @@ def end_tensions(mae: Mae, recording: Recording) -> Array:
     return mae.transmission.end(recording.tension, directions(recording.length))
 
 
-def motor_tensions(mae: Mae, recording: Recording) -> Array:
-    """Return the motor-side tensions T [N] (N, M) of a recording, computed as in the nodes."""
-    return mae.transmission.motor(recording.tension, directions(recording.length))
-
-
 def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
     """Return a function that computes a network's mean error [rad] on every `stride`-th message.
 

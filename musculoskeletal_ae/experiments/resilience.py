@@ -52,6 +52,7 @@ QUICK_TARGETS = 1  # number of targets without each muscle in a shortened run
 MOVING = 12.0  # duration of healthy motion before a fault [s]
 LATEST_VERDICT = 10  # longest wait for the end of the first verification after a fault [s]
 AFTERWARDS = 6.0  # duration of the motion after this wait [s]
+QUICK_MOVING, QUICK_AFTERWARDS = 3.0, 1.0  # both durations in a shortened run [s]
 #: longest time to a target [s]; it allows for slow winches, and for further approaches if the arm
 #: falls
 LONGEST_APPROACH = 60
@@ -112,7 +113,7 @@ class IsolatingLoop(ClosedLoop):
 
 
 def run_with_fault(
-    arm: Arm, mae: Mae, seed: int, muscle: int, sensor: str
+    arm: Arm, mae: Mae, seed: int, muscle: int, sensor: str, quick: bool = False
 ) -> tuple[IsolatingLoop, Array]:
     """Let an arm explore, make a muscle or one of its sensors fail, and continue.
 
@@ -122,15 +123,17 @@ def run_with_fault(
         seed: Random seed of the exploration.
         muscle: Index of the muscle.
         sensor: 'length' or 'tension' for a sensor that fails; '' for a rupture.
+        quick: Whether to shorten the motions before and after the fault.
 
     Returns:
         The loop, and the errors of the estimate [rad] since the isolation, or since the fault if no
         muscle was isolated.
     """
+    moving, afterwards = (QUICK_MOVING, QUICK_AFTERWARDS) if quick else (MOVING, AFTERWARDS)
     loop = IsolatingLoop(arm, mae, seed)
     loop.run(1.0)
     loop.core.explore(True)
-    loop.run(MOVING)
+    loop.run(moving)
     name, errors = arm.robot.muscles[muscle], list[Array]()
     if sensor:
         arm.set_faults([f'dead_sensor:{sensor}:{name}'])
@@ -143,7 +146,7 @@ def run_with_fault(
         errors.append(loop.run(1.0))
         if loop.isolated and not before:
             errors.clear()
-    return loop, np.concatenate([*errors, loop.run(AFTERWARDS)])
+    return loop, np.concatenate([*errors, loop.run(afterwards)])
 
 
 class Reach(NamedTuple):
@@ -241,7 +244,7 @@ def measure(study: Study, seed: int) -> Measured:
     correct, distances, shares, sensor_errors, trapped = [], [], [], [], []
     by_muscle: dict[str, dict[str, Any]] = {}
     for m in rng.permutation(robot.muscle_count)[:1].tolist() if study.quick else muscles:
-        loop, _ = run_with_fault(study.arm(seed), mae, seed, m, '')
+        loop, _ = run_with_fault(study.arm(seed), mae, seed, m, '', study.quick)
         isolated, reason = loop.verdicts[0] if loop.verdicts else ((), 'nothing')
         correct.append(isolated == (m,))
         reach = measure_reach(loop, m, rng, QUICK_TARGETS if study.quick else TARGETS)
@@ -250,7 +253,7 @@ def measure(study: Study, seed: int) -> Measured:
         trapped += reach.trapped
         row = {'found': reason, 'held_share': reach.share, 'estimate_rad': one[m]}
         for sensor in ('length',) if study.quick else ('length', 'tension'):
-            loop, errors = run_with_fault(study.arm(seed), mae, seed, m, sensor)
+            loop, errors = run_with_fault(study.arm(seed), mae, seed, m, sensor, study.quick)
             sensor_errors.append(float(errors.mean()))
             reason = loop.verdicts[0][1] if loop.verdicts else 'nothing'
             row[f'dead_{sensor}'] = f'{reason}; {sensor_errors[-1]:.3f} rad'

@@ -59,6 +59,7 @@ ABLATED = {
 }
 #: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
 QUICK = ('friction',)
+QUICK_EXPLORATION = 5.0  # duration of the exploration without these effects in a shortened run [s]
 ABLATION_INDIVIDUALS = 2  # number of individuals whose effects are removed
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
@@ -164,7 +165,8 @@ def _error_with_effects(
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
     explorer = seed if run is None else run
     learner, loop = online_learning.new_learner_and_loop(study, arm(), explorer, study.preset)
-    stream = online_learning.explore(loop, learner, 60.0 * study.minutes)
+    duration = QUICK_EXPLORATION if study.quick else 60.0 * study.minutes
+    stream = online_learning.explore(loop, learner, duration)
     online_learning.teach(learner, stream)
     return estimation_error(learner.mae, held_out)
 

@@ -10,7 +10,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
 #: duration of the exploration [min], long enough for updates of both presets
-MINUTES = 0.25
+MINUTES = 0.2
 KEPT = 'experiments_kept'
 
 

@@ -7,7 +7,7 @@ from nominal_body import nominal_arm
 
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.experiments import control
-from musculoskeletal_ae.experiments.control import METHODS, protocol
+from musculoskeletal_ae.experiments.control import METHODS, QUICK_DURATIONS, protocol
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 
 
@@ -41,6 +41,6 @@ def test_a_stop_under_one_method_leaves_the_others_measured(arm26, trained, monk
     methods = ('geometric', 'first')
     monkeypatch.setattr(ClosedLoop, 'target', stopping)
     monkeypatch.setattr(control, 'METHODS', dict.fromkeys(methods, ''))
-    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1)
+    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1, durations=QUICK_DURATIONS)
     assert ended.stops == {name: int(name == 'geometric') for name in methods}
     assert all(np.isfinite(offset).all() for offset in ended.offset.values())

@@ -126,7 +126,7 @@ def test_the_report_has_the_papers_numbers_and_the_command_to_repeat_it(quick):
     page = (quick / 'report.html').read_text(encoding='utf-8')
     for printed in ('0.414', '0.186', '0.324', '0.154', '0.335', '0.162', '105', '92.2'):
         assert f'<td>{printed}</td>' in page
-    assert 'experiment all --robot arm26 --preset default --seeds 0 --minutes 0.25 --quick' in page
+    assert 'experiment all --robot arm26 --preset default --seeds 0 --minutes 0.2 --quick' in page
 
 
 def test_the_report_names_missed_aims_and_their_difference(quick, tmp_path):
