@@ -109,13 +109,24 @@ class Setting(NamedTuple):
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
         """Return a robot in postures θ [rad] or [m], (N, D), with all quantities computed."""
-        jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
-        hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
+        radian = robot.kinematics.radian
         weight = radian * robot.kinematics.weight_torque(theta)
         elasticity = robot.kinematics.elasticity
         torque = weight + radian * elasticity.holding_torque(theta)
         springs = radian[:, None] * elasticity.stiffness * radian
-        return cls(robot, theta, radian * jacobian(theta), hessian, torque, weight, springs)
+        return cls(robot, theta, *_slopes(robot, theta), torque, weight, springs)
+
+    def rerouted(self, robot: Robot) -> Setting:
+        """Return the quantities of a robot that differs from this one only in its routes."""
+        jacobian, hessian = _slopes(robot, self.theta)
+        return self._replace(robot=robot, jacobian=jacobian, hessian=hessian)
+
+
+def _slopes(robot: Robot, theta: Array) -> tuple[Array, Array]:
+    """Return `jacobian` and `hessian` of a `Setting`."""
+    jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
+    hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
+    return radian * jacobian(theta), hessian
 
 
 @dataclass(frozen=True)
@@ -131,8 +142,9 @@ class RobotCheck:
     one_sided: Array
     required: float  # required stiffness [N·m/rad]
     matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
-    faults: tuple[Finding, ...]  # reasons why the arm is not sound; empty if it is sound
-    warnings: tuple[Finding, ...]  # questionable properties that do not make the arm unsound
+    softest: Ints  # index of the softest joint in each posture that is held but not stiff
+    faults: tuple[Finding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
+    warnings: tuple[Finding, ...] = ()  # questionable properties that do not make it unsound
 
     @property
     def held(self) -> Bools:
@@ -180,6 +192,19 @@ def judge(setting: Setting) -> RobotCheck:
     Raises:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
     """
+    result, robot = measure(setting), setting.robot
+    arms, matters = result.moment_arms, result.matters
+    faults = (
+        *_wrong_signs(robot, arms),
+        *_one_way_joints(robot, arms, matters),
+        *_useless_muscles(robot, arms, matters),
+        *_holding_faults(result),
+    )
+    return replace(result, faults=faults, warnings=tuple(_flipping_muscles(robot, arms)))
+
+
+def measure(setting: Setting) -> RobotCheck:
+    """Compute tensions, stiffness and moment arms in given postures, without any finding."""
     robot, theta, jacobian, hessian, torque, *_ = setting
     bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
     tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
@@ -205,15 +230,9 @@ def judge(setting: Setting) -> RobotCheck:
     values, vectors = np.linalg.eigh(full)
     stiffness[held], one_sided[held] = values[:, 0], np.linalg.eigvalsh(sided)[:, 0]
     softest = np.abs(vectors[:, :, 0]).argmax(axis=1)[values[:, 0] < required]
-    faults = (
-        *_wrong_signs(robot, arms),
-        *_one_way_joints(robot, arms, matters),
-        *_useless_muscles(robot, arms, matters),
-        *_holding_faults(robot, stiffness, required, softest, missing),
+    return RobotCheck(
+        setting, arms, tension, missing, stiffness, one_sided, required, matters, softest
     )
-    warnings = tuple(_flipping_muscles(robot, arms))
-    measured = tension, missing, stiffness, one_sided, required, matters
-    return RobotCheck(setting, arms, *measured, faults, warnings)
 
 
 class ArmTerms(NamedTuple):
@@ -463,23 +482,13 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
         yield _finding('no_inertia', joint=robot.joints[j], moved=moved)
 
 
-def _holding_faults(
-    robot: Robot, stiffness: Array, least: float, softest: Ints, missing: Array
-) -> Iterator[Finding]:
-    """Yield a fault if the arm is held in too few postures, and one if it is stiff in too few.
-
-    Args:
-        robot: The robot.
-        stiffness: Smallest eigenvalue of the joint stiffness [N·m/rad], (N,); NaN in postures that
-            the muscles do not hold.
-        least: Required stiffness [N·m/rad].
-        softest: Index of the softest joint in each posture that is held but not stiff.
-        missing: Torque that the muscles lack to hold each posture [N·m], (N, D).
-    """
-    held, stiff = np.isfinite(stiffness), stiffness >= least
+def _holding_faults(check: RobotCheck) -> Iterator[Finding]:
+    """Yield a fault if the arm is held in too few postures, and one if it is stiff in too few."""
+    robot, stiffness, least = check.setting.robot, check.stiffness, check.required
+    held, stiff = check.held, check.stiff
     required, worst = 100 * REQUIRED_SHARE, -1
     if held.mean() < REQUIRED_SHARE:
-        lack = np.abs(missing[~held])
+        lack = np.abs(check.missing_torque[~held])
         most = lack.argmax(axis=1)
         counts = Counter(sorted(most.tolist())).most_common()
         own, units = lack / robot.kinematics.radian, robot.units
@@ -495,7 +504,7 @@ def _holding_faults(
             force='torque' + ' or force' * bool(robot.kinematics.slides.any()), where=where,
         )._replace(joint=worst)  # fmt: skip
     if stiff.mean() < REQUIRED_SHARE:
-        counts = Counter(sorted(softest.tolist())).most_common()
+        counts = Counter(sorted(check.softest.tolist())).most_common()
         where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts) or 'none'
         problem = 'not stiff'
         if (unstable := stiffness < 0.0).any():

@@ -20,7 +20,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot import checks
-from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, judge
+from musculoskeletal_ae.robot.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, measure
 from musculoskeletal_ae.robot.description import shown
 
 LEAST_GAIN = 0.01  # smallest gain of a suggested change, in the share of held or stiff postures
@@ -65,7 +65,7 @@ def remedies(check: RobotCheck, fault: Finding) -> list[str]:
             if step:
                 setting, text = changed(setting, what, factors[step - 1], fault.joint)
                 texts.insert(0, text)
-        share = float(getattr(judge(setting), kind).mean())
+        share = float(getattr(measure(setting), kind).mean())
         return share, f'{", ".join(texts)} → {100 * share:.3g} % {kind}'
 
     nothing, steps = [0] * len(CHANGES), [len(factors) for factors in CHANGES.values()]

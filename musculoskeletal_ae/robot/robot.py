@@ -13,7 +13,12 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.actuation import ACTUATIONS, Actuation
-from musculoskeletal_ae.robot.description import RobotDescription, TensionRange, load_description
+from musculoskeletal_ae.robot.description import (
+    RobotDescription,
+    Route,
+    TensionRange,
+    load_description,
+)
 from musculoskeletal_ae.robot.groups import groups
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames
@@ -126,6 +131,15 @@ class Robot:
         reduced.tension = TensionRange(used * whole.bias, used * whole.limit, used * whole.max)
         reduced.actuation = type(self.actuation)(reduced)
         return reduced
+
+    def with_routes(self, routes: Iterable[Route]) -> Robot:
+        """Return a copy with other tendon routes; it shares joints and links with the original."""
+        changed = copy.copy(self)
+        changed.description = replace(self.description, routes=tuple(routes))
+        changed.routes = Routes(self.kinematics, changed.description.routes)
+        changed.groups = groups(changed.routes.crossed)
+        changed.actuation = type(self.actuation)(changed)
+        return changed
 
     def with_elasticity(self, elasticity: JointElasticity | None) -> Robot:
         """Return a copy with learned springs and dampers.

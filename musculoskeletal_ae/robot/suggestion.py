@@ -9,7 +9,6 @@ meet the requirements of the check, in all but a few postures.
 """
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +53,10 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
     unchanged = np.zeros((len(robot.routes.point), 3))
     theta = robot.random_postures(postures, np.random.default_rng(seed + 1))
 
+    setting = checks.Setting.of(robot, theta)
+
     def check(change: Array) -> checks.RobotCheck:
-        return checks.judge(checks.Setting.of(moved(robot, change), theta))
+        return checks.measure(setting.rerouted(moved(robot, change)))
 
     flips = np.maximum(checks.main_actions(check(unchanged).moment_arms)[1], FAILING_SHARE)
 
@@ -106,7 +107,7 @@ def moved(robot: Robot, change: Array) -> Robot:
         )
         for route in robot.description.routes
     ]
-    return Robot(replace(robot.description, routes=tuple(routes)))
+    return robot.with_routes(routes)
 
 
 def lacking(check: checks.RobotCheck) -> float:
