@@ -99,7 +99,7 @@ def test_the_example_learns_without_ros(tmp_path):
         f'sys.argv[0] = {str(ROOT / "examples" / "learn_in_python.py")!r}\n'
         'runpy.run_path(sys.argv[0])'
     )
-    options = ['--postures', '6', '--steps', '200', '--out', str(tmp_path / 'a.safetensors')]
+    options = ['--postures', '4', '--steps', '100', '--out', str(tmp_path / 'a.safetensors')]
     done = subprocess.run(
         [sys.executable, '-c', program, *options],
         cwd=tmp_path, capture_output=True, text=True, timeout=900, check=False,

@@ -272,7 +272,7 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
 
 def test_an_arm_without_a_muscle_that_falls_on_the_way_starts_again_before_the_end():
     for lost, starts_again in (([LOST], True), ([], False)):
-        bench = Bench(target_duration=10.0)
+        bench = Bench(target_duration=5.0)
         bench.isolate(lost)
         bench.theta = REST
         bench.step()

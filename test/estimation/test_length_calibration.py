@@ -46,7 +46,7 @@ def swinging(robot, mae):
 @pytest.fixture
 def seldom(monkeypatch):
     # Fits take much CPU time. Fitting less often saves it, and the calibration takes no longer.
-    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 5.0)
+    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 10.0)
 
 
 @pytest.fixture(scope='module')
@@ -142,7 +142,7 @@ def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibratio
     monkeypatch, robot, mae, moment, sees
 ):
     # Fit even less often than the fixture `seldom`, because fits without a muscle take longer.
-    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 10.0)
+    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 30.0)
     rng = np.random.default_rng(0)
 
     def disturbed(t):

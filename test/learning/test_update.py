@@ -68,15 +68,15 @@ def test_motion_samples_teach_differences_that_the_body_model_cannot_represent(
 ):
     def learned(**parts):
         updater = BodyUpdater(arm26, initial)
-        for _ in range(4):
-            update = updater.update(job(store, steps=150, **parts))
+        for _ in range(2):
+            update = updater.update(job(store, steps=100, **parts))
         return error(update.mae, observed.theta, observed.tension, observed.length)
 
     stage = CompliantStage(other_body)
     store = stage.store(30)
     observed, messages = (stage.store(400).observations() for _ in range(2))
-    # Over eight bodies and streams, motion samples reduced the error by a factor of 0.91 (standard
-    # deviation 0.02).
+    # For three bodies, motion samples multiplied the error by 0.89 to 0.96. After four updates of
+    # 150 steps, the factor was 0.91 over eight bodies and streams (standard deviation 0.02).
     assert learned(learned=messages) < 0.98 * learned()
 
 
@@ -160,10 +160,10 @@ def test_preset_paper_takes_100_steps_in_each_update(arm26, initial, stage):
     updater = OnlineLearning(arm26, initial)
     store = stage.store(THRESHOLD + 1)
     states = stage.states(500)
-    for _ in range(10):
+    for _ in range(3):
         update = updater.update(job(store))
     assert error(update.mae, *states) < error(initial, *states)
-    assert f'preset paper, {10 * 100} steps' in update.mae.training
+    assert f'preset paper, {3 * 100} steps' in update.mae.training
 
 
 def test_preset_paper_learns_nothing_of_a_changed_muscle_from_old_samples(arm26, initial, stage):
@@ -213,7 +213,7 @@ def test_a_network_of_another_arm_adapts_as_fast_as_an_initial_one(learned, arm2
     ends = []
     for start in (learned[0], initial):
         updater = BodyUpdater(arm26, start)
-        for _ in range(6):
+        for _ in range(3):
             update = updater.update(job(store))
         ends.append(error(update.mae, *states))
     assert ends[0] < 1.3 * ends[1]
