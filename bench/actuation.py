@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compares muscle modules by control (stiffness or position) and by source of tension.
 
-    python -m bench actuation [--robot musashi_left_arm] [--seeds 0,1,2,3,4] [--quick]
+    python -m bench actuation [--robot musashi_left_arm] [--seeds 0,1,2,3,4] [--held 4] [--quick]
 
 Each emulated individual explores and learns with every kind of module, from the same initial
 network. With the learned network, the bench measures:
 
 - estimate: mean ‖θ_est − θ‖ in further exploration, before and after learning,
-- control: mean ‖θ_target − θ‖ of `proposed` after 4 s, at random holdable postures,
+- control: mean ‖θ_target − θ‖ of `proposed` at random holdable postures, --held seconds after each
+  target (a motion of stiffness-controlled muscles that its tensions would not suffice for is
+  slowed, so that it can take up to 9 s),
 - rupture: several muscles rupture in turn while the arm explores. The columns are the share of
   ruptures after which a muscle is isolated within 10 s, the share after which only the ruptured
   muscle is isolated, and the mean time from a rupture to the first isolation (10 s if there is
@@ -38,7 +40,7 @@ from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held-out motion [s]
-TARGETS, HELD = 5, 4.0  # number of targets, and time for each of them [s]
+TARGETS, HELD = 5, 4.0  # number of targets, and default time for each of them [s]
 RUPTURES = 3  # number of muscles that rupture, one after another
 MOVING = 4.0  # time for which the arm explores before a rupture [s]
 LATEST = 10.0  # longest wait for an isolation after a rupture [s]
@@ -121,8 +123,10 @@ def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) ->
     return float(np.mean(errors)), wrong + (not loop.core.supervisor.is_running)
 
 
-def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tuple[float, int]:
-    """Move to `targets` random holdable postures, each of which the arm holds for HELD seconds.
+def control(
+    arm: Arm, mae: Mae, seed: int, targets: int, held: float, watched: Watched
+) -> tuple[float, int]:
+    """Move to `targets` random holdable postures, with `held` seconds for each of them.
 
     Returns:
         The mean distance between the target and the posture that the arm reached [rad], and the
@@ -138,7 +142,7 @@ def control(arm: Arm, mae: Mae, seed: int, targets: int, watched: Watched) -> tu
             loop = ClosedLoop(arm, mae)
             loop.wait(0.1)
         loop.target(theta)
-        for _ in range(round(HELD / SAMPLE_TIME)):
+        for _ in range(round(held / SAMPLE_TIME)):
             loop.step()
             watched.note()
         errors.append(float(np.linalg.norm(arm.theta - theta)))
@@ -176,8 +180,13 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
     return isolated / count, named / count, float(np.mean(times))
 
 
-def measure(robot: Robot, kind: str, initial: Mae, reality: str, seed: int, share: float) -> Result:
-    """Measure one individual with one kind of module; `share` scales the durations and counts."""
+def measure(
+    robot: Robot, kind: str, initial: Mae, reality: str, seed: int, share: float, held: float
+) -> Result:
+    """Measure one individual with one kind of module.
+
+    `share` scales the durations and counts; `held` is the time for each target [s].
+    """
     own = with_kind(robot, kind)
     arm = make_arm(own, seed, reality)
     watched = Watched(arm)
@@ -188,7 +197,7 @@ def measure(robot: Robot, kind: str, initial: Mae, reality: str, seed: int, shar
     arm.reset()
     after, wrong = estimate(arm, mae, seed, share * HELD_OUT, watched)
     arm.reset()
-    distance, stopped = control(arm, mae, seed, max(2, round(share * TARGETS)), watched)
+    distance, stopped = control(arm, mae, seed, max(2, round(share * TARGETS)), held, watched)
     shares_and_time = ruptures(arm, mae, seed, max(2, round(share * RUPTURES)))
     wrong += wrong_before + stops + stopped
     return Result(
@@ -216,6 +225,7 @@ def main(argv: list[str]) -> int:
     add('--realities', type=names, default=(KIN, FOREIGN), help='emulator models: kin, foreign')
     add('--modules', type=names, default=tuple(KINDS), help=f'kinds: {", ".join(KINDS)}')
     add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
+    add('--held', type=positive, default=HELD, help='time for each target [s]')
     add('--initial', type=Path, help='initial checkpoint (default: train one)')
     options = parser.parse_args(argv)
     if wrong := set(options.modules) - set(KINDS):
@@ -233,7 +243,7 @@ def main(argv: list[str]) -> int:
         rows: dict[str, list[Result]] = {kind: [] for kind in options.modules}
         for seed in options.seeds:
             for kind, results in rows.items():
-                results.append(measure(robot, kind, initial, reality, seed, share))
+                results.append(measure(robot, kind, initial, reality, seed, share, options.held))
                 print(line(reality, str(seed), kind, results[-1]), flush=True)
         for kind, results in rows.items():
             mean = Result(*np.nanmean(results, axis=0))
