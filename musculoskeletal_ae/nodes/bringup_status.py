@@ -44,6 +44,7 @@ class BringupStatus(Shell):
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
+        self.printed_hint = ''
         self.follow_posture('joint_states', self._on_measured_posture, some=True)
         self.follow_posture('estimated_joint_states', self._on_estimate)
         self.listen(Float64, 'anomaly', lambda m: self.anomalies.append(m.data), SENSOR)
@@ -94,5 +95,13 @@ class BringupStatus(Shell):
         self.errors, self.anomalies = [], []
         line = f'{running_time:6.0f} s  {known}'
         line += f'  samples {situation.samples or 0}  checkpoints {situation.checkpoints or 0}'
-        more = situation.trouble() or situation.hint()
-        print(printable(f'{line}  {more}'.rstrip()), flush=True)
+        parts = line, situation.unexplored(), situation.trouble()
+        self._print_hint()
+        print(printable('  '.join(filter(None, parts))), flush=True)
+
+    def _print_hint(self) -> None:
+        """Print the hint of the situation in a line of its own, once."""
+        hint = self.situation.hint()
+        if hint and hint != self.printed_hint:
+            print(f'-- {printable(hint)}')
+            self.printed_hint = hint

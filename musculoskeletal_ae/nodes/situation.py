@@ -54,6 +54,8 @@ CALIBRATION_STEPS = Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS
 #: activities in which the arm does not move while the length offsets are unknown, and in which
 #: controller/explore is not refused
 STANDING_STILL = Activity.IDLE, Activity.HOLDING, Activity.MOVING, Activity.TORQUE
+#: modes in which the arm runs without exploring
+NOT_EXPLORING = {activity.value for activity in (*STANDING_STILL, Activity.GRAVITY_COMPENSATION)}
 
 
 def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
@@ -410,8 +412,21 @@ class Situation:
         needed = values.get('samples to begin with', '1')
         if not self.samples.isdecimal() or int(self.samples) >= int(needed):
             return ''
-        why = 'nothing learned yet: the error may rise while the arm leaves its first posture'
+        why = 'nothing learned yet: the error may rise'
         return why if needed == '1' else f'{why}; learning begins with {needed} samples'
+
+    def unexplored(self) -> str:
+        """Return that the arm does not explore, with its mode, or ''.
+
+        The text is '' without a learner, during a stop, and if `trouble` says the same.
+        """
+        mode = self._values('controller').get('mode')
+        advised = {Step.EXPLORE.identifier, Step.EXPLORE_GENTLY.identifier}.intersection(
+            self.steps()
+        )
+        if self.samples == '' or mode not in NOT_EXPLORING or advised:
+            return ''
+        return f'{mode}, not exploring'
 
 
 def _is_needed(name: str) -> bool:

@@ -47,6 +47,32 @@ def test_the_hint_states_the_number_of_samples_required():
     assert situation.hint() == ''
 
 
+def test_an_arm_that_does_not_explore_is_shown_with_its_mode():
+    situation = Situation('/left')
+    situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
+    situation.diagnosed(diagnostics('/left/learner', samples='3'))
+    assert situation.unexplored() == ''
+    situation.diagnosed(diagnostics('/left/controller', mode='holding'))  # a target was sent
+    assert situation.unexplored() == 'holding, not exploring'
+    situation.diagnosed(stopped(StopCause.OPERATOR))
+    assert situation.unexplored() == ''
+    said = {'remedy_steps': Step.EXPLORE.identifier}
+    warning = diagnostics('/left/controller', 'to explore', DiagnosticStatus.WARN, **said)
+    situation.diagnosed(warning)
+    assert situation.unexplored() == ''
+
+
+def test_the_hint_is_printed_once(graph, capsys):
+    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node.situation.diagnosed(diagnostics(f'{graph.namespace}/learner', samples='0'))
+    for _ in range(2):
+        node.anomalies.append(0.5)
+        node._print()
+    hint, *lines = capsys.readouterr().out.splitlines()
+    assert 'error may rise' in hint and len(lines) == 2
+    assert not any('error may rise' in line for line in lines)
+
+
 def test_unknown_values_are_shown_with_the_missing_topic():
     assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
     assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'
