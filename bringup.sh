@@ -308,16 +308,9 @@ trap 'exit 129' HUP
 
 # --- checkpoint ----------------------------------------------------------------------------------
 
-# Sets $checkpoint. The name of the file contains a hash of everything that determines the network.
+# Sets $checkpoint to a file in the cache of initial networks, which `train --from-bag` shares.
 train_once() {
-  local cache=${XDG_CACHE_HOME:-${HOME:-$repository}/.cache}/musculoskeletal_ae hash
-  mkdir -p "$cache" || exit 1
-  hash=$(
-    find "$robot_directory"/{robot.urdf,muscles.yaml} "$package"/{robot,mae,presets,paper} \
-      "$package/tools/model_training.py" \( -name '*.py' -o -name '*.yaml' -o -name '*.urdf' \) \
-      -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -c 1-16
-  )
-  checkpoint=$cache/$(basename "$(realpath "$robot_directory")")-$preset-$hash.safetensors
+  checkpoint=$("$python" -m musculoskeletal_ae.tools.network_cache "$robot" "$preset") || exit 1
   if [ -s "$checkpoint" ]; then
     say "initial network from an earlier run (without what was learned since): $checkpoint"
     return

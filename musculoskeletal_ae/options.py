@@ -22,6 +22,7 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.stop_signals import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
+DEFAULT_SEED = 0  # default of --seed
 #: exit status after the reader of the output has closed it, as of other tools: 128 + SIGPIPE
 CLOSED = 141
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
@@ -130,7 +131,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_seed(self, text: str) -> None:
         """Add `--seed`; the text completes "random seed …" in the help."""
-        self.add_argument('--seed', type=seed, default=0, help=f'random seed {text}')
+        self.add_argument('--seed', type=seed, default=DEFAULT_SEED, help=f'random seed {text}')
 
     def add_seeds(
         self, default: tuple[int, ...] | None, text: str = 'seeds of the emulated individuals'

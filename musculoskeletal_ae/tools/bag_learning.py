@@ -18,12 +18,13 @@ from musculoskeletal_ae.bags.topics import NO_MOTORS
 from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import BagError, CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import motor_settings
+from musculoskeletal_ae.options import DEFAULT_SEED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -31,6 +32,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 from musculoskeletal_ae.tools import model_training
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
+from musculoskeletal_ae.tools.network_cache import network_file
 
 LEAST_OFFSET = 0.002  # smallest joint-sensor offset that is shown [rad]
 
@@ -50,12 +52,7 @@ def train(args: Namespace) -> None:
         for text in wrong_joint_sensors(robot, pairs)
     ]
     _warn(warnings)  # also before the training, because the user may want to stop here
-    if args.checkpoint:
-        mae = checkpoint.load(args.checkpoint, robot)
-    else:
-        name = robot.description.directory.name
-        print(f'training the initial network of {name}; --checkpoint FILE skips this')
-        mae = train_on_model(robot, args).mae
+    mae = _initial_network(robot, args)
     learner = Learner(robot, mae, args.preset, args.seed)
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
     try:
@@ -92,6 +89,37 @@ def train(args: Namespace) -> None:
     print(f'checkpoint: {args.out}')
     sys.stdout.flush()
     _warn(warnings)
+
+
+def _initial_network(robot: Robot, args: Namespace) -> Mae:
+    """Return the network to start from.
+
+    This is the network of `--checkpoint`. Without this option, it is the one that `bringup.sh`
+    starts from too. It comes from the cache of initial networks, and is trained if it is not there.
+    """
+    if args.checkpoint:
+        return checkpoint.load(args.checkpoint, robot)
+    name = robot.description.directory.name
+    if args.seed != DEFAULT_SEED or args.quick:  # the cache contains complete networks of one seed
+        print(f'training the initial network of {name}; --checkpoint FILE skips this', flush=True)
+        return train_on_model(robot, args).mae
+    file = network_file(robot.description.directory, args.preset)
+    if file.exists():
+        try:
+            mae = checkpoint.load(file, robot)
+        except CheckpointError as error:
+            _warn([f'the cached initial network is unusable and will be trained again: {error}'])
+        else:
+            print(f'initial network of {name} from the cache of bringup.sh: {file}', flush=True)
+            return mae
+    print(f'training the initial network of {name} (once; cached in {file})', flush=True)
+    mae = train_on_model(robot, args).mae
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        checkpoint.save(mae, file)
+    except OSError as error:
+        _warn([f'the initial network was not cached: {error}'])
+    return mae
 
 
 def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:

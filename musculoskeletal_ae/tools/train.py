@@ -27,7 +27,10 @@ def main(argv: list[str] | None = None) -> int:
         ('--hold-out', 'with --from-bag: recordings for measuring the error before and after'),
     ):
         parser.add_argument(flag, nargs='+', type=Path, default=[], metavar='BAG', help=text)
-    text = 'with --from-bag: network to start from (default: train one on the geometric model)'
+    text = (
+        'with --from-bag: network to start from (default: the initial network of bringup.sh from '
+        'its cache, or train it)'
+    )
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
     text = 'with --from-bag: namespace of the arm if the bags have several'
     parser.add_argument('--from-namespace', metavar='NS', help=text)

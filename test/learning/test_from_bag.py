@@ -2,6 +2,7 @@
 """Learning from the shipped recordings, and `train --from-bag`."""
 
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,10 +16,12 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.stop_signals import INTERRUPTED
-from musculoskeletal_ae.tools import bag_learning, model_training
+from musculoskeletal_ae.tools import bag_learning, model_training, network_cache
 from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read
+from musculoskeletal_ae.tools.network_cache import network_file
 from musculoskeletal_ae.tools.train import main
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
@@ -229,3 +232,96 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     text = anomaly_in(arm26, recording, initial, 'default')
     assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s after the start' in text
     assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text
+
+
+@pytest.fixture
+def learned_from_bag(arm26, initial, monkeypatch, tmp_path):
+    """Return a function that runs `train --from-bag` for arm26, with a cache of its own.
+
+    The function returns the exit status and the network that learning started from. Training on the
+    geometric model returns `initial`, and is counted in the list `trainings`. Learning changes
+    nothing.
+    """
+    count = 500
+    theta = np.tile(0.5 * (arm26.lower + arm26.upper), (count, 1))
+    tension = np.full((count, arm26.muscle_count), 60.0)
+    length, unknown = initial.lengths(theta, tension), np.full(tension.shape, -1)
+    recording = Pairs(0.01 * np.arange(count), theta, length, tension, unknown)
+    started_from, trainings = [], []
+
+    def trained(*_):
+        trainings.append(1)
+        return SimpleNamespace(mae=initial)
+
+    def learned(learner, *_):
+        started_from.append(learner.mae)
+        learner.scheduler.updates = 1
+
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    monkeypatch.setattr(model_training, 'initial_mae', trained)
+    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(bag_learning, 'learn', learned)
+
+    def run(*options):
+        out = str(tmp_path / 'out.safetensors')
+        status = main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, *options])
+        return status, started_from[-1]
+
+    run.trainings = trainings
+    return run
+
+
+def test_learning_starts_from_the_network_that_bringup_has_cached(
+    learned_from_bag, trained_file, capsys
+):
+    file = network_file('arm26', 'default')
+    file.parent.mkdir(parents=True)
+    file.write_bytes(Path(trained_file).read_bytes())
+    status, network = learned_from_bag()
+    assert status == 0 and learned_from_bag.trainings == []
+    np.testing.assert_array_equal(network.mean, load(file).mean)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if 'initial network' in line)
+    assert str(file) in line
+
+
+def test_a_network_that_is_not_cached_is_trained_once_and_cached(learned_from_bag, arm26):
+    for _ in range(2):
+        assert learned_from_bag()[0] == 0
+    assert learned_from_bag.trainings == [1]
+    assert load(network_file('arm26', 'default'), arm26).joints == tuple(arm26.joints)
+
+
+def test_a_damaged_network_in_the_cache_is_replaced(learned_from_bag, arm26, capsys):
+    file = network_file('arm26', 'default')
+    file.parent.mkdir(parents=True)
+    file.write_text('damaged')
+    assert learned_from_bag()[0] == 0
+    assert learned_from_bag.trainings == [1] and load(file, arm26)
+    assert 'will be trained again' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('options', [['--seed', '1'], ['--quick']])
+def test_only_the_network_that_bringup_would_train_is_cached(learned_from_bag, options):
+    assert learned_from_bag(*options)[0] == 0
+    assert not network_file('arm26', 'default').exists()
+
+
+def test_a_changed_robot_preset_or_version_has_another_network_in_the_cache(monkeypatch, tmp_path):
+    robot = tmp_path / 'here' / 'my_arm'
+    shutil.copytree(find_robot('arm26'), robot)
+    moved = shutil.copytree(robot, tmp_path / 'there' / 'my_arm')
+    before = network_file(robot, 'default')
+    assert network_file(moved, 'default') == before  # its place does not matter
+    files = {before, network_file(robot, 'paper'), network_file('arm26', 'default')}
+    for name in 'robot.urdf', 'muscles.yaml':
+        with (robot / name).open('a', encoding='utf-8') as stream:
+            stream.write('\n')
+        files.add(network_file(robot, 'default'))
+    ignore = shutil.ignore_patterns('__pycache__')
+    package = shutil.copytree(network_cache.PACKAGE, tmp_path / 'package', ignore=ignore)
+    monkeypatch.setattr(network_cache, 'PACKAGE', package)
+    assert network_file(robot, 'default') in files
+    for code in 'mae/network.py', 'presets/registry.py', 'tools/model_training.py':
+        (package / code).write_text('')
+        files.add(network_file(robot, 'default'))
+    assert len(files) == 3 + 2 + 3
