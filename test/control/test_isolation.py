@@ -34,6 +34,7 @@ from musculoskeletal_ae.validity import TrajectoryPoints
 LOST = 0
 USED = np.arange(ROBOT.muscle_count) != LOST
 ROBOT_WITHOUT = ROBOT.without([LOST])
+SELDOM = 0.02  # time between messages that makes long motions cheaper [s]
 
 
 def held(theta, torque=0.0):
@@ -175,13 +176,14 @@ def test_exploration_is_refused_without_muscles_and_the_report_names_the_remedy(
 def test_an_arm_without_a_muscle_that_falls_approaches_its_target_again_a_few_times():
     for lost, times in (([LOST], APPROACHES), ([], 0)):
         bench = Bench(target_duration=0.2)
+        bench.dt = SELDOM
         bench.isolate(lost)
         bench.theta = REST
         bench.step()
         bench.target(THERE)
         ways = [bench.follower.progress.trajectory]
         for _ in range(4 * (APPROACHES + 1)):
-            bench.step(100)
+            bench.step(round(1.0 / SELDOM))
             if (last := bench.follower.progress.trajectory) is not ways[-1]:
                 ways.append(last)
             np.testing.assert_array_equal(last.end, THERE)
@@ -190,6 +192,7 @@ def test_an_arm_without_a_muscle_that_falls_approaches_its_target_again_a_few_ti
 
 def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
     bench = Bench(target_duration=0.2)
+    bench.dt = SELDOM
     bench.isolate([LOST])
     bench.theta = NOT_THERE
     bench.step()
@@ -197,7 +200,7 @@ def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
     reported = lacking(ROBOT_WITHOUT, bench.mae, NOT_THERE)
     assert reported
     for _ in range(150):
-        bench.step(100)
+        bench.step(round(1.0 / SELDOM))
         if f'the muscles lack {reported}; lift the arm by hand' in bench.report().message:
             return
     raise AssertionError(bench.report().message)
@@ -273,12 +276,13 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
 def test_an_arm_without_a_muscle_that_falls_on_the_way_starts_again_before_the_end():
     for lost, starts_again in (([LOST], True), ([], False)):
         bench = Bench(target_duration=5.0)
+        bench.dt = SELDOM
         bench.isolate(lost)
         bench.theta = REST
         bench.step()
         bench.target(THERE)
         first = bench.follower.progress.trajectory
-        bench.step(round(first.duration / 0.01) - 10)
+        bench.step(round((first.duration - 0.1) / SELDOM))
         assert (bench.follower.progress.trajectory is not first) == starts_again
 
 
