@@ -14,7 +14,8 @@ from collections.abc import Generator, Sequence
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import judge
 
 RELEASE = 0.6  # wait after a release [s]
@@ -28,6 +29,9 @@ ABOVE_BIAS = 40.0  # default of the highest tension, above T_bias [N]
 RUN_AWAY_TENSION = 60.0
 MOMENT = 0.1  # time for which a muscle may exceed a limit, for example because the arm falls [s]
 LATEST = 0.1  # longest time from a command to the first response [s]
+#: longest time for which a moving target advances between two messages [s], so that it does not
+#: jump after a gap
+LONGEST_ADVANCE = 0.05
 RESPONSE = 4.0, 0.0006  # changes of T [N] and l [m] above noise that count as a response
 
 Wait = Generator[None, None, None]  # each step takes one message
@@ -185,6 +189,26 @@ class MotionTest(ABC):
             if error := self._run_away(self._recent[-1][1], start):
                 raise error
 
+    def _since(self, last: float) -> float:
+        """Return the time [s] since `last`, but at most LONGEST_ADVANCE."""
+        return min(self._now - last, LONGEST_ADVANCE)
+
+    def _judge_latency(self, m: int, latency: float) -> None:
+        """Judge the time [s] from a command to the first response of muscle m.
+
+        A long time is no fault while this computer is overloaded, because commands and messages
+        then wait for their processes.
+        """
+        if latency <= LATEST:
+            self.verdict.passed('latency', m)
+            return
+        values = {'late': 1e3 * latency, 'most': 1e3 * LATEST}
+        if is_overloaded():
+            name, text = self._robot.muscles[m], FAULTS['late'].observation.format(**values)
+            self.verdict.excuse('latency', f'{name}: {text}')
+        else:
+            self.verdict.failed('late', m, **values)
+
     def _lasting(self, is_beyond: Bools) -> int | None:
         """Return a muscle that has been beyond its limits for longer than MOMENT, or None.
 
@@ -213,7 +237,7 @@ class MotionTest(ABC):
         last = self._now
         while self._target[m] != goal:
             yield from self._wait(1e-9)
-            most = RELEASE_SPEED * (self._now - last)
+            most = RELEASE_SPEED * self._since(last)
             self._target[m] += np.clip(goal - self._target[m], -most, most)
             last = self._now
         yield from self._wait(RELEASE)

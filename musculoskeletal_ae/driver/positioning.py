@@ -18,7 +18,6 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.driver.motion import (
     ABOVE_BIAS,
     HOLD,
-    LATEST,
     RELEASE,
     RESPONSE,
     RUN_AWAY_TENSION,
@@ -128,7 +127,7 @@ class Positioning(MotionTest):
                 latency = self._now - begun
         last = self._now
         while self._target[m] > start - FURTHEST and self._may_go_on(m):
-            self._target[m] -= SPEED * (self._now - last)
+            self._target[m] -= SPEED * self._since(last)
             last = self._now
             yield from self._wait(1e-9)
         yield from self._wait(HOLD)
@@ -168,9 +167,7 @@ class Positioning(MotionTest):
         else:
             verdict.passed('law', m)
         yield from self._go(m, start)
-        if latency > LATEST:
-            verdict.failed('late', m, late=1e3 * latency, most=1e3 * LATEST)
-        verdict.passed('latency', m)
+        self._judge_latency(m, latency)
 
     def _may_go_on(self, m: int) -> bool:
         """Return whether muscle m may be wound in further; True if its tension is unknown."""

@@ -2,11 +2,13 @@
 """The checks of a driver, the faults that they can find, and the verdict."""
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from musculoskeletal_ae.files import read_table
+from musculoskeletal_ae.report import load_text
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict
 
@@ -51,6 +53,10 @@ class Verdict:
         self._state = np.full((robot.muscle_count, len(CHECKS)), OPEN, dtype=object)
         self.faults: list[Fault] = []
         self.notes: list[str] = []  # remarks, and checks that were not possible
+        #: observations of checks that failed while this computer was overloaded, by check
+        self._excused: dict[str, list[str]] = {}
+        #: why the motion test must not begin although no fault was found; empty if it may begin
+        self.obstacle = ''
 
     def passed(self, check: str, *muscles: int) -> None:
         """Record that muscles, by default all, passed a check, unless they have failed it."""
@@ -76,6 +82,19 @@ class Verdict:
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))
         self.faults.append(Fault(texts.check, muscles, observation, change, what))
 
+    def excuse(self, check: Check, observation: str) -> None:
+        """Record that a check is not judged, because this computer is overloaded.
+
+        Args:
+            check: The check.
+            observation: What would have been a fault on a computer that is not overloaded.
+        """
+        self._excused.setdefault(check, []).append(observation)
+
+    def forbid_motion(self, reason: str) -> None:
+        """Record why the motion test must not begin although no fault was found."""
+        self.obstacle = reason
+
     def add(self, other: 'Verdict') -> None:
         """Add the results of another verdict on the same driver."""
         wrong = other._state == WRONG
@@ -83,15 +102,18 @@ class Verdict:
         self._state[(self._state == OPEN) & (other._state == OK)] = OK
         self.faults += other.faults
         self.notes += other.notes
+        for check, observations in other._excused.items():
+            self._excused.setdefault(check, []).extend(observations)
+        self.obstacle = self.obstacle or other.obstacle
 
     @property
     def allows_motion(self) -> bool:
-        """Whether the motion test may begin, which requires that no fault was found.
+        """Whether the motion test may begin: no fault was found, and the rate is high enough.
 
         Even a harmless fault forbids motion, because it may be mistaken for a dangerous one. For
         example, lengths of wrong sign can look like lengths with wrong zeros.
         """
-        return not self.faults
+        return not self.faults and not self.obstacle
 
     @property
     def wrong(self) -> set[str]:
@@ -137,4 +159,11 @@ class Verdict:
                 f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}',
                 f'    change: {fault.change}',
             ]
+        if self._excused:
+            observations = '; '.join(chain.from_iterable(self._excused.values()))
+            lines.append(
+                f'not judged: {", ".join(self._excused)} (this computer is overloaded, load '
+                f'{load_text()}): {observations}. A driver that runs here may be slow for this '
+                'reason alone: end other programs and repeat the check'
+            )
         return '\n'.join([*lines, *(f'note: {note}' for note in self.notes)])

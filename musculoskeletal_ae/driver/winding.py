@@ -269,7 +269,7 @@ class Winding(MotionTest):
             if self._now - start >= HOLD and not going_on:
                 break
             if lacking and self._now - start > 0.5 * HOLD:
-                self._target[m] -= SPEED * (self._now - last)
+                self._target[m] -= SPEED * self._since(last)
             last = self._now
             yield from self._wait(1e-9)
             length, tension, _ = self._recent[-1][1][:, m]
@@ -316,9 +316,7 @@ class Winding(MotionTest):
         self._judge_law(m, home, last, self._mean())
         yield from self._go(m, home.length[m])
         if half or whole:
-            if min(half + whole) > LATEST:
-                verdict.failed('late', m, late=1e3 * min(half + whole), most=1e3 * LATEST)
-            verdict.passed('latency', m)
+            self._judge_latency(m, min(half + whole))
 
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
         """Check the law at the highest demand, and with l_target beyond l."""
@@ -366,9 +364,11 @@ class Winding(MotionTest):
         answer = self._response[m] + 3.0 * self._swing[m]
         inwards = min(home_length - FURTHEST, -home_length) - far
         for goal in (inwards, max(home_length, -home_length) + far):
-            start, direction = self._now, np.sign(goal - home_length)
-            while (gone := SPEED * (self._now - start)) < abs(goal - home_length):
+            last, gone, direction = self._now, 0.0, np.sign(goal - home_length)
+            while gone < abs(goal - home_length):
                 yield
+                gone += SPEED * self._since(last)
+                last = self._now
                 readings = np.array([states[:2, m] for _, states in self._recent])
                 if (np.ptp(readings, axis=0) == 0.0).any():
                     return None

@@ -218,18 +218,24 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         if faults != reported:
             _say(verdict)
         reported = faults
-        if not (options.wait and faults):
+        if verdict.allows_motion or not options.wait:
             break
-        _say('fix the driver before moving the arm; still listening')
+        _say(
+            'fix the driver before moving the arm; still listening'
+            if faults
+            else f'{verdict.obstacle}; still listening'
+        )
     if options.move:
         driver.alone()
         if verdict.allows_motion:
             driver.wind(verdict)
             _say(verdict)
         else:
-            _say('motion test skipped: fix the faults above first')
+            reason = 'fix the faults above first' if verdict.faults else verdict.obstacle
+            _say(f'motion test skipped: {reason}')
     _say(verdict.conclusion)
-    return 1 if verdict.faults else 0
+    was_skipped = options.move and bool(verdict.obstacle)
+    return 1 if verdict.faults or was_skipped else 0
 
 
 def _parse(arguments: list[str]) -> Namespace:
@@ -249,7 +255,8 @@ def _parse(arguments: list[str]) -> Namespace:
         type=number(1.0, 1000.0),
         default=100.0,
         metavar='HZ',
-        help='expected rate of muscle_states or of the states of the motors [Hz]',
+        help='lowest rate of muscle_states, or of the states of the motors, that the driver is '
+        'expected to keep [Hz]; 20 %% less is tolerated',
     )
     text = 'posture [rad or m] in which the arm is held, if it has no joint sensors'
     add('--posture', type=numbers, metavar='θ,…', help=text)
