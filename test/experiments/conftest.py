@@ -9,7 +9,8 @@ from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import experiment
 
-#: duration of the exploration [min], long enough for updates of both presets
+#: duration of the exploration [min], long enough for samples of both presets and for updates of
+#: preset `default`
 MINUTES = 0.2
 KEPT = 'experiments_kept'
 
