@@ -44,7 +44,7 @@ from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.reception import Stamps, Streams
-from musculoskeletal_ae.remedy import sentence
+from musculoskeletal_ae.remedy import REPAIR, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
@@ -272,7 +272,9 @@ class Controller(Shell):
         present = self.core.reset(time.monotonic())
         if present is not None:
             if present.cause is StopCause.ANOMALY:
-                remedy = 'take the steps that the estimator reports as `remedy` on /diagnostics'
+                # The steps depend on the finding, which only the estimator knows.
+                unless = 'unless the estimator reports another `remedy` on /diagnostics'
+                remedy = f'{sentence(REPAIR)}, {unless}'
             else:
                 remedy = sentence(step for step in present.cause.steps if step not in LAST)
             again = f'call controller/reset again {LIMITS.settled:g} s after the cause has ended'

@@ -178,7 +178,9 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self._publish_isolated()
         self._report()
-        return f'cleared: {cause}' if cause else 'no anomaly was detected'
+        if not cause:
+            return 'no anomaly was detected'
+        return f'cleared: {cause}; if the cause is still present, it is detected again'
 
     def _check_health(self, _: Trigger.Request) -> str:
         """Confirm that no anomaly is detected; other nodes then clear the anomaly they latched.
