@@ -217,7 +217,7 @@ def write_body(name: str, out: Path) -> Path:
 
 
 def main(argv: list[str]) -> None:
-    """Write a body."""
+    """Write the body that the command line names as a robot directory."""
     parser = Parser('limbs', 'Writes a body of several limbs as a robot directory.')
     parser.add_argument('body', choices=BODIES, nargs='?', default='17x40')
     parser.add_argument('out', type=Path, metavar='DIR')

@@ -21,8 +21,8 @@ import yaml
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-#: robot of a soft link: one half of the link below and one half above the two joints, whose axes
-#: cross in the middle of the link
+#: robot that stands for a soft link: two joints, whose axes cross in the middle of the link, with
+#: one half of the link below them and one half above
 URDF = """<robot name="{name}">
   <link name="base"/>
   <joint name="bend_x" type="revolute"><parent link="base"/><child link="cross"/>

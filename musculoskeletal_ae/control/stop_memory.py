@@ -4,11 +4,11 @@
     controller.stop    the stop with which the next controller begins
     controller.lock    locked by the controller that uses the directory
 
-While a controller commands the arm, the file names the stop cause `restarted`. A latched stop
-replaces this cause by its own. A controller that ends properly while no stop is latched deletes the
-file. The file therefore remains if a stop was latched, and if the controller was killed or has
-crashed. A controller that finds the file when it starts is stopped from the beginning, and moves
-the arm only after `controller/reset`.
+While a controller commands the arm, controller.stop names the stop cause `restarted`. A latched
+stop replaces this cause by its own. A controller that ends properly while no stop is latched
+deletes controller.stop. The file therefore remains if a stop was latched, or if the controller was
+killed or has crashed. A controller that finds controller.stop when it starts is stopped from the
+beginning, and moves the arm only after `controller/reset`.
 """
 
 import fcntl

@@ -35,7 +35,7 @@ STEP = 0.003  # first step inwards, by which latency is measured [m]
 FURTHEST = 0.015  # largest distance by which the target moves inwards [m]
 OUTWARDS = 0.005  # distance by which the target moves outwards [m]
 FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
-SHARES = 0.7, 1.4  # legal range of the motion of l, divided by that of l_target
+SHARES = 0.7, 1.4  # legal ratios of the change of l to the change of l_target
 #: rise of T that is permitted while the arm is held, even where T exceeds the highest test tension
 #: at rest [N]
 RISE = 20.0

@@ -68,7 +68,10 @@ class Attachments:
     """Random displacements of the points (MuJoCo sites) at which tendons are attached to bodies."""
 
     def __init__(self, robot: Robot, model: Any, draw: Draw) -> None:
-        """Move the sites of `model`, whose tendons must have the names of the robot's muscles."""
+        """Move the sites of `model` by random displacements, which are drawn from `draw`.
+
+        The tendons of `model` must have the names of the robot's muscles.
+        """
         self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
         sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
         self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]

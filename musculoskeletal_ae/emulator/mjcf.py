@@ -438,7 +438,7 @@ def _moves(geom: Any) -> bool:
 
 
 def _equalities(spec: Any, kind: Any, names: set[str]) -> list[Any]:
-    """Return the equality constraints of a kind that refer to one of these joints or tendons."""
+    """Return the equality constraints of type `kind` on a joint or tendon that `names` contains."""
     equalities = [each for each in spec.equalities if each.type == kind]
     return [each for each in equalities if not names.isdisjoint([each.name1, each.name2])]
 

@@ -324,7 +324,7 @@ class Arm(ABC):
 
     @property
     def has_diverged(self) -> bool:
-        """Whether a joint angle is NaN or infinite because of excessive forces, until `reset`."""
+        """Whether excessive forces have made a joint angle NaN or infinite; `reset` ends this."""
         return not np.isfinite(self.theta).all()
 
     @property

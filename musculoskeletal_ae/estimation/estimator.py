@@ -468,7 +468,7 @@ class Estimator:
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
         if is_repair:
-            self.health.reset()  # the evidence of before the repair is no longer valid
+            self.health.reset()  # evidence from before the repair is no longer valid
             return False
         revokes = finding.kind in REVOKING and finding.muscle not in self.body.isolated
         if revokes and self.body.offsets.known:

@@ -237,7 +237,9 @@ def _read_sdf(
     for element in model.iter():
         if element.get('degrees') == 'true' or any(element.get(frame) for frame in FRAMES):
             problem = f'{element.tag} with {element.attrib}: only SDF 1.6 is supported'
-            raise refuse(file, f'{problem}, with poses in radians and in their default frames')
+            raise refuse(
+                file, f'{problem}, with angles in radians, and without {", ".join(FRAMES)}'
+            )
 
     def value(element: ET.Element | None, tag: str, count: int = 1, default: str = '0') -> Array:
         if element is None:

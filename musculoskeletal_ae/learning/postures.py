@@ -193,7 +193,7 @@ class GroupFit:
         return Point(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: Point) -> None:
-        """Compute the length noise, the robust weights and the joints at their stops at a point."""
+        """Compute length noise and robust weights at a point, and find joints at their stops."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise

@@ -18,7 +18,7 @@ from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
 STIFFNESS_SPREAD = 0.5  # prior standard deviation of α
 #: prior standard deviation of the angle at which a spring exerts no torque [rad]; for prismatic
-#: joints times `kinematics.RACK` [m]
+#: joints, this value times `kinematics.RACK` is the standard deviation of the position [m]
 REST_SPREAD = 0.2
 LARGEST_LOG = 2.0  # largest |α|
 

@@ -48,7 +48,7 @@ class Trainer:
         self._update: Update | None = None
 
     def begin(self, mae: Mae) -> None:
-        """Continue from a network and discard any earlier job."""
+        """Let training start from the network `mae`, and discard any earlier job."""
         self._updater = self.preset.make_updater(self.robot, mae, self.seed)
         self._update = None
 

@@ -324,8 +324,8 @@ def _check_covariance(name: str, covariance: Array) -> None:
         least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # one value if the matrix is (1, 1)
     except np.linalg.LinAlgError as error:
         raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
-    # A covariance is positive definite. The detector inverts the one of the residuals, which must
-    # therefore not be close to singular either.
+    # A covariance is positive definite. The covariance of the residuals must not be close to
+    # singular either, because the detector inverts it.
     if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
             f'tensor {name} has eigenvalues from {least:g} to {most:g}; the smallest must '

@@ -251,7 +251,7 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
         parameters = section.get('ros__parameters') if isinstance(section, dict) else None
         if not isinstance(parameters, dict):
             problem = f'expected a section {ALL_NODES!r} with a mapping `ros__parameters`'
-            raise _unreadable(file, f'{problem}, as in config/nodes.yaml')
+            raise _unreadable(file, f'{problem}; config/nodes.yaml is an example')
         try:
             check_names(map(str, parameters))
             for name in MOTORS.keys() & parameters.keys():
@@ -262,7 +262,10 @@ def motor_settings(files: Iterable[Path]) -> MotorSettings:
 
 
 def _motor_value(name: str, value: Any) -> Any:
-    """Check and return the value of a motor parameter, which ROS checks only for nodes."""
+    """Check and return the value of a motor parameter.
+
+    In nodes, ROS checks it already. Programs that read the file without a node need this check.
+    """
     parameter = MOTORS[name]
     is_list = isinstance(parameter.default, tuple)
     words = value if isinstance(value, list) else [value]

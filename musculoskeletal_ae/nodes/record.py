@@ -203,7 +203,7 @@ def _record(options: Namespace, arguments: list[str]) -> int:
             file=sys.stderr,
         )
     if options.are_chosen and missing:
-        print(f'warning: nothing was recorded of {"; ".join(missing)}', file=sys.stderr)
+        print(f'warning: no message was recorded of {"; ".join(missing)}', file=sys.stderr)
         return 1
     if not writer.message_count:
         print('warning: nothing was recorded: no message arrived on any topic', file=sys.stderr)

@@ -353,11 +353,11 @@ class StiffnessControl(Actuation):
         return tension
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
-        """Return the difference between the length and a command that demands T_limit [m], (M,)."""
+        """Return how far [m] a command that demands the tensions `limit` lies below l, (M,)."""
         return self.largest_depth(limit)
 
     def largest_depth(self, limit: Array) -> Array:
-        """Return the difference between the length and a command that demands `limit` [m], (M,)."""
+        """Return the largest `depth` [m] for any T and dT/dt, (M,)."""
         depth: Array = (limit - self._bias) / self._stiffness
         return depth
 

@@ -133,7 +133,8 @@ def follow(
         most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # Beyond these limits the tension no longer changes, but the module would need time to return.
+    # Limit the position of the module. Beyond these limits the tension no longer changes, and the
+    # module would only lose time on the way back.
     return clip(reached, length - span, length + max(loose, most))
 
 

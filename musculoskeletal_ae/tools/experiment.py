@@ -57,5 +57,6 @@ def _names(text: str) -> tuple[str, ...]:
     groups = {'all': NAMES, 'paper': PAPER}
     names = groups.get(text) or tuple(dict.fromkeys(text.split(',')))
     if unknown := [name for name in names if name not in NAMES]:
-        raise ArgumentTypeError(f'{unknown[0]!r}: expected {", ".join(NAMES)}, or "all" or "paper"')
+        legal = ', '.join([*NAMES, *groups])
+        raise ArgumentTypeError(f'unknown experiment {unknown[0]!r}; legal: {legal}')
     return names

@@ -107,7 +107,7 @@ def _read_mesh(directory: Path, element: ET.Element) -> trimesh.Trimesh:
     data = io.BytesIO(read_bytes(file, refuse, LARGEST_MESH))
     mesh = trimesh.load(data, file_type=file.suffix.lower()[1:], force='mesh')
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
-        raise refuse(file, 'has no faces, or vertices that are not finite')
+        raise refuse(file, 'has no faces, or has vertices that are not finite')
     return mesh.apply_scale([float(word) for word in element.get('scale', '1 1 1').split()])
 
 

@@ -57,7 +57,7 @@ REST_SHARE = 0.02
 
 
 def with_buttons(text: str) -> str:
-    """Replace services that a text advises to call by the buttons of the page that call them."""
+    """Return a text in which buttons of the page replace the services that users should call."""
     for calls, button in BUTTONS.items():
         text = text.replace(calls, f'press "{button}"')
     return text

@@ -61,7 +61,8 @@ class Page:
         except (OSError, UnicodeError) as error:
             reason = getattr(error, 'strerror', error)
             raise MusculoskeletalError(
-                f'no page at port {port} of {host}: {reason}; choose another --port or --host'
+                f'cannot serve the page at port {port} of {host}: {reason}; '
+                'choose another --port or --host'
             ) from error
         # Discard what viser prints.
         with (

@@ -117,7 +117,7 @@ def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp
     output, ns = recorder.end(signal.SIGINT), graph.namespace
     assert re.search('^0 messages recorded to .*, 0 lost$', output, re.MULTILINE)
     silent = f'{ns}/anomaly, which has no publisher; {ns}/muscle_states, which sent nothing'
-    assert f'nothing was recorded of {silent}' in output
+    assert f'no message was recorded of {silent}' in output
     assert recorder.process.returncode == 1
     assert Bag.open(tmp_path / 'bag').message_count == 0
 

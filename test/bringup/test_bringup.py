@@ -24,7 +24,7 @@ from musculoskeletal_ae.nodes.messages import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures('both_cores')
-#: numbers of checkpoints before learning has an effect, and after
+#: how many checkpoints there have been: before learning has an effect, and once it has one
 INITIAL, LEARNED = range(2), range(3, 1000)
 STATUS = re.compile(
     r'^ *\d+ s  error (?P<error>\d+\.\d+) rad  A (?P<a>\d+\.\d+)  '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control without isolated muscles, and verification of a suspect."""
+"""Control while muscles are isolated, by the other muscles; verification of a suspected muscle."""
 
 from dataclasses import replace
 from itertools import pairwise

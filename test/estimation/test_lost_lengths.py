@@ -191,7 +191,8 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     assert ruptured.kind is None
     assert ruptured.offsets.known
     np.testing.assert_array_equal(ruptured.offsets.offset, before.offset)
-    # It is published with a larger deviation, so that the other nodes trust the length again.
+    # The same offset is published with a larger standard deviation. This change tells the other
+    # nodes to trust the length again.
     grown = ruptured.offsets.deviation > before.deviation
     assert np.flatnonzero(grown).tolist() == [2]
     assert not ruptured.core.stream.displaced.muscles

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learning without isolated muscles: it uses no data of these muscles, and otherwise succeeds."""
+"""Learning while muscles are isolated: it uses no data of them, but learns from the others."""
 
 import numpy as np
 

@@ -461,7 +461,7 @@ def test_a_push_ends_when_its_visitor_leaves(arm26):
 
 
 def test_an_address_of_another_machine_is_refused(arm26):
-    with pytest.raises(MusculoskeletalError, match=r'no page at port \d+ of 192\.0\.2\.1: Cannot'):
+    with pytest.raises(MusculoskeletalError, match=r'page at port \d+ of 192\.0\.2\.1: Cannot'):
         Page(arm26, '192.0.2.1', free_port(), False, lambda *_: None)
     with pytest.raises(MusculoskeletalError, match=r'of 127\.\.0\.1: .*choose another'):
         Page(arm26, '127..0.1', free_port(), False, lambda *_: None)
@@ -478,5 +478,5 @@ def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
     second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
     status, output = second.ended()
     assert status == 1
-    reported = f'error: no page at port {port} of 127.0.0.1: Address already in use'
+    reported = f'error: cannot serve the page at port {port} of 127.0.0.1: Address already in use'
     assert reported in output and 'Traceback' not in output
