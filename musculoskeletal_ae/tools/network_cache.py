@@ -22,7 +22,13 @@ from musculoskeletal_ae.robot.directories import find_robot
 
 PACKAGE = Path(__file__).resolve().parents[1]
 #: files and directories of the package that determine an initial network
-CODE = 'robot', 'mae', 'presets', 'paper', 'tools/model_training.py'
+CODE = (
+    'robot',
+    'mae',
+    'presets',
+    'paper',  # has the initial training of §III-B
+    'tools/model_training.py',
+)
 ROBOT_FILES = 'robot.urdf', 'muscles.yaml'
 
 
