@@ -2,6 +2,7 @@
 """Check a recording: contents, completeness and fit to a robot (`replay --check`)."""
 
 from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -20,6 +21,7 @@ from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.presets.registry import preset_named
+from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -51,9 +53,10 @@ def check_bag(
     namespace: str | None = None,
     motors: MotorSettings = NO_MOTORS,
 ) -> BagCheck:
-    """Read a recording and report its contents, completeness and fit to a robot.
+    """Read a recording, and report its contents, completeness and fit to a robot.
 
-    If the recording cannot be read, the report lists the error as a fault.
+    If the recording cannot be read, the report lists the error as a fault. The progress is printed
+    to stderr.
 
     Args:
         path: The bag.
@@ -63,9 +66,11 @@ def check_bag(
     """
     check = BagCheck()
     try:
-        bag = Bag.open(path)
-        check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
-        check.lines += _contents(bag)
+        with ProgressBar(f'reading {path}') as bar:
+            bar.announce()
+            bag = Bag.open(path)
+            check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
+            check.lines += _contents(bag, bar.add)
         interface_topics(bag, namespace, motors)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
@@ -108,15 +113,17 @@ def _resting_postures(robot: Robot, recording: Pairs) -> int:
     healthy = Reservoir(robot.muscle_count, 0, DEFAULT, radian=radian)
     collector = SampleCollector(robot, samples, healthy, DEFAULT)
     isolated: tuple[int, ...] = ()
-    for time, theta, length, tension, row in zip(*recording, strict=True):
-        newest = tuple(np.flatnonzero(row == 1).tolist())
-        if newest != isolated:
-            isolated = newest
-            collector.use_body(collector.body.with_isolated(isolated))
-        collector.joints(time, theta)
-        states = np.array([length, tension, np.full(len(length), np.nan)])
-        if (paired := collector.muscles(time, states)) is not None:
-            collector.collect(paired)
+    with ProgressBar('counting resting postures', len(recording.time)) as bar:
+        for time, theta, length, tension, row in zip(*recording, strict=True):
+            newest = tuple(np.flatnonzero(row == 1).tolist())
+            if newest != isolated:
+                isolated = newest
+                collector.use_body(collector.body.with_isolated(isolated))
+            collector.joints(time, theta)
+            states = np.array([length, tension, np.full(len(length), np.nan)])
+            if (paired := collector.muscles(time, states)) is not None:
+                collector.collect(paired)
+            bar.add()
     return samples.accepted
 
 
@@ -155,12 +162,13 @@ def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
     ]
 
 
-def _contents(bag: Bag) -> list[str]:
+def _contents(bag: Bag, progress: Callable[[float], None]) -> list[str]:
     times = {name: array('q') for name in bag.topics}
     for message in bag.messages():
         times[message.topic].append(message.log_time)
         if not bag.topics[message.topic].problem:
             bag.decode(message)
+        progress(1.0 / bag.message_count)
     begin = datetime.fromtimestamp(bag.start / 1e9, timezone.utc)
     length = f'{(bag.end - bag.start) / 1e9:.3f} s from {begin:%Y-%m-%d %H:%M:%S} UTC'
     has_checksums = all(file.has_checksums for file in bag.files)
@@ -189,7 +197,8 @@ def _fit(bag: Bag, name: str, namespace: str | None, motors: MotorSettings) -> _
     """Return the reasons why a bag does not fit a robot, and remarks on messages left unused."""
     try:
         robot = Robot.load(name)
-        streams = read_streams(bag, robot, namespace, motors)
+        with ProgressBar(f'comparing {bag.path} with {name}') as bar:
+            streams = read_streams(bag, robot, namespace, motors, bar.add)
     except BagError as error:
         return _Fit([f'does not fit {name}: {error}'], [])
     except MusculoskeletalError as error:

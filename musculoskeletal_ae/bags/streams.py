@@ -190,7 +190,11 @@ BODY_TOPICS = 'isolated_muscles', 'muscle_length_zeros'
 
 
 def read_streams(
-    bag: Bag, robot: Robot, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
+    bag: Bag,
+    robot: Robot,
+    namespace: str | None = None,
+    motors: MotorSettings = NO_MOTORS,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Streams:
     """Read sensor data and commands of one arm.
 
@@ -207,6 +211,7 @@ def read_streams(
         robot: The robot, whose joints and muscles the messages must have.
         namespace: The namespace of the arm; required only if the bag has several.
         motors: How the motors of a ros2_control robot are connected.
+        progress: Called after each message with its share of all messages, which add up to 1.
 
     Raises:
         BagError: If no message of a topic fits the robot, the bag is damaged, or `interface_topics`
@@ -224,7 +229,7 @@ def read_streams(
             takers[recorded[name]][labels[name]] = stream.take
     clock_offsets = _bunched(bag, list(takers))
     early = [recorded[name] for name in BODY_TOPICS if name in recorded]
-    _deliver(bag, takers, early, clock_offsets, reception)
+    _deliver(bag, takers, early, clock_offsets, reception, progress)
     # A topic of motors that also counts as joint_states need not contain joint angles, because the
     # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
@@ -268,6 +273,7 @@ def _deliver(
     early: Sequence[str],
     clock_offsets: Mapping[str, int],
     reception: Reception,
+    progress: Callable[[float], None],
 ) -> None:
     """Read the messages of a bag, and pass each one to the functions for its topic.
 
@@ -281,7 +287,9 @@ def _deliver(
         clock_offsets: Offset [ns] of the publisher's clock for each topic whose messages are timed
             by publication; messages of other topics are timed by their log times.
         reception: Rejects messages for which a function raises a MessageError, and counts them.
+        progress: Called after each message with its share of all messages.
     """
+    count = sum(bag.topics[topic].message_count for topic in takers)
     receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
     delays = defaultdict[tuple[str, ...], MessageDelay](MessageDelay)
     for message in chain(bag.messages(early), bag.messages(takers.keys() - early)):
@@ -301,6 +309,7 @@ def _deliver(
         arrival = _Arrival(time, delays[sender].step(time, message.publish_time))
         for take in receive[sender]:
             take((arrival, decoded), sent)
+        progress(1.0 / count)
 
 
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:

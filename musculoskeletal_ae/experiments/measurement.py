@@ -23,6 +23,7 @@ from musculoskeletal_ae.experiments.results import (
 )
 from musculoskeletal_ae.experiments.runner import run
 from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.progress_bar import is_bar_visible
 from musculoskeletal_ae.robot.robot import Robot
 
 BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
@@ -44,7 +45,7 @@ def measure(args: Namespace) -> None:
         study = Study(
             robot, args.preset, args.seeds, args.minutes, args.quick, folder, args.reality
         )
-        with tqdm(total=1.0, disable=None, bar_format=BAR) as bar:
+        with tqdm(total=1.0, disable=not is_bar_visible(), bar_format=BAR) as bar:
 
             def report(share: float, running: str) -> None:
                 bar.n = share

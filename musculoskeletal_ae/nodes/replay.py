@@ -35,6 +35,7 @@ from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.nodes.taught_motion import ACKNOWLEDGE_TIME, send_taught_motion
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
+from musculoskeletal_ae.progress_bar import is_bar_visible
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import END_OF_RECORDING, Report
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -222,7 +223,9 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
         start_ros(arguments)
         node = Replay(bag, names, options)
         bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
-        with tqdm(total=node.length, bar_format=bar, disable=None, leave=False) as progress:
+        with tqdm(
+            total=node.length, bar_format=bar, disable=not is_bar_visible(), leave=False
+        ) as progress:
             node.get_ready(options.wait)
             node.play(progress, options.loop)
         node.acknowledge()

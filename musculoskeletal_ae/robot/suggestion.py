@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from tqdm import tqdm
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_yaml
+from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot import checks
 from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
@@ -80,10 +80,13 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
 
     options = {'seed': seed % 2**32 + 1, 'verbose': -9, 'tolfun': 1e-3}
     search = cma.CMAEvolutionStrategy(unchanged.ravel(), START_SPREAD, options)
-    for _ in tqdm(range(TRIES * unchanged.size // search.popsize), disable=None):
-        if not search.stop():
-            candidates = search.ask()
-            search.tell(candidates, [cost(x) for x in candidates])
+    tries = TRIES * unchanged.size // search.popsize
+    with ProgressBar('searching for places of via points', tries) as bar:
+        for _ in range(tries):
+            if not search.stop():
+                candidates = search.ask()
+                search.tell(candidates, [cost(x) for x in candidates])
+            bar.add()
     change = change_of(search.best.x)
     if not lacks(change):
         # Move each point back to its old place, the least moved first, if the arm stays sound.

@@ -2,13 +2,11 @@
 """`train --from-bag`: learns from recordings, as on a running arm, and reports the errors."""
 
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
@@ -25,12 +23,12 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.options import DEFAULT_SEED
+from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.stop_signals import STOP, Reaction
-from musculoskeletal_ae.tools import model_training
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
 
@@ -84,7 +82,9 @@ def train(args: Namespace) -> None:
         print(f'{path} ({kind}): joint-angle error {change} ({note})')
         if path not in args.hold_out:
             continue
-        if warning := anomaly_in(robot, pairs, learner.mae, args.preset):
+        with ProgressBar(f'looking for anomalies in {path}', len(pairs.time)) as bar:
+            warning = anomaly_in(robot, pairs, learner.mae, args.preset, bar.add)
+        if warning:
             warnings.append(f'{path} (held out): {warning}')
     print(f'checkpoint: {args.out}')
     sys.stdout.flush()
@@ -124,29 +124,14 @@ def _initial_network(robot: Robot, args: Namespace) -> Mae:
 
 def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:
     """Learn from a recording and show the progress; return a warning, or ''."""
-    total = round(recording.time[-1] - recording.time[0], 1)
-    begun = reported = time.perf_counter()
-    passed = 0.0
-    with tqdm(total=total, unit=' s', desc=path.name, disable=None) as bar:
-        if bar.disable:
-            print(f'{path}: learning from a recording of {total:.0f} s', flush=True)
+    total = float(recording.time[-1] - recording.time[0])
 
-        def progress(seconds: float) -> None:
-            nonlocal passed, reported
-            bar.update(seconds)
-            passed += seconds
-            now = time.perf_counter()
-            if now - reported < model_training.REPORT_INTERVAL:
-                return
-            reported = now
-            learned = f'{len(learner.samples)} samples, {learner.updates} updates'
-            if bar.disable:
-                share = 100.0 * passed / max(total, passed)
-                print(f'{path}: {share:.0f} %, {learned}, {now - begun:.0f} s elapsed', flush=True)
-            else:
-                bar.set_postfix_str(learned)
+    def learned() -> str:
+        return f'{len(learner.samples)} samples, {learner.updates} updates'
 
-        return learn(learner, recording, progress)
+    with ProgressBar(f'learning from {path}', total, learned) as bar:
+        bar.announce(f', a recording of {total:.0f} s')
+        return learn(learner, recording, bar.add)
 
 
 def _nothing_learned(learner: Learner) -> str:
@@ -191,11 +176,18 @@ def _warn(warnings: list[str]) -> None:
         print(f'warning: {warning}', file=sys.stderr)
 
 
-def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
+def anomaly_in(
+    robot: Robot,
+    recording: Pairs,
+    mae: Mae,
+    preset: str,
+    progress: Callable[[], None] = lambda: None,
+) -> str:
     """Return a warning about the first anomaly in a recording; '' if there is none.
 
     The warning also states the error of the estimate before the anomaly. The health
-    monitor detects the anomaly with the learned network, as on a running arm.
+    monitor detects the anomaly with the learned network, as on a running arm. `progress` is called
+    after each message.
     """
     stream, health = MuscleStream(robot), HealthMonitor(robot, preset)
     isolated: tuple[int, ...] | None = None
@@ -211,6 +203,7 @@ def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
         states = np.array([recording.length[row], recording.tension[row], recording.tension[row]])
         states[2] = np.nan
         finding = _finding(health, reduced, stream, states, at, min(dt, LONGEST_PERIOD))
+        progress()
         if finding is None:
             continue
         muscle = robot.muscles[finding.muscle]
@@ -225,7 +218,7 @@ def anomaly_in(robot: Robot, recording: Pairs, mae: Mae, preset: str) -> str:
 def read(
     path: Path, robot: Robot, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
 ) -> Pairs:
-    """Return the paired messages of a bag, and print warnings about unused messages.
+    """Return the paired messages of a bag, and print progress, and warnings about unused messages.
 
     Args:
         path: The bag.
@@ -236,10 +229,12 @@ def read(
     Raises:
         BagError: If the bag is unusable or has no pair of simultaneous messages.
     """
-    bag = Bag.open(path)
+    with ProgressBar(f'reading {path}') as bar:
+        bar.announce()
+        bag = Bag.open(path)
+        streams = read_streams(bag, robot, namespace, motors, bar.add)
     for reason in bag.unfinished:
         print(f'warning: {path} is unfinished: {reason}', file=sys.stderr)
-    streams = read_streams(bag, robot, namespace, motors)
     for reason, count in streams.rejected.items():
         print(f'warning: {path}: {count} messages were rejected: {reason}', file=sys.stderr)
     for note in streams.notes:

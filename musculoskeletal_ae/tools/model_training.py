@@ -8,7 +8,6 @@ from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_plot
@@ -17,13 +16,12 @@ from musculoskeletal_ae.mae.initial_training import Trained, initial_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, PairError, pair_errors, random_states, train_on
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.registry import PRESETS
+from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT_STATES = 5000  # number of states of the geometric model over which errors are averaged
-#: time between two lines of progress without a terminal [s]
-REPORT_INTERVAL = 5.0
 ENTERED = {
     Mask.THETA_TENSION: '① (θ, T)',
     Mask.TENSION_LENGTH: '② (T, l)',
@@ -77,25 +75,14 @@ def train(args: Namespace) -> None:
 def train_on_model(robot: Robot, args: Namespace) -> Trained:
     """Train a network on the geometric model, and show the progress."""
     steps = PRESETS[args.preset].initial_steps(robot.groups) // (10 if args.quick else 1)
-    start = time.perf_counter()
-    with tqdm(total=steps, unit='batch', desc=f'train {args.preset}', disable=None) as bar:
-        reported, begun = start, 0.0
-        if bar.disable:
-            print(f'training: drawing states of the geometric model, {steps} mini-batches follow')
-            sys.stdout.flush()
+    newest = 0.0  # loss of the newest mini-batch
+    with ProgressBar('training', steps, lambda: f'loss {newest:.4f}') as bar:
+        bar.announce(f': drawing states of the geometric model, {steps} mini-batches follow')
 
-        def progress(step: int, loss: float, *_: object) -> None:
-            nonlocal reported, begun
-            bar.update()
-            if step % 100 == 0:
-                bar.set_postfix(loss=f'{loss:.4f}', refresh=False)
-            now = time.perf_counter()
-            begun = begun or now
-            if bar.disable and now - reported >= REPORT_INTERVAL and step:
-                reported, left = now, (steps - step) / step * (now - begun)
-                share = 100.0 * step / steps
-                print(f'training: {share:.0f} %, loss {loss:.4f}, about {left:.0f} s left')
-                sys.stdout.flush()
+        def progress(_step: int, loss: float, *_: object) -> None:
+            nonlocal newest
+            newest = loss
+            bar.add()
 
         return initial_mae(robot, args.preset, args.seed, progress, steps)
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from musculoskeletal_ae import progress_bar
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.finding import Finding, Kind
@@ -125,15 +126,15 @@ def test_progress_and_wrong_joint_sensors_are_reported(
             progress(step, 0.5)
         return SimpleNamespace(mae=initial)
 
-    monkeypatch.setattr(model_training, 'REPORT_INTERVAL', 0.0)
+    monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.0)
     monkeypatch.setattr(model_training, 'initial_mae', trained)
     monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
     out = str(tmp_path / 'out.safetensors')
     assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 1
     printed = capsys.readouterr()
-    assert 'training: 50 %, loss 0.5' in printed.out
-    assert 'BAG: learning from a recording of 20 s\n' in printed.out
-    assert re.search(r'BAG: \d+ %, [01] samples, 0 updates, \d+ s elapsed\n', printed.out)
+    assert 'training: 50 %, loss 0.5' in printed.err
+    assert 'learning from BAG, a recording of 20 s\n' in printed.err
+    assert re.search(r'learning from BAG: \d+ %, [01] samples, 0 updates, about ', printed.err)
     *_, warning, failed = printed.err.splitlines()
     assert failed.startswith('error: nothing was learned (0 updates). Different resting postures')
     assert 'in the recordings: 1; learning begins with 2. Record' in failed

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+import fcntl
+import os
+import struct
+import sys
+import termios
+import time
+from contextlib import suppress
+
+import pytest
+
+from musculoskeletal_ae import progress_bar
+from musculoskeletal_ae.progress_bar import ProgressBar
+
+
+def work(seconds=0.05, parts=5):
+    """Do work that takes at least this time [s], and show its progress."""
+    with ProgressBar('working', parts, lambda: 'note') as bar:
+        bar.announce(' hard')
+        for _ in range(parts):
+            time.sleep(seconds / parts)
+            bar.add()
+
+
+@pytest.fixture
+def shown_on(monkeypatch):
+    """Return a function that works with a terminal of a given width, and returns what it shows."""
+
+    def run(columns):
+        ours, terminal = os.openpty()
+        fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', 24, columns, 0, 0))
+        with os.fdopen(terminal, 'w') as stderr, monkeypatch.context() as patch:
+            patch.setattr(sys, 'stderr', stderr)
+            work()
+        shown = b''
+        with suppress(OSError):  # EIO at the end
+            while more := os.read(ours, 4096):
+                shown += more
+        os.close(ours)
+        return shown.decode()
+
+    return run
+
+
+def test_a_short_task_prints_one_line_and_no_progress(capsys):
+    work()
+    assert capsys.readouterr() == ('', 'working hard\n')
+
+
+def test_a_long_task_prints_its_progress_at_intervals(capsys, monkeypatch):
+    monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.1)
+    work(seconds=0.5, parts=100)
+    first, *lines = capsys.readouterr().err.splitlines()
+    assert first == 'working hard' and 1 <= len(lines) <= 5 + 1
+    assert lines[0].startswith('working: ') and ' %, note, about ' in lines[0]
+
+
+def test_a_terminal_shows_a_bar(shown_on):
+    shown = shown_on(80)
+    assert 'working:   0%|' in shown and 'working hard' not in shown
+
+
+def test_a_terminal_of_unknown_width_shows_lines(shown_on, monkeypatch):
+    monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.0)
+    shown = shown_on(0)
+    assert 'working hard' in shown and 'working: 100 %' in shown and '|' not in shown
