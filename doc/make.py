@@ -117,11 +117,16 @@ def _class(node: ast.ClassDef) -> list[str]:
     methods = [member for member in node.body if isinstance(member, ast.FunctionDef)]
     made = next((member for member in methods if member.name == '__init__'), None)
     lines = [f'**{_signature(made, node.name) if made else f"`{node.name}`"}** {_first(node)}', '']
-    fields = [ast.unparse(m.target) for m in node.body if isinstance(m, ast.AnnAssign)]
+    fields = [
+        f'{ast.unparse(member.target)}: {ast.unparse(member.annotation)}'
+        for member in node.body
+        if isinstance(member, ast.AnnAssign)
+    ]
     for member in methods:
         marks = [ast.unparse(mark) for mark in member.decorator_list]
         plain = 'property' in marks or 'cached_property' in marks
-        fields.append(member.name + '()' * (not plain))
+        kind = f': {ast.unparse(member.returns)}' if plain and member.returns else '()'
+        fields.append(member.name + kind)
     public = ' '.join(f'`{name}`' for name in fields if not name.startswith('_'))
     return [*lines[:1], public, ''] if public else lines
 

@@ -30,7 +30,13 @@ RELEASE = 100.0  # rate of this decrease [N/s]
 
 
 class Bus:
-    """Your motors and sensors; arrays have the order of muscles.yaml. This class is a fake."""
+    """Your motors and sensors. This class is a fake.
+
+    All arrays have the order of muscles.yaml, as the names in `robot.muscles`. If your bus has
+    another order, let `order = robot.muscle_indices(names)`, with the names in the order of the
+    bus. Then `tension[order]` is in the order of the bus, and `reading[np.argsort(order)]` in that
+    of muscles.yaml.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self.arm, self.read_at = EmulatedArm(robot, seed=1), time.monotonic()

@@ -30,6 +30,14 @@ from musculoskeletal_ae.robot.stiffness import muscle_stiffness
 class Robot:
     """Geometric model of D joints and M muscles (paper, §III-B)."""
 
+    description: RobotDescription
+    joints: tuple[str, ...]  # names of the joints, in the order of θ
+    muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
+    tension: TensionRange
+    stiffness: Array  # K_stiff of muscle stiffness control [N/m], (M,)
+    lower: Array  # lower joint limits [rad] ([m] of prismatic joints), (D,)
+    upper: Array  # upper joint limits, (D,)
+
     def __init__(self, description: RobotDescription) -> None:
         self.description = description
         self.joints, self.muscles = description.joints, description.muscles
@@ -53,7 +61,6 @@ class Robot:
         )
         self.routes = Routes(self.kinematics, description.routes)
         self.groups = groups(self.routes.crossed)
-        #: joint limits [rad] ([m] of prismatic joints), (D,), and the units of each joint
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
         self.units = self.kinematics.units
 
