@@ -51,9 +51,10 @@ COMMANDS = (
     'controller/stop', 'controller/explore', 'end exploring', 'reset', 'hand', 'estimator/zero',
     'estimator/restore',
 )  # fmt: skip
-#: change of the estimate, as a share of the joint's range, that a slider does not follow; otherwise
-#: the noise of an arm at rest would change a number while somebody begins to type
-REST_SHARE = 0.02
+#: The sliders follow the arm only when it rests. Otherwise, they would replace a number while
+#: somebody types it. An arm rests if no joint has moved by more than REST_SHARE of its range for
+#: REST_TIME [s]. The noise of an estimate is smaller than that.
+REST_SHARE, REST_TIME = 0.02, 1.0
 
 
 def with_buttons(text: str) -> str:
@@ -81,6 +82,8 @@ class Controls:
         self._sliders: dict[Key, Any] = {}  # handles of all sliders
         self._settled: dict[Key, float] = {}  # last value that was followed or sent
         self._entered: dict[Key, float] = {}  # last value that was followed or entered
+        #: posture [rad] (D,) near which the estimate has been, and since when [s]
+        self._rest = np.full(robot.joint_count, np.nan), 0.0
         self._is_pushing = False
         #: controls of each node, which are shown while the node runs
         self._of_node: dict[str, Any] = {
@@ -229,24 +232,38 @@ class Controls:
         """Update the controls.
 
         Args:
-            theta: The estimated θ [rad] (D,), which the sliders show until a visitor changes one.
+            theta: The estimated θ [rad] (D,). The sliders show it when the arm rests, until a
+                visitor changes one.
             payload: Payload of the emulated arm [kg].
             played: Position and length of the replay [s]; None without a replay.
         """
-        if theta is not None and not self._is_targeted:
-            for joint, angle, slider in zip(self._robot.joints, theta, self.sliders):
-                span = slider.max - slider.min
-                if abs(angle - slider.value) <= max(REST_SHARE * span, slider.step):
-                    continue
-                near = round(np.clip(angle, slider.min, slider.max) / slider.step) * slider.step
-                self._set(('targets', joint), float(np.clip(near, slider.min, slider.max)))
-            self._gizmo.position = self._robot.kinematics.end_effector_pose(theta).translation
         now = monotonic()
+        if theta is not None and not self._is_targeted:
+            if self._is_at_rest(theta, now):
+                self._show(self._rest[0])
+            self._gizmo.position = self._robot.kinematics.end_effector_pose(theta).translation
         if not self._entries.are_recent('payload', now):
             self._set(('payload', PAYLOAD), round(min(max(payload, 0.0), MOST_PAYLOAD), 1))
         if played is not None and not self._entries.are_recent('position', now):
             self._timeline.max = round(max(played[1], 0.1), 1)
             self._set(('position', POSITION), round(min(played), 1))
+
+    def _is_at_rest(self, theta: Array, now: float) -> bool:
+        """Return whether the estimate θ [rad] (D,) has hardly changed for REST_TIME [s]."""
+        span = np.array([slider.max - slider.min for slider in self.sliders])
+        posture, since = self._rest
+        if (np.abs(theta - posture) <= REST_SHARE * span).all():
+            return now - since >= REST_TIME
+        self._rest = theta.copy(), now
+        return False
+
+    def _show(self, theta: Array) -> None:
+        """Set the sliders to a posture θ [rad] (D,)."""
+        for joint, angle, slider in zip(self._robot.joints, theta, self.sliders):
+            near = round(np.clip(angle, slider.min, slider.max) / slider.step) * slider.step
+            value = float(np.clip(near, slider.min, slider.max))
+            if value != slider.value:
+                self._set(('targets', joint), value)
 
     def end_visit(self) -> None:
         """Discard the values that are being entered, and end a push: a visitor may have left.

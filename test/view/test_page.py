@@ -33,6 +33,7 @@ from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import controls
+from musculoskeletal_ae.view.controls import REST_TIME
 from musculoskeletal_ae.view.entries import SETTLE_TIME
 from musculoskeletal_ae.view.page import Page
 from musculoskeletal_ae.view.readings import History, scale_top
@@ -227,7 +228,8 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         assert not targets and not any(message.data for message in detected)
         page.click(*page.centre('End exploring'))
         graph.wait(lambda: modes[-1].data == 'idle', 'the end of the exploration')
-        # The sliders follow the arm, and would replace a number that is typed while it moves.
+        # When the arm comes to rest, the sliders show its posture, and would replace a number that
+        # is being typed at this moment.
         graph.wait(is_at_rest, 'the arm to come to rest')
         graph.next('estimated_joint_states', 100)  # time for the page to show this posture
         page.type_at('elbow', '-1.2')
@@ -373,10 +375,31 @@ def follow(page: Page, elbow: float) -> None:
     page.follow(0.0, None)
 
 
+def rest(page: Page, elbow: float, clock: Any) -> None:
+    """Show the same estimate for so long that the arm is at rest."""
+    follow(page, elbow)
+    clock.now += REST_TIME
+    follow(page, elbow)
+
+
+def test_sliders_follow_an_arm_that_rests_but_not_one_that_moves(entering, clock):
+    page, _, _ = entering
+    slider = page.controls.sliders[-1]
+    rest(page, -0.5, clock)
+    assert slider.value == pytest.approx(-0.5)
+    for elbow in np.linspace(-0.6, -1.0, 9):
+        clock.now += 0.5 * REST_TIME
+        follow(page, elbow)
+        assert slider.value == pytest.approx(-0.5)
+    clock.now += REST_TIME
+    follow(page, -1.0)
+    assert slider.value == pytest.approx(-1.0)
+
+
 def test_a_number_is_sent_when_it_is_complete_and_is_not_overwritten_before(arm26, entering, clock):
     page, asked, enter = entering
     slider, elbow = page.controls.sliders[-1], arm26.joints[-1]
-    follow(page, -0.5)
+    rest(page, -0.5, clock)
     assert slider.value == pytest.approx(-0.5)
     follow(page, -0.51)  # noise of the estimate must not change the box while somebody uses it
     assert slider.value == pytest.approx(-0.5)
@@ -399,7 +422,7 @@ def test_a_number_is_sent_when_it_is_complete_and_is_not_overwritten_before(arm2
 def test_a_number_beyond_the_limits_is_refused_and_taken_back(arm26, entering, clock, is_left):
     page, asked, enter = entering
     slider, elbow = page.controls.sliders[-1], arm26.joints[-1]
-    follow(page, -0.5)
+    rest(page, -0.5, clock)
     # When the visitor leaves the box, the browser clamps the number to the limit.
     enter(slider, -1.0, -12.0, *[slider.min] * is_left)
     clock.now += SETTLE_TIME
