@@ -31,8 +31,15 @@ parser.add_argument(
 parser.add_argument('--out', default='learned.safetensors', help='file for the network')
 options = parser.parse_args()
 
+
+def show_progress(step: int, *_: object) -> None:
+    """Print a line after every hundredth step of the initial training."""
+    if step % 100 == 0:
+        print(f'training on the geometric model: step {step} of {options.steps}', flush=True)
+
+
 robot = Robot.load('arm26')  # or the directory of your robot.urdf and muscles.yaml
-initial = initial_mae(robot, steps=options.steps).mae  # trained on the geometric model
+initial = initial_mae(robot, steps=options.steps, progress=show_progress).mae
 arm = EmulatedArm(robot, seed=1)
 learner = Learner(robot, initial)
 
@@ -55,6 +62,8 @@ for theta in robot.random_postures(options.postures, rng):
         for mae in (initial, learner.mae)
     ]
     errors.append([np.linalg.norm(estimate - read.theta) for estimate in estimates])
+    count = f'posture {len(errors)} of {options.postures}'
+    print(f'{count}: error {errors[-1][1]:.3f} rad, {learner.updates} updates', flush=True)
 
 before, after = np.mean(errors[-10:], axis=0)
 print(f'{len(learner.samples)} samples, {learner.updates} updates')

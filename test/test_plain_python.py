@@ -106,8 +106,11 @@ def test_the_example_learns_without_ros(tmp_path):
         env={**os.environ, 'PYTHONPATH': str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    before, after = (float(word) for word in done.stdout.split() if word.startswith('0.'))
+    *progress, last = done.stdout.splitlines()
+    before, after = (float(word) for word in last.split() if word.startswith('0.'))
     assert after < before
+    assert any(line.startswith('training on the geometric model: step 0 ') for line in progress)
+    assert sum(line.startswith('posture ') for line in progress) == 4  # a line for each posture
     assert (tmp_path / 'a.safetensors').exists()
 
 
