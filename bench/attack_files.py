@@ -329,8 +329,8 @@ def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
 
 
 def _child(start: str, count: str, seed: str, folder: str) -> None:
-    # Without these limits, one file could exhaust the memory of the machine or block the bench. The
-    # parent reports as a finding that a limit was reached.
+    # Without these limits, one file could exhaust the memory of the machine or block the bench. If
+    # a limit is reached, the bench reports this as a finding.
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     resource.setrlimit(resource.RLIMIT_CPU, (3600, 3600))
     import faulthandler

@@ -336,7 +336,10 @@ def second(name: str, node: str = '') -> Callable[[Scene], None]:
 
 
 def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
-    """Return an attack that publishes a network changed by `change`, as the learner would."""
+    """Return an attack that publishes a wrong network on the topic of the learner.
+
+    `change` derives this network from the one in use.
+    """
 
     def attack(scene: Scene) -> None:
         mae = checkpoint.from_bytes(

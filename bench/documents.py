@@ -113,7 +113,10 @@ def commands(page: Path) -> list[Command]:
 
 
 def _blocks(page: Path) -> list[tuple[str, str]]:
-    """Return the mark ('' if none) and the text of each block of a page."""
+    """Return the mark and the text of each ```sh block of a page.
+
+    The mark is the text of the comment `<!-- bench: … -->` above the block, or '' if there is none.
+    """
     pattern = r'(?:<!-- bench: (?P<mark>[^>]*?) -->\s*)?^ *```sh\n(?P<block>.*?)^ *```'
     text = page.read_text('utf-8')
     return [(m['mark'] or '', m['block']) for m in re.finditer(pattern, text, re.S | re.M)]

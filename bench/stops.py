@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stops nodes while they start, by SIGINT and SIGTERM at random moments of the first 3 s.
+"""Stops nodes with SIGINT or SIGTERM at random moments of the first 3 s of their start.
 
     python -m bench stops [--count 70] [--seed 0]
 
-The bench passes if every node ends with status 0 and without a traceback. Python reaches the first
-line of the package about 0.1 s after the start, or later on a busy machine. A signal before that
-ends the process, and Python may print a traceback; these cases are counted separately.
+Python reaches the first line of the package about 0.1 s after the start, or later on a busy
+machine. The bench passes if every node that gets the signal later ends with status 0 and without
+a traceback. An earlier signal ends the process at once, and Python may print a traceback. The bench
+counts these cases, but they do not affect its result.
 """
 
 import os

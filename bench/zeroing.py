@@ -143,7 +143,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 
 def main(argv: list[str]) -> int:
-    """Print the table; exit status 0 if every individual meets the goals."""
+    """Print the results; return the exit status, 0 if every individual meets the goals, else 1."""
     parser = Parser('zeroing', 'Tests length calibration after power-on.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))

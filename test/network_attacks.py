@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks that must be rejected: changes of a healthy one, for tests and `bench gate`."""
+"""Networks that must be rejected: falsified copies of a healthy one, for tests and `bench gate`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A pinocchio of a sourced ROS, compiled for another NumPy, is never loaded beside the wheel."""
+"""The pinocchio wheel is loaded even if a ROS with another pinocchio is sourced.
+
+The pinocchio of ROS may have been compiled for another NumPy; it would then crash the process.
+"""
 
 import os
 import subprocess

@@ -346,8 +346,8 @@ def test_the_feedback_of_a_blocked_arm_does_not_wind_up_against_the_tension_limi
 
 
 def test_a_trajectory_that_leaves_the_limits_once_slowed_is_refused(monkeypatch):
-    # The trajectory starts at a speed. When it is slowed for slow winches, the arm takes longer to
-    # brake, and overshoots the joint limits.
+    # The trajectory starts while the arm moves. The controller slows it because the winches are
+    # slow. The arm then takes longer to brake, and overshoots the joint limits.
     bench = Bench(rate_limit=0.05)
     start = Setpoint(np.array([0.5, -0.5]), np.array([-1.4, 1.8]), np.zeros(2))
     Trajectory.through(start, points((-0.8, -1.1), 0.3), 0.0).check(ROBOT)

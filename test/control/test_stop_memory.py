@@ -81,7 +81,7 @@ def test_a_second_controller_of_the_same_arm_is_refused(tmp_path):
 @pytest.mark.parametrize('name', ['file/arm', 'nul\0'])
 def test_a_directory_that_cannot_be_used_is_refused_with_a_remedy(tmp_path, name):
     (tmp_path / 'file').touch()
-    with pytest.raises(MusculoskeletalError, match=r'cannot be used .*; set a writable directory'):
+    with pytest.raises(MusculoskeletalError, match=r'cannot be used .* to a writable directory'):
         StopMemory(tmp_path / name)
 
 

@@ -155,8 +155,8 @@ def test_temperatures_settle_at_the_steady_state_of_the_thermal_model(robot):
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
     muscle, module = arm._muscle, arm._module_constants
     assert np.ptp(module.loss) > 0.1 * module.loss.mean()  # the modules differ
-    # The housing would take many minutes to settle. Setting it to the steady temperature of the
-    # present tension again and again is faster.
+    # The housing would take many minutes to settle. It is faster to set its temperature repeatedly
+    # to the steady state at the present tension.
     for _ in range(20):
         muscle.housing[:] = modules.AMBIENT + module.housing_resistance * (
             module.loss * muscle.tension**2

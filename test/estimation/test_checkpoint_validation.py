@@ -244,9 +244,10 @@ def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
 
 
 def send_messages_of_the_model(gate, measures):
-    """Send messages of an arm that equals its model to a validator; return θ, T and l.
+    """Send the messages of an arm that is identical to its model; return their θ, T and l.
 
-    With `measures`, the messages contain the angles of joint sensors.
+    `gate` is the validator that receives them. With `measures`, the messages contain the angles of
+    joint sensors.
     """
     rng = np.random.default_rng(0)
     theta = ROBOT.random_postures(60, rng)

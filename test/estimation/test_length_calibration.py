@@ -62,7 +62,7 @@ def moment(swing):
 def run(calibration, moment, seconds, sees, begin=0.0):
     for n in range(round(seconds / WINDOW)):
         theta, tension, length = moment(begin + n * WINDOW)
-        for k in range(25):  # joint angles arrive with two of three messages of lengths
+        for k in range(25):  # joint angles arrive with two of every three length messages
             calibration.step(
                 tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None
             )

@@ -25,7 +25,7 @@ ROWS = [(name, row) for name, rows in TABLE.items() for row in rows]
 
 
 def rows(key):
-    """Return the rows of the table whose number has the key `key` in result.json."""
+    """Return the rows of the results table that show the value of `key` in result.json."""
     return [row for _, row in ROWS if row.default == key]
 
 

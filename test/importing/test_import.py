@@ -186,7 +186,10 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
 
 
 def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
-    """MuJoCo accepts XML without a space between attributes. A file of MyoHub has such a place."""
+    """MuJoCo accepts XML in which the space between two attributes is missing.
+
+    One file of MyoHub contains this error.
+    """
     expected = import_robot(mjcf, tmp_path / 'sound')
     mjcf.write_text('<!-- own -->\n' + mjcf.read_text().replace('ball" type=', 'ball"type='))
     result = import_robot(mjcf, tmp_path / 'loose')

@@ -279,7 +279,7 @@ def test_a_directory_serves_one_learner_at_a_time(tmp_path, arm26):
 def test_a_directory_that_cannot_be_created_is_reported_with_a_remedy(tmp_path, arm26, place):
     (tmp_path / 'file').write_text('x')
     with pytest.raises(
-        StateError, match=r'state_directory.*cannot be written.*set a writable directory'
+        StateError, match=r'state_directory.*cannot be written.*to a writable directory'
     ):
         StateStore(tmp_path / place, arm26)
 

@@ -27,7 +27,7 @@ def process(arm26, monkeypatch):
 
 
 def answer(process):
-    """Wait for the next update and return it, or None if the process ends before."""
+    """Wait for the next update and return it, or None if the process ends first."""
     deadline = time.monotonic() + PATIENCE
     losses = process.restarts
     while process.restarts == losses:

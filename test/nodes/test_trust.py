@@ -97,8 +97,8 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
     network = replace(trained['paper'], version=first + 1)
     rejected = -1
 
-    # On a busy machine, late messages may contradict a healthy network, so that it is rejected.
-    # Send it again in this case.
+    # On a busy machine, messages may arrive late. The estimator may then find that they contradict
+    # the new network, and reject it although it is healthy. In this case, send the network again.
     def is_used():
         nonlocal rejected
         if arm.estimator.rejected[REFUSED] > rejected:

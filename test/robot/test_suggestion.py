@@ -17,13 +17,17 @@ WRAP = {'wrap': 'sphere', 'link': 'upper_arm', 'xyz': [0.0, 0.0, -0.2], 'radius'
 
 
 def poor_arm(directory, spread=0.03):
-    """Write arm26 with inaccurate via points, as if placed by eye."""
+    """Write arm26 to `directory`, with via points as inaccurate as if they were placed by eye.
+
+    Each coordinate of a point is wrong by at most `spread` [m]. The arm also gets the entries that
+    a suggestion must keep.
+    """
     document = read_muscles(copy_robot('arm26', directory))
     rng = np.random.default_rng(3)
     for muscle in document['muscles']:
         for point in muscle['route']:
             point['xyz'] = (point['xyz'] + rng.uniform(-spread, spread, 3)).tolist()
-    # Add entries that the suggestion must keep: a wrapped object, a point that occurs twice, the
+    # Entries that the suggestion must keep: a wrapped object, a point that occurs twice, the
     # limit of a single muscle, and a stiffness other than the default.
     document['muscles'][4]['route'].insert(2, WRAP)
     document['muscles'][5]['route'].insert(1, dict(document['muscles'][5]['route'][0]))

@@ -22,7 +22,8 @@ def test_the_programme_finds_the_nearest_feasible_tension(seed, desired):
     np.testing.assert_allclose(-jacobian.T @ tension, torque, atol=1e-8)
     assert (tension >= LOW - 1e-8).all()
     assert (tension <= HIGH + 1e-8).all()
-    # At the optimum of a convex problem, the cost increases towards every other feasible point.
+    # At the optimum of a convex problem, the cost does not decrease towards any other feasible
+    # point.
     for other in [inside, programme.nearest(0.0), programme.nearest(150.0)]:
         assert (tension - desired) @ (other - tension) >= -1e-6
 
