@@ -28,7 +28,11 @@ parser.add_argument(
 parser.add_argument(
     '--steps', type=int, default=1000, help='number of steps of the initial training'
 )
-parser.add_argument('--out', default='learned.safetensors', help='file for the network')
+parser.add_argument(
+    '--out',
+    default='learned.safetensors',
+    help='file to which the learned network is written',
+)
 options = parser.parse_args()
 
 

@@ -21,7 +21,9 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 
-MOST_ENTRIES = 10_000  # largest number of entries that are read, far more than any arm needs
+#: largest legal number of entries of an array in a message, or of joints × points in a trajectory;
+#: far more than any arm needs
+MOST_ENTRIES = 10_000
 #: largest force [N] and torque [N·m] of a wrench, for each axis
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
 #: largest commanded linear [m/s] and angular velocity [rad/s] of the end effector, for each axis
@@ -209,7 +211,7 @@ def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str,
         raise MessageError('wrong frame', problem)
     acceleration = np.array([vector.x, vector.y, vector.z])
     if not np.isfinite(acceleration).all():
-        raise MessageError('not finite', 'an acceleration; expected finite numbers')
+        raise _not_finite('an acceleration', acceleration)
     norm = float(np.linalg.norm(acceleration))
     if not LEAST_GRAVITY <= norm <= MOST_GRAVITY:
         legal = f'{LEAST_GRAVITY:g} to {MOST_GRAVITY:g} (an IMU at rest measures 9.81)'
@@ -232,10 +234,17 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
     """Return two vectors as one array (6,), whose elements must be finite and within ±`most`."""
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
-        raise MessageError('not finite', f'{what}; expected finite numbers')
+        raise _not_finite(what, values)
     if (np.abs(values) > most).any():
         raise MessageError('oversized', f'{values}; legal: magnitudes of at most {most}')
     return values
+
+
+def _not_finite(what: str, values: Array) -> MessageError:
+    """Return the error for an array with NaN or infinite values; it states the first of these."""
+    return MessageError(
+        'not finite', f'{what} is {values[~np.isfinite(values)][0]}; expected finite numbers'
+    )
 
 
 class TrajectoryPoints(NamedTuple):
@@ -356,7 +365,7 @@ def read_pose(message: Any, frame: str, position_only: bool = False) -> pin.SE3:
     if position_only:
         values[:4] = 0.0, 0.0, 0.0, 1.0
     if not np.isfinite(values).all():
-        raise MessageError('not finite', 'a position or orientation; expected finite numbers')
+        raise _not_finite('a position or orientation', values)
     norm = np.linalg.norm(values[:4])
     if abs(norm - 1.0) > UNIT_TOLERANCE:
         detail = f'{values[:4]} has the norm {norm:.4g}; legal: 1 ± {UNIT_TOLERANCE:g}'

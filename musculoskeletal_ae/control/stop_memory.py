@@ -63,14 +63,17 @@ class StopMemory:
             exists = file.exists()
         except BlockingIOError as error:
             self.close()
-            remedy = 'stop that controller, or set another directory if it controls another arm'
+            remedy = (
+                'stop that controller, or set the parameter state_directory to another directory '
+                'if that controller moves another arm'
+            )
             raise MusculoskeletalError(f'{name} is in use by a controller; {remedy}') from error
         # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
         except (OSError, ValueError, RuntimeError) as error:
             self.close()
             remedy = (
-                "set a writable directory, or '' to start without remembering stops (a latched "
-                'stop then ends with the controller)'
+                "set the parameter state_directory to a writable directory, or to '' to start "
+                'without remembering stops (a latched stop then ends with the controller)'
             )
             raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error
         self._file = file

@@ -78,7 +78,8 @@ def read_source(file: Path) -> Source:
         root = ET.Element('mujoco')
     if root.tag not in READERS:
         problem = f'the root element {root.tag[:60]!r} is unknown; legal: {", ".join(READERS)}'
-        raise refuse(file, f'{problem}; for an SDF, name the cardsflow.xml in its directory')
+        remedy = 'to import an SDF, pass the path of the cardsflow.xml in its directory instead'
+        raise refuse(file, f'{problem}; {remedy}')
     if any('/xacro}' in element.tag for element in root.iter()):
         raise refuse(
             file,
@@ -164,8 +165,9 @@ def play(robot: Robot, file: Path) -> int:
         return 0
     slower = needed / REAL_TIME
     print(
-        f'{message}, {slower:.2g} times the {REAL_TIME:g} s that are legal for real time beside '
-        "other nodes; `bringup.sh --mujoco` therefore lets all nodes use the emulator's own clock"
+        f'{message}. While the other nodes run, the emulator keeps up with real time only if a '
+        f'second takes at most {REAL_TIME:g} s; this model takes {slower:.2g} times as long. '
+        "`bringup.sh --mujoco` therefore lets all nodes follow the emulator's own clock"
     )
     return SLOW
 

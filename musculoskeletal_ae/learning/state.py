@@ -52,8 +52,8 @@ class StateStore:
             self.directory = Path(directory).expanduser()
         except RuntimeError as error:
             raise StateError(
-                f'{name}: the home directory is unknown; set an absolute path, '
-                "or '' to save nothing"
+                f'{name}: the home directory is unknown; set the parameter state_directory to an '
+                "absolute path, or to '' to save nothing"
             ) from error
         self.not_used = ''
         self._robot = robot
@@ -68,12 +68,13 @@ class StateStore:
             self._open()
         except BlockingIOError as error:
             raise StateError(
-                f'{name} is in use by another learner; set another directory, or stop that learner'
+                f'{name} is in use by another learner; stop that learner, or set the parameter '
+                'state_directory to another directory'
             ) from error
         except (OSError, ValueError) as error:  # a NUL in the path raises a ValueError
             raise StateError(
-                f'{name} cannot be written ({error}); set a writable directory, '
-                "or '' to save nothing"
+                f'{name} cannot be written ({error}); set the parameter state_directory to a '
+                "writable directory, or to '' to save nothing"
             ) from error
 
     def _open(self) -> None:

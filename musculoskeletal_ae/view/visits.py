@@ -117,6 +117,7 @@ def checked_visits(host: str, title: str) -> Iterator[None]:
         server.serve = serve  # type: ignore[misc]
     if not served:
         raise MusculoskeletalError(
-            'this version of viser serves its page in an unknown way, so requests of other web '
-            'sites could not be refused; install the version of viser in requirements.txt'
+            'this version of viser serves its page in a way that this package does not support, so '
+            'requests from other web sites could not be refused; install the version of viser that '
+            'requirements.txt names'
         )
