@@ -27,7 +27,7 @@ from musculoskeletal_ae.simulation.load import Load
 
 INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
 #: Tension above T_bias [N] that a model with efforts assigns to a strong effort, which is the 95 %
-#: quantile of the efforts in the training data. The tension is proportional to the effort.
+#: quantile of the efforts in the training data. This tension is proportional to the effort.
 STRONG = 40.0
 
 Model = Callable[[Run], Array]  # returns θ [rad], (N, D)

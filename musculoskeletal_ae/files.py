@@ -45,7 +45,10 @@ def open_regular(file: Path, refuse: Refuse) -> BinaryIO:
 
 
 def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
-    """Return the content of a regular file of at most `largest` bytes."""
+    """Return the content of a regular file of at most `largest` bytes.
+
+    If the file is larger or cannot be read, the exception of `refuse` is raised.
+    """
     with open_regular(file, refuse) as stream:
         try:
             data = stream.read(largest + 1)
@@ -57,7 +60,10 @@ def read_bytes(file: Path, refuse: Refuse, largest: int = LARGEST) -> bytes:
 
 
 def read_text(file: Path, refuse: Refuse, largest: int = LARGEST) -> str:
-    """Return the text of a UTF-8 file of at most `largest` bytes."""
+    """Return the text of a UTF-8 file of at most `largest` bytes, without a byte-order mark.
+
+    If the file is larger, is not UTF-8, or cannot be read, the exception of `refuse` is raised.
+    """
     try:
         # Windows programs put a byte-order mark before tables; 'utf-8-sig' removes it.
         return read_bytes(file, refuse, largest).decode('utf-8-sig')

@@ -140,7 +140,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--seeds', type=seeds, default=default, metavar='N,…', help=text)
 
     def add_reality(self) -> None:
-        """Add `--reality`, the emulator model."""
+        """Add `--reality`, which selects the emulator model."""
         text = 'emulator model: `kin` shares the mechanics of this package; `foreign` uses MuJoCo'
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 

@@ -73,7 +73,10 @@ def identifiers(steps: Iterable[Step]) -> str:
 
 
 def parse(value: str) -> tuple[Step, ...]:
-    """Return the steps that a value `remedy steps` lists; unknown identifiers are left out."""
+    """Return the steps whose identifiers `value` lists, separated by commas.
+
+    `value` is the value `remedy steps` of /diagnostics. Unknown identifiers are ignored.
+    """
     return tuple(STEPS[name] for name in value.split(', ') if name in STEPS)
 
 

@@ -110,8 +110,9 @@ class Hand:
                 before = self._interval or interval
                 self._interval = before + INTERVAL_WEIGHT * (interval - before)
                 velocity = (theta - last[2]) / self._interval
-                # If the arm joins the path only after the next pose is due, extrapolate the path
-                # until then. Afterwards, come to rest at the last pose.
+                # The arm passes this pose when the next one is due, after `_interval`. If joining
+                # the path takes longer, it joins the path at a point extrapolated beyond this pose.
+                # If no other pose arrives, the arm comes to rest at this pose.
                 ahead = max(self._interval, JOINING)
                 further = theta + (ahead - self._interval) * velocity
                 path = np.array([np.clip(further, robot.lower, robot.upper), theta])

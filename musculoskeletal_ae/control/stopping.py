@@ -7,8 +7,8 @@ K_stiff times the rate limit.
 
 Position-controlled modules hold no tension of their own. Each tendon is therefore paid out only
 while its measured tension is above T_bias. Unloaded tendons thus do not become slack, and muscles
-that carry the arm lower it slowly. If a tension is not known, the muscle is paid out by the length
-`Actuation.release` after the start of the release.
+that carry the arm lower it slowly. If the tension of a muscle is not known, the muscle is
+paid out by `Actuation.release` [m], relative to its length at the start of the release.
 
 After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
 once the other muscles are paid out. Winding ends when the measured tension of the suspect, or the

@@ -52,9 +52,11 @@ LAST = Step.RESET_CONTROLLER, Step.EXPLORE_GENTLY
 
 
 class StopCause(Enum):
-    """All stop causes, each with an identifier for programs and its declaration.
+    """All stop causes, each with an identifier for programs and a `Declaration`.
 
-    If several causes begin together, the one that is declared first is reported.
+    The declaration states when a cause is present, what the controller does, how the stop ends, and
+    what users are told. If several causes begin together, the one that is listed first here is
+    reported.
     """
 
     def __init__(self, identifier: str, declaration: Declaration) -> None:

@@ -91,7 +91,7 @@ class PlannedTension(NamedTuple):
 
     @classmethod
     def at_bias(cls, robot: Robot) -> PlannedTension:
-        """Return the tensions before the first setpoint, at which all muscles have T_bias."""
+        """Return the tensions that apply before the first setpoint: T_bias for every muscle."""
         bias = robot.tension.bias.copy()
         return cls(bias, bias, np.zeros(robot.joint_count))
 

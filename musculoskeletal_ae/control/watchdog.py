@@ -208,10 +208,11 @@ class HeatLimit:
         self.momentary = np.maximum(momentary, self.momentary - fall)
 
     def conditions(self, robot: Robot, highest: float) -> list[Condition]:
-        """Return the stop condition of overheating, if windings are overheated.
+        """Return a list with the stop condition of overheating, or [] if the arm is not overheated.
 
-        Overheating ends when no winding is above `highest` [°C] and plans may give at least one
-        muscle more tension than T_bias. The list is empty without overheating.
+        Overheating begins when a winding is more than 20 °C (constant OVERHEATED) above `highest`
+        [°C], or when `planned` permits no muscle more than T_bias. It ends when no winding is above
+        `highest` and `planned` permits at least one muscle more than T_bias.
         """
         winding = np.fmax(self.heat.core, -np.inf)  # a temperature that is unknown is NaN
         m = int(winding.argmax())

@@ -104,7 +104,7 @@ class IsolatingLoop(ClosedLoop):
             self.estimator.commanded(now, **{command.kind: command.value})
 
     def run(self, duration: float) -> Array:
-        """Advance by `duration` [s]; return the error of every estimate [rad]."""
+        """Advance by `duration` [s]; return ‖θ_est − θ‖ after each of the N steps [rad], (N,)."""
         errors = list[float]()
         for _ in range(round(duration / SAMPLE_TIME)):
             self.step()

@@ -127,7 +127,7 @@ class Study:
 
 
 class Measured(NamedTuple):
-    """The results of an experiment for one individual."""
+    """The results of an experiment for one emulated individual."""
 
     #: contents of result.json: nested dictionaries of finite numbers, text, lists or None
     numbers: dict[str, Any]

@@ -240,7 +240,19 @@ def _quaternion(at: pin.SE3) -> Array:
 def _compare(
     robot: Robot, mae: Mae, model: Any, springs: Springs, warnings: tuple[str, ...]
 ) -> tuple[Report, Array]:
-    """Compare a model with the network; return the report and the offsets of the controls [m]."""
+    """Compare an exported model with the network from which it was made.
+
+    Args:
+        robot: The robot, with learned springs of the joints.
+        mae: The network.
+        model: The compiled MjModel.
+        springs: Linear springs that represent the series elastic elements in the model.
+        warnings: Warnings of MuJoCo about the model, for the report.
+
+    Returns:
+        The report, and for each muscle the offset [m], (M,), that is added to a length l in
+        muscle_states to get the control of the muscle's actuator.
+    """
     theta = robot.random_postures(POSTURES, np.random.default_rng([1, 0xE2]))
     tension = np.broadcast_to(springs.tension, (POSTURES, robot.muscle_count))
     lengths, jacobian = mae.lengths(theta, tension), mae.muscle_jacobian(theta, tension)

@@ -51,7 +51,7 @@ GLITCH_RATIO = 3.0  # smallest d of a glitch, relative to the largest d of all o
 POSTURES = 200  # number of stored postures that show where the detector was calibrated
 # Messages from which the network learns must be recent, because tendons creep and bed in.
 RECENT_TIME = 3600.0  # largest age of a recent message [s]
-RECENT_RESTS = 200  # largest number of rests since a recent message
+RECENT_RESTS = 200  # a message is recent if fewer rest samples than this came after it
 
 
 class Healthy(NamedTuple):

@@ -279,7 +279,7 @@ class GroupFit:
         return np.array([determined(c, p) for c, p in zip(curvature, precisions, strict=True)])
 
     def right_sides(self, point: Point) -> RightSides:
-        """Return the right sides of the normal equations."""
+        """Return the right-hand sides of the normal equations at `point`."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
         length, torque = weights.length * residuals.length, weights.torque * residuals.torque

@@ -99,7 +99,7 @@ class LeanExecutor(SingleThreadedExecutor):
         super().wake()
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Run a function or coroutine in the next full round."""
+        """Schedule a function or coroutine for the next *full round*, and return its task."""
         self._is_changed = True
         return super().create_task(callback, *args, **kwargs)
 

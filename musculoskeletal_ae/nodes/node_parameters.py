@@ -88,7 +88,10 @@ class NodeParameters:
         setter: Callable[[Any], object],
         prepare: Callable[[Any], object] | None = None,
     ) -> None:
-        """Call `setter` whenever the parameter is set; unlike `follow`, do not call it now."""
+        """Call `setter` whenever the parameter is set; unlike `follow`, do not call it now.
+
+        `prepare`, if given, converts and checks the value before `setter` is called (see `follow`).
+        """
         self._setters[name] = setter
         if prepare is not None:
             self._prepare[name] = prepare

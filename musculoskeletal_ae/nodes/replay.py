@@ -175,17 +175,24 @@ class Replay(Node):
                 self._sought = self._bag.start + int(1e9 * parameter.value)
 
     def pause(self, _: Trigger.Request) -> str:
-        """Pause at the present position."""
+        """Pause playback; return a message that states the present position."""
         self._timeline.hold(True, time.monotonic())
         return f'paused at {self._position()}'
 
     def resume(self, _: Trigger.Request) -> str:
-        """Resume playback."""
+        """Resume playback; return a message that states the present position."""
         self._timeline.hold(False, time.monotonic())
         return f'playing at {self._position()}'
 
     def step(self, _: Trigger.Request) -> str:
-        """Publish the messages of the next recorded time."""
+        """Publish the messages of the next recorded time, and remain paused.
+
+        Returns:
+            A message that states the new position.
+
+        Raises:
+            MusculoskeletalError: If playback is not paused.
+        """
         if not self._timeline.paused:
             raise MusculoskeletalError('not paused: call replay/pause first')
         self._timeline.jump(self._next_time, time.monotonic())

@@ -28,7 +28,8 @@ MOST = 50_000  # largest number of messages in a recording
 MOST_BYTES = 32 << 20  # largest total size of the messages in a recording [bytes]
 LARGEST_MESSAGE = 4 << 20  # largest recorded message [bytes]; a typical network has half a MB
 FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
-#: pattern of the bags' directories, including bags that are incomplete because of a kill
+#: pattern for the names of the bags' directories; it also matches bags that are incomplete because
+#: the process was killed
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
 
 

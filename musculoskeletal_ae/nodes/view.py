@@ -73,7 +73,7 @@ TRIGGERS = (
 SERVICES = {'controller/explore': SetBool, **dict.fromkeys(TRIGGERS, Trigger), GET: GetParameters}
 SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
 EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value  # values of controller_mode
-#: service of each node whose availability shows that the node is running
+#: for each node, a service that is available only while the node is running
 SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
 
 

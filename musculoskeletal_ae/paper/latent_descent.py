@@ -40,7 +40,10 @@ class StepSearch(NamedTuple):
 
 
 class Loss:
-    """The loss L, a sum of terms. One matrix product evaluates all terms, which is faster."""
+    """The loss L, a weighted sum of terms.
+
+    A single matrix product evaluates all terms, which is faster than one product for each term.
+    """
 
     def __init__(self, terms: Sequence[Term]) -> None:
         """Stack the matrices and targets of all terms."""

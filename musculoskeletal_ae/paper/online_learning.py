@@ -4,17 +4,17 @@
     batch = {newest, (0, 0, 0), C_data random stored ones} × {①, ②, ③},   3 (C_data + 2) entries
 
 The network is updated as soon as more than C_thre samples are stored. A sample is stored if the
-robot is at rest and θ or T differs from all stored samples by a threshold. Both presets share that
-rule (`learning/samples.py`, `learning/rest.py`).
+robot is at rest and the sample differs from every stored one by more than a threshold, in θ or in
+T. Both presets share this rule (`learning/samples.py`, `learning/rest.py`).
 
 "The number of batches C_batch = 10" has two readings. Ten such batches, each with its own random
 samples, are repeated for ten epochs: 100 steps of 36 entries. Or one batch of 36 entries is split
 into mini-batches of ten: 4 × 10 steps. We chose the first. The text calls the 36 entries "a batch",
 and under the second reading an update would use only ten stored samples.
 
-The paper does not state the following, which we chose. The loss is L_initial (3) with its weights.
-The optimiser is Adam with the step size of initial training, and it keeps its moments between
-updates.
+The paper does not state the following, which we chose. The loss is L_initial of equation (3), with
+the weights of that equation. The optimiser is Adam with the step size of initial training, and it
+keeps its moments between updates.
 """
 
 import numpy as np

@@ -298,7 +298,7 @@ def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None
 
 
 def _joint_problem(name: str, model: pin.Model) -> str:
-    """Return why a joint can be used neither in `joints` nor in a coupling, or '' if it can."""
+    """Check whether a joint is suitable for `joints` or a coupling; return the problem, or ''."""
     movable = list(model.names)[1:]
     if name not in movable:
         return f'unknown joint {name!r}; movable joints of robot.urdf: {", ".join(movable)}'

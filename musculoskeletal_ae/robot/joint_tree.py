@@ -259,10 +259,11 @@ class JointTree:
         return self.ratios(theta)[:, None] * self.moved_by
 
     def of_theta(self, values: Array, theta: Array) -> Array:
-        """Convert torques or derivatives of all joints of the tree into those of the joints of θ.
+        """Convert values for all joints of the tree into values for the joints of θ.
 
-        The values are multiplied by the transpose of ∂q/∂θ, so that each joint of θ also gets those
-        of the joints that are coupled to it.
+        The values are torques, or derivatives with respect to the joint positions q of the tree.
+        They are multiplied by the transpose of ∂q/∂θ. The result for a joint of θ thus includes the
+        values of the joints that are coupled to it.
 
         Args:
             values: One value for each joint of the tree, (*N, ..., J−1).

@@ -88,7 +88,12 @@ def jump_warning(robot: Robot) -> str:
 
 
 def jump_choices(robot: Robot) -> list[str]:
-    """Return texts on each muscle whose length jumps: where it jumps, and possible remedies."""
+    """Return lines for the user that say where muscle lengths jump, and which remedies there are.
+
+    For each muscle whose length jumps, one line states the joint angles. A second line suggests
+    limits of a joint that exclude the jump, if there are any. The last line lists all remedies.
+    Without jumps, the list is empty.
+    """
     if robot.routes.objects is None:
         return []
     bends, theta = _second_differences(robot.routes.absolute_lengths, robot.lower, robot.upper)

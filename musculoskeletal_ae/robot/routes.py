@@ -98,8 +98,9 @@ class Routes:
         self._sum: Array = self.weight * (np.arange(len(routes))[:, None] == self.muscle)
         #: segments that may wrap, and the objects around which they wrap
         self.wrapping, self.objects = self._attach_objects(routes)
-        # Forces of the tendons on the links, Q in total: one force pair for each segment, and
-        # one force at each end of a segment that may wrap.
+        # Tendon forces, Q = S + 2 W. Each acts between two bodies, and counts once. Every segment
+        # has one force, between its end points. A segment that may wrap has two more, one between
+        # each end point and the object.
         ends = self.first[self.wrapping], self.second[self.wrapping]
         #: point at which each force acts, (Q,)
         self._force_point = np.concatenate([self.first, *ends])

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tendon friction by Dahl's model: the last sliding direction of a tendon changes its tension.
+"""Tendon friction by Dahl's model: motor-side tension depends on the last sliding direction.
 
     T = T_end e^{μ s},   s ← w + (s − w) e^{−|Δl|/b},   w = −sign Δl
 
-T is the motor-side tension and T_end the bone-side tension. s is 1 after winding in, when T is
-higher than T_end, and −1 after paying out. When a tendon slides by Δl, s approaches the direction w
-over the distance b (REVERSAL), so that friction reverses gradually. The network models the body
-without friction, so its tension is T_end. `Transmission` converts measured values of T to T_end.
+T is the motor-side tension and T_end the bone-side tension. The tendon friction μ is the exponent
+of the capstan equation: coefficient of friction × wrapping angle. s is 1 after winding in, when T
+is higher than T_end, and −1 after paying out. When a tendon slides by Δl, s approaches the
+direction w over the distance b (REVERSAL), so that friction reverses gradually. The network models
+the body without friction, so its tension is T_end. `Transmission` converts measured values of T to
+T_end.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class Heat:
         self._known = np.zeros(count, dtype=bool)  # whether the housing temperature is measured
         #: whether the housing temperature appeared, vanished or jumped since the last update
         self._interrupted = np.zeros(count, dtype=bool)
-        self._age: Array = np.zeros(count)  # time of learning [s]
+        self._age: Array = np.zeros(count)  # time spent learning [s]
         self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ when first known
         self._sums: Array = np.zeros((2, count))
         self._passed, self._messages = 0.0, 0

@@ -166,8 +166,9 @@ def add_slopes(
         limbs: The cubics.
         theta: θ [rad], (D, N).
         tension: T [N], (M, N).
-        jacobian: Output: G [m/rad], (M, D, N).
-        curvature: Output: Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to its lower half, (D, D, N).
+        jacobian: Output, overwritten with G [m/rad], (M, D, N).
+        curvature: Input and output, (D, D, N). Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to the lower
+            triangle; the upper triangle is not changed.
     """
     arms = theta.shape[1]
     jacobian[:] = 0.0
@@ -216,7 +217,7 @@ def turn(
 
     Δθ is scaled down so that no joint moves by more than `most` [rad]. A joint that `push` presses
     against its stop stays there, and forced joints move towards their angles in `fixed`. Only the
-    lower half of the symmetric `matrix` (D, D, N) is read, and it is overwritten.
+    lower triangle of the symmetric `matrix` (D, D, N) is read, and it is overwritten.
     """
     joints, arms = theta.shape
     way, turned, held = np.zeros((joints, arms)), push.copy(), np.empty((joints, arms), np.bool_)
