@@ -6,15 +6,28 @@ is printed, because compilation takes half a minute on a fast computer, and minu
 """
 
 import sys
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from numba.core import event
 from numba.extending import is_jitted
 
+import musculoskeletal_ae
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
+
+PACKAGE = Path(musculoskeletal_ae.__path__[0])
+
+
+def import_functions() -> None:
+    """Import all modules with compiled functions, so that their number is known at the start."""
+    for file in sorted(PACKAGE.rglob('*.py')):
+        if 'njit' in file.read_text(encoding='utf-8'):
+            names = file.relative_to(PACKAGE.parent).with_suffix('').parts
+            import_module('.'.join(names))
 
 
 def functions_to_compile() -> set[str]:
@@ -36,6 +49,7 @@ class Progress(event.Listener):
     """Prints how many functions of the package have been compiled."""
 
     def __init__(self) -> None:
+        self._functions = functions_to_compile()
         self._compiled: set[str] = set()
 
     def on_start(self, compilation: event.Event) -> None:
@@ -43,12 +57,13 @@ class Progress(event.Listener):
 
     def on_end(self, compilation: event.Event) -> None:
         """Count a function; numba may compile it several times, for several types."""
-        functions, name = functions_to_compile(), _name(compilation.data['dispatcher'])
-        if name in functions and name not in self._compiled:
+        name = _name(compilation.data['dispatcher'])
+        if name in self._functions and name not in self._compiled:
             self._compiled.add(name)
-            print(f'compiling: {len(self._compiled)} of {len(functions)}', flush=True)
+            print(f'compiling: {len(self._compiled)} of {len(self._functions)}', flush=True)
 
 
+import_functions()
 with event.install_listener('numba:compile', Progress()):
     robot = Robot.load('arm26')
     for reality in ('kin', 'foreign'):
