@@ -223,6 +223,7 @@ flock -w 5 "$arm_lock" ||
  stop that one, or give this one a --namespace of its own"
 
 logs=$(mktemp -d "$log_folder/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
+ln -sfn "${logs##*/}" "$log_folder/latest_bringup" # beside colcon's latest_build
 export ROS_LOG_DIR=$logs
 say "logs in $logs"
 
