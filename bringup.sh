@@ -34,7 +34,8 @@ doc/howto/your_robot.md is the guide for your own robot.
                              reports faults, and starts the nodes when all checks pass
   --no-controller            start no controller, so that nothing moves the arm
   --combined                 estimator and controller in one process
-  --bag DIR                  a recording instead of the emulator: no controller, no emulator
+  --bag DIR                  a recording instead of the emulator: no controller, no emulator. It has
+                             to be one of the robot that --robot names
   --explore | --no-explore   random exploration, so that learning has data (default: on; with
                              --hardware off: a real arm moves only on request)
   --no-learner               no online learning
@@ -67,7 +68,8 @@ doc/howto/your_robot.md is the guide for your own robot.
   --read-only                a page without controls
   -h, --help                 this text
 
-Exit status: 0 at the end of --duration, 130 on Ctrl-C, 1 if a process failed, 2 for a wrong option.
+Exit status: 0 at the end of --duration or of a recording, 130 on Ctrl-C, 1 if a process failed or a
+recording brought no estimate, 2 for a wrong option or a recording of another robot.
 EOF
 }
 
@@ -212,6 +214,10 @@ if [ $hardware = false ] && [ $network = false ]; then
 fi
 use_udp
 [ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.parameters "${parameters[@]}" || exit
+if [ -n "$bag" ]; then
+  say "reading $bag"
+  "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" "${parameter_files[@]}" || exit 2
+fi
 
 # A namespace contains one arm. The lock is held until the last process has ended, which takes a
 # moment after Ctrl-C.
@@ -267,15 +273,23 @@ died() { # NAME STATUS
 
 # wait_for NAME: waits until this process has ended, and returns its status. If another process ends
 # first, bring-up has failed, except for a replay that has reached the end of its recording.
+# bringup_status then ends too, and its status says whether there were estimates. If it has missed the
+# end of the recording, it is ended here.
 wait_for() {
-  local pid name status
+  local pid name status other
   wait -n -p pid "${!name_of[@]}"
   status=$?
   name=${name_of[$pid]}
   unset "name_of[$pid]"
   [ "$name" = "$1" ] || [ "$name $status" = 'replay 0' ] || died "$name" "$status"
-  [ "$name" != replay ] || say 'end of the recording'
-  return "$status"
+  [ "$name" = replay ] || return "$status"
+  say 'end of the recording'
+  for other in "${!name_of[@]}"; do
+    [ "${name_of[$other]}" = "$1" ] || continue
+    for _ in {1..100}; do kill -0 "$other" 2>/dev/null && sleep 0.1 || break; done
+    kill -TERM "$other" 2>/dev/null
+  done
+  wait_for "$1"
 }
 
 # shellcheck disable=SC2329  # called by the trap
@@ -432,6 +446,7 @@ if [ -n "$duration" ]; then
   [[ $duration == *.* ]] || duration+=.0 # a ROS double
   limits=(-p "duration:=$duration" -p patience:=300.0)
 fi
+[ -z "$bag" ] || limits+=(-p end_with_replay:=true)
 launch bringup_status "${common[@]}" "${limits[@]}" 2>"$logs/bringup_status.log"
 wait_for bringup_status || died bringup_status $?
 exit 0

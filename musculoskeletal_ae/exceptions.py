@@ -76,7 +76,7 @@ class BagError(MusculoskeletalError):
 
     def __init__(self, file: Path, problem: str, remedy: str) -> None:
         super().__init__(f'{file}: {problem}; {remedy}')
-        self.file = file
+        self.file, self.problem = file, problem
 
 
 class StateError(MusculoskeletalError):

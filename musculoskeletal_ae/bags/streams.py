@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
@@ -195,6 +196,7 @@ def read_streams(
     namespace: str | None = None,
     motors: MotorSettings = NO_MOTORS,
     progress: Callable[[float], None] = lambda _: None,
+    stop: int = LATEST,
 ) -> Streams:
     """Read sensor data and commands of one arm.
 
@@ -212,6 +214,7 @@ def read_streams(
         namespace: The namespace of the arm; required only if the bag has several.
         motors: How the motors of a ros2_control robot are connected.
         progress: Called after each message with its share of all messages, which add up to 1.
+        stop: Latest log time [ns] of the messages to read.
 
     Raises:
         BagError: If no message of a topic fits the robot, the bag is damaged, or `interface_topics`
@@ -227,9 +230,9 @@ def read_streams(
     for name, stream in arm.by_topic.items():
         if name in recorded:
             takers[recorded[name]][labels[name]] = stream.take
-    clock_offsets = _bunched(bag, list(takers))
+    clock_offsets = _bunched(bag, list(takers), stop)
     early = [recorded[name] for name in BODY_TOPICS if name in recorded]
-    _deliver(bag, takers, early, clock_offsets, reception, progress)
+    _deliver(bag, takers, early, clock_offsets, reception, progress, stop)
     # A topic of motors that also counts as joint_states need not contain joint angles, because the
     # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
@@ -274,6 +277,7 @@ def _deliver(
     clock_offsets: Mapping[str, int],
     reception: Reception,
     progress: Callable[[float], None],
+    stop: int,
 ) -> None:
     """Read the messages of a bag, and pass each one to the functions for its topic.
 
@@ -288,11 +292,14 @@ def _deliver(
             by publication; messages of other topics are timed by their log times.
         reception: Rejects messages for which a function raises a MessageError, and counts them.
         progress: Called after each message with its share of all messages.
+        stop: Latest log time [ns] of the messages to read.
     """
     count = sum(bag.topics[topic].message_count for topic in takers)
     receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
     delays = defaultdict[tuple[str, ...], MessageDelay](MessageDelay)
-    for message in chain(bag.messages(early), bag.messages(takers.keys() - early)):
+    for message in chain(
+        bag.messages(early, stop=stop), bag.messages(takers.keys() - early, stop=stop)
+    ):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic may have different clocks.
         sender = message.topic, *getattr(decoded, 'name', ())
@@ -327,7 +334,7 @@ def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -
             raise BagError(bag.path, problem, 'choose the robot that was recorded')
 
 
-def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
+def _bunched(bag: Bag, topics: list[str], stop: int) -> dict[str, int]:
     """Return the topics with bunched log times, and an offset for their publish times [ns].
 
     A recorder that was blocked for a moment writes many messages with almost the same log time.
@@ -336,7 +343,7 @@ def _bunched(bag: Bag, topics: list[str]) -> dict[str, int]:
     and the publish time of a message.
     """
     times = {topic: (array('q'), array('q')) for topic in topics}
-    for message in bag.messages(topics):
+    for message in bag.messages(topics, stop=stop):
         times[message.topic][0].append(message.log_time)
         times[message.topic][1].append(message.publish_time)
     bunched = {}

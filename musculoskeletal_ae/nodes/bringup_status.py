@@ -25,6 +25,8 @@ from musculoskeletal_ae.report import Report
 #: time after the first estimate during which problems are not shown, because most of them end by
 #: themselves while the nodes start [s]
 SETTLING = 4.0
+#: shortest time between two lines before the first estimate [s]
+WAITING_INTERVAL = 5.0
 
 
 class BringupStatus(Shell):
@@ -44,6 +46,8 @@ class BringupStatus(Shell):
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
+        self.waiting = ''  # the last line before the first estimate
+        self.waiting_since = -math.inf  # when it was printed [s]
         self.printed_hint = ''
         self.follow_posture('joint_states', self._on_measured_posture, some=True)
         self.follow_posture('estimated_joint_states', self._on_estimate)
@@ -78,6 +82,8 @@ class BringupStatus(Shell):
                     f'the system did not come up: no estimate within {self.patience:g} s; see the '
                     'logs of the nodes'
                 )
+            self._end_with_replay()
+            self._print_waiting(now)
             return
         self.started = self.started or now
         # Print nothing yet if there are problems: shortly after the start, the last reports of the
@@ -86,6 +92,26 @@ class BringupStatus(Shell):
             self._print_line(now - self.started)
         if 0.0 < self.duration <= now - self.started:
             raise ExternalShutdownException
+        self._end_with_replay()
+
+    def _end_with_replay(self) -> None:
+        """End the node, if it is to end with the recording and `replay` has reported its end."""
+        if not (self.parameter('end_with_replay') and self.situation.has_recording_ended):
+            return
+        if self.started is None:
+            reason = self.situation.why_no_estimate()
+            sys.exit(f'the recording brought no estimate: {reason}; see the logs of the nodes')
+        raise ExternalShutdownException
+
+    def _print_waiting(self, now: float) -> None:
+        """Print that there is no estimate yet, and why; again if the reason has changed."""
+        line = 'waiting for the first estimate'
+        # Most problems end by themselves while the nodes start.
+        if now - self.begun >= SETTLING and (reason := self.situation.why_no_estimate()):
+            line += f': {reason}'
+        if line != self.waiting and now - self.waiting_since >= WAITING_INTERVAL:
+            self.waiting, self.waiting_since = line, now
+            print(printable(line), flush=True)
 
     def _print_line(self, running_time: float) -> None:
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]

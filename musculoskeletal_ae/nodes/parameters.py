@@ -191,6 +191,10 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'patience': Parameter(
             0.0, 'longest wait for the first estimate (0: unlimited)', 's', (0.0, 1e9)
         ),
+        'end_with_replay': Parameter(
+            False,
+            'end with the recording that `replay` plays, with an error if it brought no estimate',
+        ),
     },
 }
 

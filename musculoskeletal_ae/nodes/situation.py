@@ -209,7 +209,7 @@ class Situation:
     def _troubles(self) -> list[Trouble]:
         others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
         errors, warnings = list[Trouble](), list[Trouble]()
-        if has_ended := self._values('replay').get('state') == END_OF_RECORDING:
+        if has_ended := self.has_recording_ended:
             errors.append(Trouble('end of the recording'))
         for name, node in self._nodes.items():
             if _is_own(name) or node.level == DiagnosticStatus.OK:
@@ -231,6 +231,19 @@ class Situation:
                 steps = remedy.parse(node.values.get(REMEDY_STEPS, ''))
                 errors.append(Trouble(f'{name}: {node.message}', steps))
         return [*self._stops(), *others, *errors, *self._body(), *warnings]
+
+    @property
+    def has_recording_ended(self) -> bool:
+        """Whether `replay` has played its recording to the end."""
+        return self._values('replay').get('state') == END_OF_RECORDING
+
+    def why_no_estimate(self) -> str:
+        """Return why there are no estimates: the last rejected message of the estimator, or ''.
+
+        If the estimator has rejected nothing, the text states the problems of all nodes.
+        """
+        rejected = self._values('estimator').get('last rejected', '')
+        return f'rejected {rejected}' if rejected else self.trouble()
 
     def _values(self, name: str) -> dict[str, str]:
         node = self._nodes.get(f'{self._here}/{name}')

@@ -273,6 +273,7 @@ def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
         (['-p', 'estimator:on_anomly:=stop'], 'nearest: on_anomaly'),
         (['--params-file', 'no_such_file.yaml'], 'no_such_file.yaml'),
         (['--fly'], '--help'),
+        (['--bag', str(REPOSITORY / 'bags/teaching'), '--robot', 'arm26'], '--robot musashi_left'),
         (['--robot'], 'requires an argument'),
     ],
 )

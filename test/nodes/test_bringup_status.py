@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.control.stops import Condition, StopCause, remedy_of
@@ -91,6 +92,38 @@ def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
     node._on_estimate(np.ones(2))
     node._print()
     assert 'error waits for joint_states' in capsys.readouterr().out
+
+
+def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, monkeypatch):
+    monkeypatch.setattr(bringup_status, 'WAITING_INTERVAL', 0.0)
+    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node._print()
+    assert capsys.readouterr().out == 'waiting for the first estimate\n'
+    rejected = {'last_rejected': 'muscle_states: wrong length: 15 values; expected 18'}
+    estimator = f'{graph.namespace}/estimator'
+    node.situation.diagnosed(diagnostics(estimator, 'w', DiagnosticStatus.ERROR, **rejected))
+    node.begun -= 2 * bringup_status.SETTLING
+    node._print()
+    line = f'waiting for the first estimate: rejected {rejected["last_rejected"]}\n'
+    assert capsys.readouterr().out == line
+    node._print()
+    assert capsys.readouterr().out == ''  # nothing has changed
+
+
+@pytest.mark.parametrize('had_estimates', [True, False])
+def test_the_end_of_a_recording_without_estimates_is_an_error(graph, had_estimates):
+    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    if had_estimates:
+        node.anomalies.append(0.5)
+    node._print()
+    rejected = {'last_rejected': 'muscle_states: wrong length'}
+    node.situation.diagnosed(diagnostics(f'{graph.namespace}/estimator', **rejected))
+    end = diagnostics(f'{graph.namespace}/replay', 'end', state='end_of_recording')
+    node.situation.diagnosed(end)
+    with pytest.raises(ExternalShutdownException if had_estimates else SystemExit) as ended:
+        node._print()
+    if not had_estimates:
+        assert 'no estimate: rejected muscle_states: wrong length' in str(ended.value)
 
 
 def found(kind, **more):

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tell whether a recording is one of a given robot, and otherwise of which.
+
+    python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT [PARAMS_FILE…]
+
+ends with status 1 and one line if the nodes of the robot could not use the recording. `bringup.sh`
+calls it before it starts anything. It only reads the beginning of a recording that fits;
+`replay --check` reads all of it, and also compares the order of the muscles.
+"""
+
+import sys
+from pathlib import Path
+
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import LATEST
+from musculoskeletal_ae.bags.streams import read_streams
+from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
+from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
+from musculoskeletal_ae.nodes.parameters import motor_settings
+from musculoskeletal_ae.robot.directories import shipped_robots
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.urdf import parse_xml
+from musculoskeletal_ae.signals.motor_settings import MotorSettings
+
+BEGINNING = 2_000_000_000  # duration of the part that decides whether a recording fits [ns]
+
+
+def misfit(bag: Bag, name: str, motors: MotorSettings = NO_MOTORS) -> str:
+    """Return why a recording is not one of a robot, and what to pass instead; '' if it is one.
+
+    Args:
+        bag: The recording.
+        name: A shipped robot or a robot directory.
+        motors: How the motors of a ros2_control robot are connected.
+
+    Raises:
+        MusculoskeletalError: If the robot or the recording is unusable.
+    """
+    robot = Robot.load(name)
+    interface_topics(bag, motors=motors)  # raises errors that have nothing to do with the robot
+    # The first messages may be bad ones, so the whole recording is read before it is refused.
+    for stop in bag.start + BEGINNING, LATEST:
+        problem = _problem(bag, robot, motors, stop)
+        if not problem:
+            return ''
+    fits = [
+        other
+        for other in shipped_robots()
+        if not _problem(bag, Robot.load(other), motors, bag.start + BEGINNING)
+    ]
+    if fits:
+        remedy = f'it fits {", ".join(fits)}; pass --robot {fits[0]}'
+    else:
+        remedy = 'pass --robot with the directory of the robot that was recorded'
+        recorded, joints = _described(bag, motors)
+        if joints:
+            stated = f'its robot_description is that of {recorded!r}, with the joints '
+            remedy = f'{stated}{", ".join(joints)}; {remedy}'
+    robot_name = robot.description.directory.name
+    return f'{bag.path} is not a recording of {robot_name}: {problem}; {remedy}'
+
+
+def _problem(bag: Bag, robot: Robot, motors: MotorSettings, stop: int) -> str:
+    """Return why the messages up to a log time [ns] do not fit a robot; '' if they do."""
+    try:
+        streams = read_streams(bag, robot, motors=motors, stop=stop)
+    except BagError as error:
+        return error.problem
+    if len(streams.joints.time):
+        return ''
+    # Without joint sensors, only the number of muscles is known to fit.
+    _, described = _described(bag, motors)
+    if described and not set(robot.joints) <= set(described):
+        return f'its robot_description has the joints {", ".join(described)}'
+    return ''
+
+
+def _described(bag: Bag, motors: MotorSettings) -> tuple[str, list[str]]:
+    """Return the name and the movable joints of the recorded URDF; '' and [] without one."""
+    topic = interface_topics(bag, motors=motors).get('robot_description')
+    for message in bag.messages([topic] if topic else []):
+        try:
+            root = parse_xml(bag.path, bag.decode(message).data)
+        except MusculoskeletalError:
+            continue
+        joints = [
+            joint.get('name', '')
+            for joint in root.iterfind('joint')
+            if joint.get('type') != 'fixed'
+        ]
+        return root.get('name', ''), joints
+    return '', []
+
+
+def main(arguments: list[str]) -> int:
+    """Print why a recording does not fit a robot; return the exit status."""
+    path, robot, *files = arguments
+    try:
+        problem = misfit(Bag.open(path), robot, motor_settings(map(Path, files)))
+    except (MusculoskeletalError, OSError) as error:
+        problem = str(error)
+    if problem:
+        print(f'error: {printable(problem)}', file=sys.stderr)
+    return 1 if problem else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))
