@@ -3,6 +3,7 @@
 
     python my_driver.py --ros-args -p robot:=path/to/my_arm
 
+With `-p moved:=true`, the emulated arm moves slowly through its range, as if a hand moved it.
 doc/howto/your_driver.md states the contract of a driver; `check_driver` checks it.
 """
 
@@ -24,6 +25,7 @@ from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.robot.robot import Robot
 
 RATE = 100.0  # rate at which sensors are read and tensions regulated [Hz]
+TURN = 10.0  # time in which a hand moves the first joint to and fro, if `moved` [s]
 SPOOL = 0.01  # radius of the spools [m]
 SILENCE = 0.5  # time without a command after which tensions decrease to T_bias [s]
 RELEASE = 100.0  # rate of this decrease [N/s]
@@ -38,8 +40,9 @@ class Bus:
     of muscles.yaml.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, moved: bool = False) -> None:
         self.arm, self.read_at = EmulatedArm(robot, seed=1), time.monotonic()
+        self.robot, self.moved = robot, moved
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return spool angles [rad], T [N], temperatures [°C] and θ [rad].
@@ -47,6 +50,11 @@ class Bus:
         Positive spool angles wind in. They are 0 at θ = 0 without tension.
         """
         now = time.monotonic()
+        if self.moved:  # all motors hold T_bias while a hand moves the arm
+            low, high = self.robot.lower, self.robot.upper
+            periods = TURN * (1.0 + 0.3 * np.arange(len(low)))
+            share = 0.5 - 0.5 * np.cos(2.0 * np.pi * now / periods)
+            self.arm.reset(low + share * (high - low))
         self.arm.step(min(round(now - self.read_at, 3), 0.1))
         self.read_at = now
         reading = self.arm.sense()
@@ -64,7 +72,7 @@ class Driver(Node):
     def __init__(self) -> None:
         super().__init__('driver')
         self.robot = Robot.load(self.declare_parameter('robot', 'arm26').value)
-        self.bus = Bus(self.robot)
+        self.bus = Bus(self.robot, self.declare_parameter('moved', False).value)
         # The last command: l_target [m], or T [N] if `by_tension`, and its time of arrival [s].
         self.target, self.by_tension, self.commanded_at = None, False, -SILENCE
         self.setpoint = np.full(self.robot.muscle_count, self.robot.tension.bias)

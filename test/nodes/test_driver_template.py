@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driver template meets the requirements of the controller."""
 
+import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
 from graph import Process
 from std_msgs.msg import Float64MultiArray
 
+from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.robot.robot import Robot
 
 TEMPLATE = Path(__file__).parents[2] / 'examples' / 'driver.py'
@@ -59,3 +64,22 @@ def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(gra
         lambda: graph.set_parameter('controller', 'method', 'tension')[0],
         'the method to be accepted',
     )
+
+
+@pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm'])
+def test_the_moved_arm_of_the_template_shows_order_and_sign_of_every_muscle(name, monkeypatch):
+    spec = importlib.util.spec_from_file_location('driver_template', TEMPLATE)
+    template = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(template)
+    now, robot = [100.0], Robot.load(name)
+    monkeypatch.setattr(template.time, 'monotonic', lambda: now[0])
+    bus, listening = template.Bus(robot, moved=True), Listening(robot, 50.0)
+    for _ in range(600):
+        now[0] += 0.02
+        angle, tension, temperature, theta = bus.read()
+        listening.joints(joint_message(robot.joints, theta, Time()))
+        rows = np.stack([-template.SPOOL * angle, tension, temperature])
+        listening.muscles(array_message(rows, 'quantity', 'muscle'), now[0])
+    verdict = listening.verdict(now[0])
+    assert not verdict.faults, str(verdict)
+    assert verdict.conclusion == 'no fault found; not judged: law, clip, latency of all muscles'
