@@ -14,6 +14,7 @@ from collections.abc import Generator, Sequence
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.driver.order import Order, corrected, judge_order
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import judge
@@ -29,6 +30,9 @@ ABOVE_BIAS = 40.0  # default of the highest tension, above T_bias [N]
 RUN_AWAY_TENSION = 60.0
 MOMENT = 0.1  # time for which a muscle may exceed a limit, for example because the arm falls [s]
 LATEST = 0.1  # longest time from a command to the first response [s]
+#: Exchanged muscles explain the lengths better than a fault of joint sensors if they reduce the
+#: misfit to less than this fraction.
+JOINTS_BETTER = 0.8
 #: longest time for which a moving target advances between two messages [s], so that it does not
 #: jump after a gap
 LONGEST_ADVANCE = 0.05
@@ -44,6 +48,15 @@ class RunAwayError(Exception):
         """Store the arguments for `Verdict.failed`: the muscle, the fault, and its values."""
         super().__init__(fault)
         self.muscle, self.fault, self.values = muscle, fault, values
+
+
+class WrongOrderError(Exception):
+    """Commands wind in other muscles than those whose readings they should change."""
+
+    def __init__(self, winds: dict[int, int]) -> None:
+        """Store for each misplaced muscle which muscle its command winds in."""
+        super().__init__('wrong order')
+        self.winds = winds
 
 
 class MotionTest(ABC):
@@ -127,11 +140,16 @@ class MotionTest(ABC):
         """
 
     @abstractmethod
-    def _release(self, m: int) -> Wait:
-        """Pay out muscle m, which has run away, within RELEASE seconds.
+    def _release(self, error: RunAwayError) -> Wait:
+        """Pay out the muscle that has run away, within RELEASE seconds.
 
         A test may pay out all muscles instead.
         """
+
+    def _explain(self) -> Generator[None, None, dict[int, int]]:
+        """Return which muscles commands wind in instead, after a muscle ran away; {} if unknown."""
+        yield from ()
+        return {}
 
     # -- common parts ---------------------------------------------------------------------------
 
@@ -144,10 +162,25 @@ class MotionTest(ABC):
                 yield from self._try(m)
                 self._is_verified[m] = all(m not in fault.muscles for fault in self.verdict.faults)
             self._judge_joints()
+        except WrongOrderError as error:
+            self._report_order(error.winds)
         except RunAwayError as error:
-            self.verdict.failed(error.fault, error.muscle, **error.values)
             # After the release no more commands follow, so that the modules go to their safe state.
-            yield from self._release(error.muscle)
+            # The exception is a search for a wrong order, at less than the test tension.
+            yield from self._release(error)
+            if winds := (yield from self._explain()):
+                self._report_order(winds)
+            else:
+                self.verdict.failed(error.fault, error.muscle, **error.values)
+
+    def _report_order(self, winds: dict[int, int]) -> None:
+        """Record that commands wind in other muscles: `winds[m]` is moved by the command of m."""
+        names = self._robot.muscles
+        (first, other), *more = winds.items()
+        moves = [f'winding in {names[first]} moved the readings of {names[other]}']
+        moves += [f'winding in {names[m]} those of {names[other]}' for m, other in more]
+        misplaced = dict.fromkeys([*winds, *winds.values()])
+        self.verdict.failed('misplaced', *misplaced, moves=', and '.join(moves))
 
     def _judge_joints(self) -> None:
         """Compare the joint sensors with the lengths, unless the lengths are wrong."""
@@ -159,10 +192,25 @@ class MotionTest(ABC):
             verdict.notes.append('θ of some joints is unknown, so signs of θ were not checked')
             return
         judgement = judge(robot, theta, states[:, 0], states[:, 1], segments=tested)
+        order = judge_order(robot, theta, states[:, 0], states[:, 1], tested)
+        meant = corrected(theta, judgement.faults)
+        of_joints = judge_order(robot, meant, states[:, 0], states[:, 1], tested)
+        # A fault of the joint sensors is preferred, because it can look like exchanged antagonists.
+        if order.misplaced and (
+            not judgement.faults or order.misfit < JOINTS_BETTER * of_joints.misfit
+        ):
+            self._report_misplaced(order)
+            return
         for fault in judgement.faults:
             verdict.failed(fault.kind, names=', '.join(robot.joints[j] for j in fault.joints))
         if judgement.faults:
+            if order.misplaced:
+                verdict.notes.append(
+                    f'the lengths look the same if {self._moves_like(order)}: check the order of '
+                    'these muscles, too'
+                )
             return
+        verdict.passed_some('order', [m for m in self._muscles if m in order.right])
         unknown = [name for j, name in enumerate(robot.joints) if j not in judgement.right]
         if judgement.right:
             names = ', '.join(robot.joints[j] for j in judgement.right)
@@ -176,6 +224,16 @@ class MotionTest(ABC):
                 f'little: {", ".join(unknown)}. {again if higher > highest + 1.0 else "Move"} '
                 'the arm by hand while check_driver listens'
             )
+
+    def _report_misplaced(self, order: Order) -> None:
+        """Record muscles whose readings and commands are both misplaced."""
+        moves = self._moves_like(order)
+        self.verdict.failed('both misplaced', *order.misplaced, moves=moves)
+
+    def _moves_like(self, order: Order) -> str:
+        names = self._robot.muscles
+        moves = [f'{names[j]} moves like {names[k]}' for j, k in order.misplaced.items()]
+        return ', and '.join(moves)
 
     def _wait(self, duration: float) -> Wait:
         """Wait for `duration` [s].

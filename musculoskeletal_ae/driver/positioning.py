@@ -10,7 +10,7 @@ follow
 and T must not fall meanwhile. The target then returns and moves outwards, and l must follow again.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from musculoskeletal_ae.driver.motion import (
     MotionTest,
     RunAwayError,
     Wait,
+    WrongOrderError,
 )
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -73,6 +74,7 @@ class Positioning(MotionTest):
             self._highest = np.full(self._robot.muscle_count, highest)
         #: tension at which a muscle is released while the arm is held [N] (M,)
         self._most: Array = np.full(self._robot.muscle_count, np.inf)
+        self._winds = dict[int, int]()  # for each command, the module that seems to follow it
 
     # -- commands -------------------------------------------------------------------------------
 
@@ -86,6 +88,8 @@ class Positioning(MotionTest):
         self._target[:] = length
         yield from self._wait(SETTLE)
         held = self._mean()
+        if winds := self._exchanged(held[0]):
+            raise WrongOrderError(winds)
         for m in np.flatnonzero(np.abs(held[0] - self._target) > FOLLOWS).tolist():
             off = 1e3 * (held[0] - self._target)[m]
             self.verdict.failed('position hold', m, off=off)
@@ -103,11 +107,47 @@ class Positioning(MotionTest):
             detail = f'l deviates by {1e3 * (length - self._target)[m]:+.0f} mm from l_target'
         return RunAwayError(m, 'position ran away', detail=detail)
 
-    def _release(self, m: int) -> Wait:
+    def _release(self, error: RunAwayError) -> Wait:
+        self._winds = self._exchanged(self._recent[-1][1][0]) if self._tested is None else {}
+        # The module that follows the command of an exchanged muscle is paid out as well.
+        m = [error.muscle, *self._winds]
         self._target[m] += self._robot.actuation.release[m]
         end = self._now + RELEASE
         while self._now < end:
             yield
+
+    def _explain(self) -> Generator[None, None, dict[int, int]]:
+        yield from ()
+        return self._winds
+
+    def _exchanged(self, length: Array) -> dict[int, int]:
+        """Return which modules the commands move instead while the arm is held; {} if unknown.
+
+        Every target is the l that a module had published. Modules that follow the commands of other
+        muscles move to the l of these muscles. While they still move, only two modules that move
+        towards each other's l can be recognised.
+
+        Args:
+            length: Measured lengths [m], (M,).
+        """
+        moved = length - self._target
+        movers = np.flatnonzero(np.abs(moved) > FOLLOWS)
+        if len(movers) < 2:
+            return {}
+        distance = np.abs(length[movers][:, None] - self._target[movers][None, :])
+        np.fill_diagonal(distance, np.inf)
+        nearest = distance.argmin(axis=1)
+        has_arrived = distance.min(axis=1) < 2.0 * FOLLOWS
+        is_order = len(set(nearest.tolist())) == len(movers)
+        if len(movers) == 2:
+            a, b = movers
+            apart = self._target[b] - self._target[a]
+            meets = np.sign(moved[a]) == np.sign(apart) and np.sign(moved[b]) == -np.sign(apart)
+            is_order = meets and (np.abs(moved[movers]) < abs(apart) + FOLLOWS).all()
+            has_arrived[:] = True
+        if not (is_order and has_arrived.all()):
+            return {}
+        return dict(zip(movers[nearest].tolist(), movers.tolist(), strict=True))
 
     def _mean(self) -> Array:
         """Return the mean of the last readings: l [m], T [N] and temperature [°C], (3, M)."""

@@ -64,6 +64,11 @@ class Verdict:
             if self._state[m, CHECKS.index(check)] == OPEN:
                 self._state[m, CHECKS.index(check)] = OK
 
+    def passed_some(self, check: str, muscles: Sequence[int]) -> None:
+        """Record that some muscles, or none, passed a check, unless they have failed it."""
+        for m in muscles:
+            self.passed(check, m)
+
     def failed(self, what: str, *muscles: int, **values: object) -> None:
         """Record a fault.
 

@@ -26,14 +26,17 @@ from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.motion import (
     ABOVE_BIAS,
     HOLD,
     LATEST,
+    LONGEST_ADVANCE,
     MEAN,
     RELEASE,
+    RELEASE_SPEED,
     RESPONSE,
     RUN_AWAY_TENSION,
     SETTLE,
@@ -41,6 +44,7 @@ from musculoskeletal_ae.driver.motion import (
     MotionTest,
     RunAwayError,
     Wait,
+    WrongOrderError,
 )
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -67,6 +71,13 @@ OSCILLATES = 6  # T oscillates if it crosses its mean more often than this withi
 #: distance of l_target beyond l at the start of a release [m], and its growth [m/s]; small at
 #: first, because commands of wrong sign wind in
 PAY_OUT = 0.003, 0.3
+#: distance of every l_target beyond the largest l while a wrong order is searched [m]; no module
+#: then pulls, whichever command it follows
+CLEAR = 0.005
+#: share of the range from T_bias to ALARM by which the demand may rise within LONGEST_ADVANCE while
+#: a wrong order is searched
+SEARCH_SHARE = 0.5
+CONFIRMATIONS = 3  # successive messages in which a tension must have risen to be a response
 MOST_BEYOND = 0.3  # highest demand beyond tension.max, relative to tension.max
 
 
@@ -139,6 +150,14 @@ class Winding(MotionTest):
         self._is_searched: Bools = np.zeros(robot.muscle_count, dtype=bool)
         #: standard deviation of T while the arm is held [N] (M,)
         self._swing: Array = np.zeros(robot.muscle_count)
+        self._searches_order = False
+        #: muscles whose commands may wind in other muscles, after one of them ran away
+        self._suspects = list[int]()
+
+    @property
+    def trying(self) -> str:
+        """The present step of the test, for messages: `hold`, `order` or the name of a muscle."""
+        return 'order' if self._searches_order else super().trying
 
     # -- commands -------------------------------------------------------------------------------
 
@@ -150,7 +169,9 @@ class Winding(MotionTest):
         held, self._swing = self._mean(), self._noise()
         for m in np.flatnonzero(self._swing > self._tolerance).tolist():
             self.verdict.failed('hums', m, swing=self._swing[m])
-        for m in np.flatnonzero(self._off(held)).tolist():
+        off = np.flatnonzero(self._off(held)).tolist()
+        yield from self._search_order([m for m in off if self._obeys_another(m, held)])
+        for m in off:
             self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
 
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
@@ -183,12 +204,17 @@ class Winding(MotionTest):
             return RunAwayError(int(fell.argmax()), 'ran away', detail=detail)
         return None
 
-    def _release(self, m: int) -> Wait:  # noqa: ARG002 (all muscles: the arm may be falling)
-        """Pay out all muscles.
+    def _release(self, error: RunAwayError) -> Wait:
+        """Pay out all muscles, because the arm may be falling.
 
         Every target moves away from the newest l, because l may change in the wrong direction. If
         a tension still rises, the sign of the commands is wrong, so that no more are sent.
         """
+        # A length that rises as the muscle is wound in has the wrong sign, not the wrong place.
+        self._suspects = [] if error.fault == 'rising' else self._misplaced()
+        if self._suspects:
+            yield from self._pay_out()
+            return
         start, before = self._now, self._recent[-1][1][1]
         while (passed := self._now - start) < RELEASE:
             length, tension, _ = self._recent[-1][1]
@@ -196,6 +222,129 @@ class Winding(MotionTest):
                 break
             self._target = length + min(PAY_OUT[0] + PAY_OUT[1] * passed, 2.0 * RUN_AWAY)
             yield
+
+    # -- wrong order ------------------------------------------------------------------------------
+
+    def _pay_out(self) -> Wait:
+        """Pay out all muscles, whichever command each of them follows.
+
+        Every target moves beyond the largest l. If a tension still rises, commands end.
+        """
+        start, before = self._now, self._recent[-1][1][1]
+        while (passed := self._now - start) < RELEASE:
+            length, tension, _ = self._recent[-1][1]
+            if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
+                self._suspects = []
+                break
+            self._target[:] = length.max() + CLEAR
+            yield
+
+    def _misplaced(self) -> list[int]:
+        """Return the muscles that pull more than demanded, if a wrong order explains all of them.
+
+        Each of them must then follow the command of another muscle, which is at a shorter length,
+        and no two of them the same one. If every muscle pulls, the order is therefore not wrong.
+        """
+        length, tension, _ = self._recent[-1][1]
+        excess = tension - self._demanded(length)
+        pulls = excess > self._tolerance
+        needed = 0.5 * np.where(pulls, excess, -np.inf) / self._robot.stiffness
+        explained: Bools = length[:, None] - self._sent[None, :] > needed[:, None]
+        np.fill_diagonal(explained, ~pulls)
+        rows, columns = linear_sum_assignment(~explained)
+        if not pulls.any() or not explained[rows, columns].all():
+            return []
+        return np.flatnonzero(pulls).tolist()
+
+    def _obeys_another(self, m: int, held: _Reading) -> bool:
+        """Return whether the tension of muscle m at rest is what another command demands of it."""
+        stretched = np.maximum(0.0, held.length[m] - self._sent)
+        demands = self._bias[m] + self._robot.stiffness[m] * stretched
+        fits = np.abs(demands - held.tension[m]) < 2.0 * np.maximum(
+            self._tolerance[m], TENSION_SHARE * held.tension[m]
+        )
+        fits[m] = False
+        return bool(fits.any())
+
+    def _explain(self) -> Generator[None, None, dict[int, int]]:
+        try:
+            yield from self._search_order(self._suspects)
+        except WrongOrderError as error:
+            return error.winds
+        except RunAwayError:
+            yield from self._pay_out()
+        return {}
+
+    def _search_order(self, suspects: Sequence[int]) -> Wait:
+        """Find out whether commands wind in other muscles, and return if they do not.
+
+        At first, no command demands more than T_bias, whichever muscle follows it. Then one command
+        after the other moves inwards, until the tension of any muscle rises noticeably.
+
+        Args:
+            suspects: Indices of the muscles whose commands may be misplaced.
+
+        Raises:
+            WrongOrderError: If commands wind in other muscles.
+            RunAwayError: If a tension exceeds ALARM.
+        """
+        if not len(suspects):
+            return
+        self._searches_order = True
+        self._is_searched[:] = False
+        clear = float(self._recent[-1][1][0].max()) + CLEAR
+        self._target[:] = clear
+        yield from self._wait(RELEASE)
+        tested, self._tested = self._tested, None  # from now on, ALARM limits every tension
+        winds = dict[int, int]()
+        for suspect in suspects:
+            m: int | None = suspect
+            while m is not None and m not in winds:
+                other = yield from self._first_to_respond(m, clear)
+                if other is not None:
+                    winds[m] = other
+                m = other
+        self._searches_order = False
+        if misplaced := {m: other for m, other in winds.items() if m != other}:
+            raise WrongOrderError(misplaced)
+        self._target[:] = self._mean().length
+        yield from self._wait(SETTLE)
+        self._tested = tested
+
+    def _first_to_respond(self, m: int, clear: float) -> Generator[None, None, int | None]:
+        """Move the command of muscle m inwards, and return the muscle whose tension rises first.
+
+        Args:
+            m: The muscle.
+            clear: Target at which no muscle pulls [m].
+
+        Returns:
+            The index of the muscle, or None if none responds.
+        """
+        before = self._mean()
+        answer = self._response + 3.0 * np.maximum(self._noise(), self._swing)
+        rise = (self._alarm - self._bias)[m] / self._robot.stiffness[m]
+        speed = min(RELEASE_SPEED, SEARCH_SHARE * rise / LONGEST_ADVANCE)
+        floor = float(before.length.min()) - FURTHEST
+        last, found, count = self._now, None, 0
+        self._is_searched[m] = True
+        while self._target[m] > floor and count < CONFIRMATIONS:
+            self._target[m] -= speed * self._since(last)
+            last = self._now
+            yield from self._wait(1e-9)
+            rose = (self._recent[-1][1][1] - before.tension) / answer
+            m_rose = int(rose.argmax())
+            count = count + 1 if rose[m_rose] > 1.0 and m_rose in (found, None) else 0
+            found = m_rose if rose[m_rose] > 1.0 else None
+        reached = self._recent[-1][1][1]
+        self._target[m] = clear
+        self._is_searched[m] = False
+        yield from self._wait(RELEASE)
+        if found is None or count < CONFIRMATIONS:
+            return None
+        # A tension that the command has raised falls with the command.
+        fell = (reached - self._mean().tension)[found]
+        return found if fell > 0.5 * answer[found] else None
 
     def _ceiling(self) -> Array:
         """Return the highest tension [N], (M,), to demand of muscles that are not yet verified."""
@@ -292,6 +441,9 @@ class Winding(MotionTest):
         yield from self._wind(m, home.demand[m] + 0.5 * rise, home.length[m], half)
         last = yield from self._wind(m, home.demand[m] + rise, home.length[m], whole)
         pulled, wound = last.tension - home.tension, home.length - last.length
+        if self._may_be_misplaced(m, home, last):
+            yield from self._go(m, home.length[m])
+            yield from self._search_order([m])
         if not (abs(pulled[m]) > self._response[m] or wound[m] > RESPONSE[1]):
             yield from self._ask_outwards(m, home, pulled, wound)
             return
@@ -334,6 +486,18 @@ class Winding(MotionTest):
             failed('beyond l', m, got=out.tension[m], asked=out.demand[m])
         else:
             self.verdict.passed('law', m)
+
+    def _may_be_misplaced(self, m: int, home: _Reading, last: _Reading) -> bool:
+        """Return whether another muscle seems to have followed the command of muscle m.
+
+        It was then wound in further than muscle m, and its tension rose more than demanded of it.
+        """
+        pulled, wound = last.tension - home.tension, home.length - last.length
+        excess = pulled - (last.demand - home.demand)
+        rose = excess > self._response + 3.0 * self._swing
+        others = rose & (wound > np.maximum(wound[m], RESPONSE[1]))
+        others[m] = False
+        return bool(others.any()) and pulled[m] < SLOPES[0] * (last.demand - home.demand)[m]
 
     def _whose_tension(self, m: int, home: _Reading, last: _Reading) -> int:
         """Return the muscle whose tension responds when muscle m is wound in.
@@ -390,6 +554,7 @@ class Winding(MotionTest):
         other = int(np.where(wound > RESPONSE[1], pulled, -np.inf).argmax())
         yield from self._go(m, home.length[m])
         if other != m and pulled[other] > self._response[other]:
+            yield from self._search_order([m])
             self.verdict.failed('other one', m, other=self._robot.muscles[other])
             return
         self._target[m] = home.length[m] + ((self._highest - self._bias) / self._robot.stiffness)[m]

@@ -106,8 +106,8 @@ def test_a_sound_driver_is_found_sound(seed):
     reported = str(verdict).splitlines()
     for name, line in zip(ROBOT.muscles, reported[1:]):
         assert line.startswith(name)
-        # `Winding` alone does not judge rate, order, zero and clip.
-        assert line.count('ok') == 4 and 'WRONG' not in line
+        # `Winding` alone does not judge rate, zero and clip, and order only where θ shows it.
+        assert line.count('ok') in (4, 5) and 'WRONG' not in line
 
 
 HEARD = {
@@ -539,7 +539,7 @@ def only_first(target):
 
 
 WOUND = {
-    'exchanged commands': ({'take': exchanged}, 'order', 'instead'),
+    'exchanged commands': ({'take': exchanged}, 'order', 'moved the readings of'),
     'sign of both': (
         {'publish': flipped, 'take': lambda t: -t},
         'sign',
@@ -640,8 +640,8 @@ def test_a_driver_that_pulls_from_the_first_command_on_is_released_and_bounded_b
     driver.take = partial(JUMPING[name], driver.arm.sense().length)
     verdict = driver.wind((BICEPS,))
     assert 'released for safety' in str(verdict)
-    assert driver.pulled.keys() == {'hold'}
-    assert driver.pulled['hold'] < 1.1 * 60.0
+    assert driver.pulled.keys() <= {'hold', 'order'}
+    assert max(driver.pulled.values()) < 1.1 * 60.0
 
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
@@ -782,7 +782,7 @@ def test_a_sound_driver_that_follows_positions_is_found_sound():
     assert not verdict.faults, str(verdict)
     verdict = driver.wind()
     assert not verdict.faults, str(verdict)
-    assert all(line.count('ok') == 4 for line in str(verdict).splitlines()[1 : M + 1])
+    assert all(line.count('ok') in (4, 5) for line in str(verdict).splitlines()[1 : M + 1])
 
 
 POSITION_FAULTS = {

@@ -73,9 +73,9 @@ def test_the_moved_arm_of_the_template_shows_order_and_sign_of_every_muscle(name
     spec.loader.exec_module(template)
     now, robot = [100.0], Robot.load(name)
     monkeypatch.setattr(template.time, 'monotonic', lambda: now[0])
-    bus, listening = template.Bus(robot, moved=True), Listening(robot, 50.0)
+    bus, listening = template.Bus(robot, moved=True), Listening(robot, 20.0)
     for _ in range(600):
-        now[0] += 0.02
+        now[0] += 0.05
         angle, tension, temperature, theta = bus.read()
         listening.joints(joint_message(robot.joints, theta, Time()))
         rows = np.stack([-template.SPOOL * angle, tension, temperature])

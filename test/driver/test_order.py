@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Muscles in a wrong order are named, and no sound driver is accused of a wrong order."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from driver.scripted import Driver
+from musculoskeletal_ae.driver.motion import ABOVE_BIAS
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.robot.description import with_modules
+from musculoskeletal_ae.robot.robot import Robot
+
+ARM26 = Robot.load('arm26')
+POSITION = Robot(with_modules(ARM26.description, actuation='position'))
+PAIRS = [(0, 1), (2, 5), (1, 4)]
+CYCLE = (0, 3, 4)
+
+
+@cache
+def robot_named(name):
+    return Robot.load(name)
+
+
+def misordered(robot, muscles, what, seed=0, reality='kin'):
+    """Return a driver in which `what` of `muscles` are in another order, shifted by one."""
+    driver, order = Driver(robot, seed), np.arange(robot.muscle_count)
+    driver.arm = make_arm(robot, seed, reality)
+    order[list(muscles)] = np.roll(muscles, 1)
+    if what in ('readings', 'both'):
+        driver.publish = lambda rows: rows[:, order]
+    if what in ('commands', 'both'):
+        # The command of column j must reach the muscle whose readings column j shows.
+        into = np.argsort(order) if what == 'both' else order
+        driver.take = lambda target: target[into]
+    driver.listen(2.0)
+    return driver
+
+
+def assert_names(verdict, muscles):
+    (fault,) = verdict.faults
+    assert fault.check == 'order', str(verdict)
+    assert set(fault.muscles) == set(muscles), str(verdict)
+    assert all(verdict.robot.muscles[m] in fault.observation for m in muscles)
+
+
+@pytest.mark.parametrize('what', ['readings', 'commands'])
+@pytest.mark.parametrize('muscles', [*PAIRS, CYCLE])
+def test_muscles_in_a_wrong_order_are_the_only_fault_and_are_not_pulled_hard(what, muscles):
+    driver = misordered(ARM26, muscles, what)
+    driver.pulled.clear()
+    verdict = driver.wind()
+    assert_names(verdict, muscles)
+    assert driver.pulled['order'] < ARM26.tension.bias[0] + ABOVE_BIAS
+
+
+@pytest.mark.parametrize(
+    ('name', 'muscles', 'seed', 'reality'),
+    [
+        ('musashi_left_arm', (0, 7), 1, 'kin'),
+        ('musashi_left_arm', (2, 3), 2, 'kin'),
+        ('arm26', (3, 4), 1, 'foreign'),
+    ],
+)
+def test_exchanged_readings_of_other_arms_are_named(name, muscles, seed, reality):
+    robot = robot_named(name)
+    assert_names(misordered(robot, muscles, 'readings', seed, reality).wind(), muscles)
+
+
+@pytest.mark.parametrize('muscles', PAIRS)
+def test_muscles_whose_readings_and_commands_are_exchanged_are_named_by_the_joint_angles(muscles):
+    verdict = misordered(ARM26, muscles, 'both').wind()
+    assert_names(verdict, muscles)
+    assert 'the joint angles show' in str(verdict)
+
+
+@pytest.mark.parametrize('what', ['readings', 'commands'])
+@pytest.mark.parametrize('muscles', PAIRS)
+def test_exchanged_modules_that_follow_positions_are_named(what, muscles):
+    assert_names(misordered(POSITION, muscles, what).wind(), muscles)
+
+
+@pytest.mark.parametrize(('name', 'seed'), [('arm26', 2), ('musashi_left_arm', 0)])
+@pytest.mark.parametrize('reality', ['kin', 'foreign'])
+def test_no_sound_driver_is_accused_of_a_wrong_order(name, seed, reality):
+    verdict = misordered(robot_named(name), (), 'both', seed, reality).wind()
+    assert 'order' not in verdict.wrong, str(verdict)
