@@ -788,7 +788,7 @@ def test_a_sound_driver_that_follows_positions_is_found_sound():
 POSITION_FAULTS = {
     'deaf': ('take', lambda _: np.zeros(M), 'position hold'),
     'sign of the command': ('take', lambda target: -target - 0.04, 'position ran away'),
-    'exchanged commands': ('take', exchanged, 'position hold'),
+    'exchanged commands': ('take', exchanged, 'misplaced'),
     'half of the way': ('take', 'half', 'position gain'),
     'sign of T': ('publish', 'fall', 'position sign'),
     'late': ('late', 0.3, 'late'),
